@@ -14,6 +14,7 @@ from smartcam.inspection._locate.segments import (
     Segments,
     fit_bands,
     make_bands,
+    normal_equations,
     pixels_in,
 )
 from smartcam.inspection._measure.edges import ROUNDING
@@ -230,7 +231,7 @@ def _fitted(
     slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
     rise = load("scipy.special").ndtr(part)
     columns = np.stack([np.ones_like(part), rise, slope, slope * along, slope * part * blurs])
-    square, right = _normal_equations(columns, pixels.levels, pixels.owners, count)
+    square, right = normal_equations(columns, pixels.levels, pixels.owners, count)
     number = np.bincount(pixels.owners, minlength=count)
     good = number >= 20
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", square), 1e-12))
@@ -256,16 +257,3 @@ def _fitted(
         blurs=np.maximum(segments.blurs * (1 + growth), MIN_BLUR_PX),
     )
     return made, rms, good, np.sqrt(inverse[:, 2, 2]) / tall
-
-
-def _normal_equations(
-    columns: Array, values: Array, owners: NDArray[np.intp], count: int
-) -> tuple[Array, Array]:
-    """Return the square matrices (N, K, K) and right sides (N, K) of all bands."""
-    size = len(columns)
-    square, right = np.zeros((count, size, size)), np.zeros((count, size))
-    for i in range(size):
-        right[:, i] = np.bincount(owners, columns[i] * values, count)
-        for j in range(i, size):
-            square[:, i, j] = square[:, j, i] = np.bincount(owners, columns[i] * columns[j], count)
-    return square, right

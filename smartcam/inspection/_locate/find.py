@@ -223,6 +223,7 @@ class _SearchedPicture:
             self._noise * self._unit,
             search.any_polarity,
             search.scales[1] > search.scales[0],
+            search.least_score,
             model.symmetry.fold != 0,
         )
         return fit_pose(self._levels, model.segments, model.bands, start, use)

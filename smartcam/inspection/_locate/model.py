@@ -565,7 +565,7 @@ class _ModelFile(BaseModel):
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
         return PartModel(
             name=self.name,
-            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T, np.array(self.moves)),
+            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T, moves=np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(np.array(one, np.intp) for one in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),

@@ -227,3 +227,16 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
         freedoms,
         -float((weights * heights * grown).sum()) / total if total > 0 else 0.0,
     )
+
+
+def normal_equations(
+    columns: Array, values: Array, owners: NDArray[np.intp], count: int
+) -> tuple[Array, Array]:
+    """Return the square matrices (N, K, K) and right sides (N, K) of all bands."""
+    size = len(columns)
+    square, right = np.zeros((count, size, size)), np.zeros((count, size))
+    for i in range(size):
+        right[:, i] = np.bincount(owners, columns[i] * values, count)
+        for j in range(i, size):
+            square[:, i, j] = square[:, j, i] = np.bincount(owners, columns[i] * columns[j], count)
+    return square, right
