@@ -322,8 +322,10 @@ def _result(
 def _settled(
     rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
-    """Return the last move of a pose (4,), its covariance, the segments that it follows from, and
-    the squares of their shifts in parts of what they may have; None: too few agree."""
+    """Return the last move of a pose (4,), its covariance, and the segments that it follows from.
+
+    Besides, the squares of their shifts in parts of what they may have; None: too few agree.
+    """
     off = np.abs(shifts) * np.sqrt(weights)
     kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
     for _ in range(3):

@@ -39,8 +39,8 @@ NEAR_PX: Final = 10.0
 pixels of the picture that was taught."""
 
 COMMON_PX, COMMON_DIRECTION = 24.0, 0.5
-"""Distance in pixels, and cosine of the angle between the normals, up to which edges may have errors
-in common."""
+"""Distance in pixels, and cosine of the angle between the normals, of edges that may have errors in
+common."""
 
 LEAST_PART: Final = 1e-4
 """Standard deviation of a slope in parts of the noise at least."""
@@ -133,9 +133,9 @@ def _step(across: Array, blurs: Array) -> tuple[Array, Array]:
 
 
 def _solved(columns: Array, pixels: BandPixels, known: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the values (N, K) of bands, their covariance (N, K, K) for noise of one grey level,
-    the pixels' variance about them, 0 where a band has too few, and the degrees of freedom (N,).
+    """Return the values (N, K) of bands, and their covariance for noise of one grey level.
 
+    Besides, the pixels' variance about them, 0 where a band has too few, and degrees of freedom.
     ``known`` (N, K): the variance of the noise in parts of that of each value; 0: it is unknown.
     """
     owners, (count, size) = pixels.owners, known.shape
@@ -143,12 +143,13 @@ def _solved(columns: Array, pixels: BandPixels, known: Array) -> tuple[Array, Ar
     means = np.bincount(owners, pixels.levels, count) / np.maximum(number, 1.0)
     levels = pixels.levels - means[owners]
     square, right = normal_equations(columns, levels, owners, count)
-    inverse = np.linalg.inv(square + (known[:, :, None] + 1e-7) * np.eye(size))
+    regular = square + (known[:, :, None] + 1e-7) * np.eye(size)
+    inverse = np.asarray(np.linalg.inv(regular), np.float64)
     values = (inverse @ right[:, :, None])[:, :, 0]
     fitted = (columns * values[owners].T).sum(axis=0)
     left = np.bincount(owners, (levels - fitted) ** 2, count)
-    taken = size - (np.diagonal(inverse, axis1=1, axis2=2) * known).sum(axis=1)
+    taken: Array = size - (np.diagonal(inverse, axis1=1, axis2=2) * known).sum(axis=1)
     freedoms = number - taken
     good = (number >= MIN_BAND_PIXELS) & (freedoms >= 2)
-    variances = np.where(good, left / np.maximum(freedoms, 1.0), 0.0)
+    variances: Array = np.where(good, left / np.maximum(freedoms, 1.0), 0.0)
     return values, inverse, variances, np.maximum(freedoms, 1.0)

@@ -562,10 +562,11 @@ class _ModelFile(BaseModel):
     def model(self) -> PartModel:
         """Return the model of the file."""
         rows = np.array(self.segments, np.float64)
+        numbers = (rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], rows[:, 8])
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
         return PartModel(
             name=self.name,
-            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T, moves=np.array(self.moves)),
+            segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(np.array(one, np.intp) for one in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
