@@ -328,7 +328,9 @@ def _part(said: Mapping[str, Any]) -> Localization:
     )
     if "sigma" in pose:
         told = {name: pose["sigma"][name] for name in PoseSigma._fields}
-        errors = {name: None if one is None else _number(one) for name, one in told.items()}
+        errors: dict[str, Any] = {
+            name: None if one is None else _number(one) for name, one in told.items()
+        }
         place = place.with_sigma(PoseSigma(**errors))
     return Localization(feature, _number(said["quality"]), photo, place)
 
