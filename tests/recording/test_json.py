@@ -27,6 +27,7 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Result,
@@ -113,6 +114,7 @@ def test_text_is_made_while_another_thread_imports_numpy(
 @example([PART])  # integers where there are floats otherwise
 @example([PART._replace(quality=np.float32(0.5))])
 @example([PART._replace(quality=True)])
+@example([PART._replace(pose=PART.pose.with_sigma(PoseSigma(0.1, math.nan, 0.2, z=0.3)))])
 @example([PART._replace(pose=None)])
 @example([PART._replace(photo_index="first")])
 def test_result_is_written_as_the_slow_way_writes_it(value: Any) -> None:
