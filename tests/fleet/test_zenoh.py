@@ -354,6 +354,26 @@ async def test_burst_is_not_dropped(count: int) -> None:
             assert sorted(heard.payloads) == sorted(payloads)
 
 
+async def test_engine_thread_keeps_its_state_from_one_callback_to_the_next() -> None:
+    """Python would make and free it for each message, which costs a third of a message."""
+    own, calls = threading.local(), list[int]()
+
+    def hear(_: Any) -> None:
+        own.calls = getattr(own, "calls", 0) + 1
+        calls.append(own.calls)
+
+    async with two_ends() as (listens, connects):
+        heard = await heard_by(listens, connects)
+        session = connects._session
+        subscriber = session.declare_subscriber("test/it", _zenoh.direct(hear))
+        for count in range(20):
+            listens.put("test/it", b"")
+            await heard.come(count + 1)
+        await until(lambda: len(calls) == 20)
+        assert calls.count(1) <= 4  # threads that came for the first time
+        subscriber.undeclare()
+
+
 async def test_long_questions_and_answers_arrive() -> None:
     async with two_ends() as (one, other):
         question, answers = os.urandom(1 << 20), [os.urandom(1 << 20) for _ in range(3)]

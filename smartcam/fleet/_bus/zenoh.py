@@ -318,7 +318,7 @@ class ZenohEnd(ZenohSession, Bus):
         self, ask: Callable[[Any, Any], None], timeout: float
     ) -> list[tuple[str, bytes]]:
         """Return all answers; ``ask`` sends the question, given the session and a callback."""
-        zenoh, session = self._zenoh, self._session
+        session = self._session
         answers: list[tuple[str, bytes]] = []
         done = self._loop.create_future()
 
@@ -337,7 +337,7 @@ class ZenohEnd(ZenohSession, Bus):
         if session is None:
             return answers
         ended = functools.partial(self.in_loop, end, 0)
-        ask(session, zenoh.handlers.Callback(on_reply, ended, indirect=False))
+        ask(session, direct(on_reply, ended))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await done
