@@ -68,6 +68,10 @@ listens there.
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
+ROOM_TIMEOUT = 0.001
+"""Seconds that the engine waits for room before it drops a message that may be dropped. It waits
+once: until something goes out to the same end, it drops further ones of that priority at once."""
+
 MAX_WAITING_BYTES = 1 << 26
 """Bytes that wait for the event loop, as many of patient things, or for the thread that says what
 is long; what comes beyond is dropped, and results are asked for again later."""
@@ -148,7 +152,9 @@ class BusLink:
             "scouting/delay": 0,
             "transport/shared_memory/enabled": False,
             "transport/link/tx/lease": int(1e3 * LEASE_TIME),
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": int(
+                1e6 * ROOM_TIMEOUT
+            ),
             "routing/interests/timeout": int(1e3 * MAX_LISTING_TIME),
             # of each later try, too: of one that began while a cable was cut the system repeats
             # the packets ever more seldom, so who stays with it for long is back that much later
