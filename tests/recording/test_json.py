@@ -33,8 +33,11 @@ from smartcam.models import (
     Status,
     jsonable,
 )
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
+from smartcam.protocols import BVS, INSIGHT, Frame
+from smartcam.protocols.messages import Sender
 from smartcam.recording._mcap.form import KINDS, message_fields, message_of, nanoseconds
+from smartcam.recording._mcap.json import MAX_FRAMES_ALIKE, FrameTexts, body_of, frame_text
 from tests.recording.recordingkit import at
 
 if TYPE_CHECKING:
@@ -247,3 +250,46 @@ def test_data_of_a_frame_begins_within_it(data_from: int) -> None:
 def test_nanoseconds_are_exact_and_never_negative(when: datetime) -> None:
     since = when - datetime(1970, 1, 1, tzinfo=UTC)
     assert nanoseconds(when) == max(0, since // timedelta(microseconds=1) * 1000)
+
+
+DIALECTS = [*BVS.dialects.values(), *INSIGHT.dialects.values()]
+
+
+@given(
+    frames=st.lists(
+        st.tuples(
+            st.sampled_from(DIALECTS),
+            st.sampled_from(Sender),
+            # ids with data and without, and one that nobody has
+            st.sampled_from([0x20, 0x21, 0x40, 0x41, 0x81, 0xFE]) | st.integers(0, 255),
+            # fronts that come again, with other data behind them
+            st.sampled_from([b"", bytes(2), bytes(4), b"\x05\0\0\0", bytes(6)]),
+            st.binary(max_size=12),
+        ),
+        max_size=30,
+    )
+)
+def test_texts_of_frames_that_are_alike_are_those_of_each(
+    frames: list[tuple[Any, Sender, int, bytes, bytes]],
+) -> None:
+    texts = FrameTexts()
+    for second, (dialect, sender, message_id, front, data) in enumerate(frames * 2):
+        raw = RawFrame(at(second), "left", dialect, sender, Frame(message_id, front + data))
+        entry = raw.entry()
+        assert texts.text(raw) == (frame_text(entry), body_of(entry))
+
+
+def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
+    texts, dialect = FrameTexts(), BVS.dialects["handbook"]
+    (result,) = (
+        number
+        for number in range(256)
+        if dialect.data_begins(Sender.CAMERA, number) is not None
+        and RawFrame(at(0), "left", dialect, Sender.CAMERA, Frame(number, bytes(8))).entry().message
+        == "ResultContainer"
+    )
+    for length in range(1000):
+        raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
+        entry = raw.entry()
+        assert texts.text(raw) == (frame_text(entry), body_of(entry))
+        assert 0 < len(texts._known) <= MAX_FRAMES_ALIKE

@@ -11,9 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._json import NULL, hex_text, text_of
 from smartcam.models import Result
+from smartcam.observers import TraceEntry
+from smartcam.protocols.messages import Sender
 
 if TYPE_CHECKING:
-    from smartcam.observers import TraceEntry
+    from smartcam.observers import RawFrame
+
+MAX_FRAMES_ALIKE = 256
+"""Kinds of frames whose text is kept, apart from their time and data."""
 
 VALUE_IS_RAW = '"raw"'
 
@@ -41,6 +46,48 @@ def frame_text(entry: TraceEntry) -> str:
         f'{{"at":{text_of(at)},"camera":{text_of(camera)},"direction":{text_of(direction)},'
         f'{number}"message":{text_of(message)},{body}"hex":{said}{begins}}}'
     )
+
+
+class FrameTexts:
+    """Makes the texts of frames; of those that are alike but for their data, most of it once."""
+
+    def __init__(self) -> None:
+        # by all that tells a kind: what stands in front of the data and behind it. The dialect is
+        # kept with them, as its place in memory would be another one's afterwards
+        self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
+
+    def text(self, raw: RawFrame) -> tuple[str, str]:
+        """Return a frame's text as :func:`frame_text` makes it, and its data as hex.
+
+        The data is "" where there is none, and where the frame is no camera's.
+        """
+        frame, dialect = raw.frame, raw.dialect
+        if isinstance(frame, TraceEntry):
+            return frame_text(frame), body_of(frame)
+        begins, payload = dialect.data_begins(raw.sender, frame.message_id), frame.payload
+        if begins is None or len(payload) <= begins or raw.sender is not Sender.CAMERA:
+            entry = raw.entry()
+            return frame_text(entry), body_of(entry)
+        kind = raw.camera, id(dialect), frame.message_id, payload[:begins], len(payload)
+        data, known = payload[begins:].hex(), self._known.get(kind)
+        if known is None:
+            entry = raw.entry()
+            text = frame_text(entry)
+            before = f'{{"at":{text_of(raw.at)}'
+            behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
+            if text.startswith(before) and text.endswith(data + behind):
+                if len(self._known) >= MAX_FRAMES_ALIKE:
+                    self._known.clear()
+                front = text[len(before) : len(text) - len(data) - len(behind)]
+                self._known[kind] = front, behind, dialect
+            return text, body_of(entry)
+        return f'{{"at":{text_of(raw.at)}{known[0]}{data}{known[1]}', data
+
+
+def body_of(entry: TraceEntry) -> str:
+    """Return the data that a frame of the camera has, as hex; "" where it has none."""
+    data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
+    return data if type(data) is str else ""
 
 
 def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[str, Any]:

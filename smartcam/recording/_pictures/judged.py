@@ -12,6 +12,8 @@ from smartcam.recording._judged import PictureMatcher
 from smartcam.recording._mcap.form import RecordedPicture, captured_at
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from smartcam.frames import Frame, FrameSource
     from smartcam.models import Result
     from smartcam.recording._recorder import Recorder
@@ -37,11 +39,11 @@ class JudgedPictures(Observer):
         self._matcher = PictureMatcher(MAX_MATCHED_BYTES)
         self._settled = asyncio.Event()
 
-    def on_result(self, result: Result) -> None:
-        """Look for the picture of a result."""
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Look for the pictures of results."""
         self._settled.clear()
-        self._matcher.results.append(result)
-        self._settle(result.camera)
+        self._matcher.results += results
+        self._settle(results[0].camera)
 
     async def record(self, source: FrameSource, camera: str) -> None:
         """Record pictures of an open source until it ends.
