@@ -101,6 +101,29 @@ def test_text_is_that_of_the_standard_library(fields: dict[str, Any]) -> None:
     assert object_text(plain(fields)) == text
 
 
+COLUMNS = st.sampled_from(["<i2", ">i4", "u1", "<u8", "<f2", "<f4", ">f8", "?", "S3", "U2"])
+SHAPES = st.sampled_from([(), (0,), (1,), (3,), (2, 2)])
+
+
+@given(
+    st.dictionaries(st.text(min_size=1, max_size=4), COLUMNS, min_size=1, max_size=4),
+    SHAPES,
+    st.binary(min_size=400, max_size=400),
+)
+@example({"100%": "<f4", '"': "S3"}, (1,), bytes(400))
+@example({"x": "<f4", "y": "<f8"}, (3,), b"\xff" * 400)  # NaN
+@example({"x": "<f8"}, (3,), bytes.fromhex("000000000000f07f") * 50)  # infinity
+def test_text_of_a_table_is_that_of_the_standard_library(
+    columns: dict[str, str], shape: tuple[int, ...], data: bytes
+) -> None:
+    if {"?", "U2"} & {*columns.values()}:
+        data = bytes(len(data))  # not every byte is one of these
+    dtype = np.dtype([*columns.items()])
+    count = int(np.prod(shape))
+    table = np.frombuffer(data, dtype=dtype, count=count).reshape(shape)
+    assert text_of(table) == json.dumps(jsonable(table), separators=(",", ":"))
+
+
 @pytest.mark.parametrize(
     "value", [[{"x": (1, 2)}], [[1.5], None], {"of": [b"\xff"]}, Fraction(1, 2)]
 )

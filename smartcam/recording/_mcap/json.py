@@ -10,19 +10,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam._json import NULL, hex_text, text_of
-from smartcam.models import Result
 from smartcam.observers import TraceEntry
 from smartcam.protocols.messages import Sender
 
 if TYPE_CHECKING:
+    from smartcam.models import Result
     from smartcam.observers import RawFrame
 
 MAX_FRAMES_ALIKE = 256
 """Kinds of frames whose text is kept, apart from their time and data."""
 
 VALUE_IS_RAW = '"raw"'
-
-_RESULT = tuple(f'"{name}":' for name in (*Result._fields, "raw_from", "value_from"))
 
 
 def frame_text(entry: TraceEntry) -> str:
@@ -110,13 +108,25 @@ def result_text(result: Result[Any], raw_from: int | None = None) -> str:
         raw_from: number of the frame whose ``data`` is :attr:`~smartcam.Result.raw`; None:
             write ``raw`` itself.
     """
-    raw, value = result.raw, result.value
-    raw_text = NULL if raw_from is not None else text_of(raw)
-    said, said_from = (NULL, VALUE_IS_RAW) if value is raw else (text_of(value), NULL)
-    last = raw_text, said, text_of(raw_from), said_from
-    return _object_of(_RESULT, (*map(text_of, result[:-2]), *last))
-
-
-def _object_of(names: tuple[str, ...], texts: tuple[str, ...]) -> str:
-    pairs = zip(names, texts, strict=True)
-    return f"{{{','.join([name + text for name, text in pairs if text != NULL])}}}"
+    camera, application, sequence, number, triggered_at, received_at, latency, raw, value = result
+    text = f'{{"camera":{text_of(camera)},"application":{text_of(application)}'
+    if sequence is not None:
+        text += f',"sequence":{text_of(sequence)}'
+    text += f',"number":{text_of(number)}'
+    if triggered_at is not None:
+        text += f',"triggered_at":{text_of(triggered_at)}'
+    text += f',"received_at":{text_of(received_at)}'
+    if latency is not None and (said := text_of(latency)) != NULL:
+        text += f',"latency":{said}'
+    if raw_from is None:
+        text += f',"raw":{text_of(raw)}'
+    if value is raw:
+        end = f',"value_from":{VALUE_IS_RAW}}}'
+    else:
+        end = "}"
+        said = text_of(value)
+        if said != NULL:
+            text += f',"value":{said}'
+    if raw_from is not None:
+        text += f',"raw_from":{raw_from}'
+    return text + end
