@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 MAX_MATCHED_BYTES: Final = 1 << 26
 """Bytes of a camera's last pictures that are kept until the result that was made of one comes."""
 
+FIRST_PICTURE_TIMEOUT: Final = 2.0
+"""Seconds until the first picture is there, at most, before the first trigger is sent."""
+
 LAST_PICTURE_TIMEOUT: Final = 2.0
 """Seconds that the picture of a result may come behind it, at most, where the recording ends."""
 
@@ -38,6 +41,7 @@ class JudgedPictures(Observer):
         self._recorder = recorder
         self._matcher = PictureMatcher(MAX_MATCHED_BYTES)
         self._settled = asyncio.Event()
+        self._streams = asyncio.Event()
 
     def on_results(self, results: Sequence[Result]) -> None:
         """Look for the pictures of results."""
@@ -55,6 +59,7 @@ class JudgedPictures(Observer):
         """
 
         def take(frame: Frame) -> bool:
+            self._streams.set()
             self._matcher.add_picture(RecordedPicture(camera, captured_at(frame), frame))
             self._settle(camera)
             return True
@@ -64,6 +69,12 @@ class JudgedPictures(Observer):
             await tap.ended()
         finally:
             tap.close()
+
+    async def wait_streaming(self) -> None:
+        """Wait until a picture has come, before which no result can have one; 2 s at most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_PICTURE_TIMEOUT):
+                await self._streams.wait()
 
     async def wait_settled(self) -> None:
         """Wait until each result so far has its picture, or can have none; 2 s at most."""
