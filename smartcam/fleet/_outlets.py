@@ -19,7 +19,7 @@ from smartcam.observers import Observer
 from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._agent.server import FleetServer
@@ -190,10 +190,14 @@ class _OutletObserver(Observer):
             return
         self._owner.outlets.state_changed(name, {**state, "at": event.at})
 
-    def on_result(self, result: Result) -> None:
-        """Hand on a result."""
-        owner, read = self._owner, self._owner.reading(result.camera)
-        endian = owner.endian(result.camera)
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Hand on results that came together."""
+        camera = results[0].camera
+        read, endian = self._owner.reading(camera), self._owner.endian(camera)
+        for result in results:
+            self._offer(result, read, endian)
+
+    def _offer(self, result: Result, read: Interpretation | None, endian: int) -> None:
         cells = result.value.cells
 
         def value() -> tuple[Any, int | None]:
@@ -212,7 +216,7 @@ class _OutletObserver(Observer):
             done = read(container, endian, camera=camera, number=number, at=at)
             return done.value, done.sequence
 
-        owner.outlets.offer_result(result, value)
+        self._owner.outlets.offer_result(result, value)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Hand on how a trigger ended that has no result."""
