@@ -48,7 +48,7 @@ from smartcam.fleet._security.access import RIGHTS
 from smartcam.fleet._security.certificates import ROLES
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import MAX_SURPLUS
+from smartcam.protocols._framed.dialect import MAX_SURPLUS_BYTES
 from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._machine import State
 from smartcam.protocols.messages import Request, Sender, Wire
@@ -691,7 +691,7 @@ def _wrap(names: list[str]) -> str:
 
 def policies() -> str:
     """Return what each role does with broken input."""
-    surplus = f"is accepted and counted; by more than {MAX_SURPLUS:,} bytes it is broken"
+    surplus = f"is accepted and counted; by more than {MAX_SURPLUS_BYTES:,} bytes it is broken"
     rows = [
         (
             role.value,

@@ -5,7 +5,7 @@ may compare, hash and print as it likes. A value that cannot work is a
 :exc:`~smartcam.ConfigurationError` that says which argument it is, what was expected, and what
 came. Nothing is searched, sent or waited for.
 
-``who`` names whose argument it is, such as a camera; "" where the argument's name says it all.
+``who`` names whose argument it is, such as a camera; "" if the argument's name says it all.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import asyncio
     import socket
 
-LARGEST_DATAGRAM = 1 << 16
+MAX_DATAGRAM_BYTES = 1 << 16
 """Largest number of bytes that one read makes room for: UDP's length field, 16 bits, cannot say
 more."""
 
@@ -25,14 +25,14 @@ def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
     it is.
     """
     size = getattr(transport, "max_size", None)
-    if isinstance(size, int) and size > LARGEST_DATAGRAM:
-        transport.max_size = LARGEST_DATAGRAM  # type: ignore[attr-defined]
+    if isinstance(size, int) and size > MAX_DATAGRAM_BYTES:
+        transport.max_size = MAX_DATAGRAM_BYTES  # type: ignore[attr-defined]
 
 
 def second_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
     """Return a socket by which to read the datagrams that have come already; its maker closes it.
 
-    asyncio reads one datagram in a turn of its loop. None where the loop reads several by itself
+    asyncio reads one datagram in a turn of its loop. None if the loop reads several by itself
     (uvloop), and where reading aside is not safe (Windows' proactor).
     """
     known = transport.get_extra_info("socket")

@@ -48,7 +48,7 @@ MAX_NAMED_WORDS = 30
 
 
 def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | None = None) -> str:
-    """Return the end of an error text, with the known word that is closest; empty where none is.
+    """Return the end of an error text, with the known word that is closest; empty if none is.
 
     ``meant``: known words by what others call them, such as ``real32`` for ``float``.
     """
@@ -57,7 +57,7 @@ def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | Non
 
 
 def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | None:
-    """Return the known word that was probably meant, None where none is close.
+    """Return the known word that was probably meant, None if none is close.
 
     ``least``: score, up to 1, below which a known word is not close.
 
@@ -132,7 +132,7 @@ def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
 
 
 def _parts(word: str) -> list[str]:
-    """Return the parts of a word in small letters: ``maxQueue_bytes`` has three."""
+    """Return the parts of a word in lower case: ``maxQueue_bytes`` has three."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", word)
     return [part.lower() for part in re.split(r"[\W_]+", spaced) if part]
 

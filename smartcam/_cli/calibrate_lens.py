@@ -30,7 +30,7 @@ MIN_NEW_VIEW_SHARE: Final = 0.05
 
 MAX_VIEWS: Final = 200
 
-MAX_DESCRIPTION: Final = 65_536
+MAX_DESCRIPTION_BYTES: Final = 65_536
 """Largest number of bytes of a target's description."""
 
 
@@ -158,7 +158,7 @@ def read_target(path: str) -> Target:
 
     try:
         with Path(path).open("rb") as stream:
-            data: object = json.loads(stream.read(MAX_DESCRIPTION))
+            data: object = json.loads(stream.read(MAX_DESCRIPTION_BYTES))
     except OSError as exc:
         raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
     except (ValueError, RecursionError) as exc:

@@ -124,4 +124,4 @@ SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
     ".png": _png,
     ".raw": _raw,
 }
-"""The function that makes a file, by the suffix of its name in small letters."""
+"""The function that makes a file, by the suffix of its name in lower case."""

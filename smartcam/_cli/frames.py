@@ -93,7 +93,7 @@ async def list_(scheme: str | None, options: Options) -> None:
 
 
 async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
-    """Return the sources that a scheme's driver finds, None where the driver has no search.
+    """Return the sources that a scheme's driver finds, None if the driver has no search.
 
     The error of a broken driver is returned, and costs only the line of its scheme.
     """

@@ -73,8 +73,9 @@ class CommandLock:
     _switch_timeout: float  # bound of each switch, seconds
 
     def __post_init__(self) -> None:
-        self._jobs: asyncio.TaskGroup | None = None  # of the session, None between two
-        self._owed: Before | None = None  # to go back to in the next session
+        # tasks of the session; None between two sessions
+        self._jobs: asyncio.TaskGroup | None = None
+        self._owed: Before | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
         self._in_line = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()

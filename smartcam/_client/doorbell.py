@@ -36,7 +36,8 @@ class Doorbell:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._asyncio_future_blocking = False
-        self._wake: Callable[[Doorbell], None] | None = None  # None: nobody waits
+        # function that wakes the waiting task; None if nobody waits
+        self._wake: Callable[[Doorbell], None] | None = None
         self._context: contextvars.Context | None = None
 
     def ring(self) -> None:
@@ -90,7 +91,8 @@ class PlainDoorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._ringing: asyncio.Future[None] | None = None  # None: nobody waits
+        # future of the waiting task; None if nobody waits
+        self._ringing: asyncio.Future[None] | None = None
 
     def ring(self) -> None:
         """Have the task go on."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MAX_FILE_BYTES: Final = 1 << 30
 """Largest number of bytes of a file that is read."""
 
-MAX_HEAD: Final = 1 << 12
+MAX_HEAD_BYTES: Final = 1 << 12
 """Largest number of bytes of a file in which a comment says the unit."""
 
 UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
@@ -108,7 +108,7 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
 
 def _said_unit(data: bytes) -> str:
     """Return the unit that a comment of the header says; else BadTableError."""
-    found = UNIT.search(data[:MAX_HEAD])
+    found = UNIT.search(data[:MAX_HEAD_BYTES])
     if found is None:
         raise BadTableError(
             'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '

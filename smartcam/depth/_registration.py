@@ -129,7 +129,8 @@ def register(
         min_overlap: part of the source that must lie on the target.
 
     Raises:
-        ConfigurationError: no such method, lengths that are not above 0, fewer than 20 points.
+        ConfigurationError: there is no such method, lengths that are not above 0, fewer than 20
+            points.
         MissingExtraError: the extra ``depth`` is not installed.
     """
     _check(method, max_distance, min_overlap)

@@ -73,7 +73,7 @@ class StereoStatistics:
         group: statistics of the frames' pairing; its ``skew`` is the largest.
         skew: seconds by which the right frames are later: the median of the last pairs; None: no
             pair came yet.
-        drift: rate by which the right camera's clock is faster than the left one's, seconds a
+        drift: rate by which the right camera's clock is faster than the left one's, seconds per
             second; None: not known yet.
         drift_from: ``clocks``: of what the cameras' own clocks said; ``frames``: they have none,
             and it is by how much the right one gives more frames of the same nominal rate; "".
@@ -113,7 +113,7 @@ class StereoDepth:
         focal_sigma: standard deviation of the focal length, pixels of the calibrated left picture;
             a calibration of a pair tells only that of where the cameras are.
         within: largest skew, seconds; None: half of the time between two frames.
-        timeout: seconds that an iteration waits for a pair; None: as long as it takes.
+        timeout: seconds that an iteration waits for a pair; None: without limit.
 
     Raises:
         ConfigurationError: a value that is not valid, or no calibration of two cameras.

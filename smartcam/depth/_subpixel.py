@@ -44,7 +44,7 @@ MIDDLE_GREY: Final = 128
 """Grey level that is taken off, so that squares keep their digits."""
 
 MIN_WINDOW_PIXELS: Final = 12
-"""Pixels of a window at least, whose least squares have two unknowns."""
+"""Least number of pixels of a window, whose least squares have two unknowns."""
 
 GAIN_SIGMA: Final = 0.3
 """Standard deviation, about 1, that the gain between the pictures is taken to have beforehand."""
@@ -142,8 +142,8 @@ class _DisparityPlane(NamedTuple):
 
     across: Field  # slope, pixels a pixel
     down: Field
-    rough: Field  # how far the disparities are from it, rms, pixels
-    pixels: Field  # how many have a disparity
+    rough: Field  # RMS distance of the disparities from the plane, pixels
+    pixels: Field  # number of pixels with a disparity
 
 
 def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
@@ -192,10 +192,11 @@ class _Refined(NamedTuple):
     """All (H, W); the sigma is infinite where there is no texture."""
 
     disparity: Field  # pixels
-    sigma: Field  # of noise that is not correlated, pixels
+    sigma: Field  # sigma from uncorrelated noise, pixels
     linear: _LinearMatch
-    expected: Field  # of linear.e, by the constant and the gain of each window, grey levels
-    variance: Field  # of linear.e, grey levels^2
+    # expected part of linear.e, by the constant and the gain of each window, grey levels
+    expected: Field
+    variance: Field  # variance of linear.e, grey levels^2
 
 
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:

@@ -39,7 +39,7 @@ class Finding:
         severity: ``ok``: as it should be, or only said; ``hint``: something to know or to try;
             ``warning``: it works, and something is wrong; ``error``: it does not work.
         text: what was found, in plain words.
-        cure: what to do, empty where nothing is to be done.
+        cure: what to do, empty if nothing is to be done.
         details: the finding as values for programs; times in seconds.
         exit_code: what a command that ends with it returns; 0 for all but errors.
     """

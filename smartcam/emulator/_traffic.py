@@ -55,9 +55,9 @@ class LogEntry(NamedTuple):
         error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
         fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
-            behind them where it was lost for that reason. None where none did. The entry of a
-            message is made when it has passed, or is lost. What the camera sends is told as it
-            meant it, what it hears as it heard it.
+            behind them where it was lost for that reason. None if none did. The entry of a message
+            is made when it has passed, or is lost. What the camera sends is told as it meant it,
+            what it hears as it heard it.
         wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
             of the frame.
     """
@@ -127,9 +127,9 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # behind those
-        self._weights: deque[int] = deque()  # of both, in the same order
-        self._size = 0  # their sum, bytes
+        self._unread: deque[LogEntry | _Traced] = deque()  # entries after those
+        self._weights: deque[int] = deque()  # sizes of both, in the same order, bytes
+        self._size = 0  # sum of these, bytes
         self._gone = 0  # entries that there have been before them
 
     def __repr__(self) -> str:

@@ -35,10 +35,9 @@ class InSightDriver(FrameDriver):
     with the camera exists only while somebody reads.
 
     ============ ============================================================================
-    ``fps``      how often it is asked, times a second; usual 2
-    ``timeout``  seconds for connecting, and for a picture; usual 10
-    ``name``     of the camera
-    ============ ============================================================================
+    ``fps``      how often it is asked, times per second; usual 2 ``timeout``  seconds for
+    connecting, and for a picture; usual 10 ``name``     of the camera ============
+    ============================================================================
 
     The camera does not say when a picture was taken, nor whether it is new. A picture with the same
     bytes as the last is taken for the same, and is not returned again: if nothing triggers the

@@ -108,7 +108,7 @@ class FrameReader:
 
         Args:
             max_age: seconds since it was captured; ``inf``: any.
-            timeout: seconds; None: as long as it takes.
+            timeout: seconds; None: without limit.
 
         Raises:
             ConfigurationError: a time that is not valid.
@@ -133,7 +133,7 @@ class FrameReader:
 
         Args:
             moment: time of ``time.monotonic()``.
-            timeout: seconds; None: as long as it takes.
+            timeout: seconds; None: without limit.
 
         Raises:
             ConfigurationError: a time that is not valid.

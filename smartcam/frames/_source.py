@@ -88,7 +88,7 @@ class FrameSource(FrameSink):
     Args:
         driver: driver of the device; it is the source's from now on.
         camera_info: the lens, which every frame gets; None: as the driver has it.
-        timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+        timeout: seconds that an iteration waits for a frame; None: without limit.
         stall: seconds without a frame after which a streaming device counts as stuck: readers get
             a :exc:`~smartcam.FrameSourceError`. None: never, as with one that waits for triggers.
         linger: seconds that it goes on streaming after the last reader, for one that comes back.
@@ -119,7 +119,8 @@ class FrameSource(FrameSink):
         self._took = asyncio.Event()  # a reader took a frame, or went
         self._held_up = False  # the driver waits for readers
         self._streaming = False
-        self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
+        # error that the driver ended with, in a tuple
+        self._over: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
@@ -158,7 +159,7 @@ class FrameSource(FrameSink):
         Args:
             *names: names of the events, as ``EventSelector`` has them.
             size: events that are kept for a reader that is slow.
-            timeout: seconds that an iteration waits for an event; None: as long as it takes.
+            timeout: seconds that an iteration waits for an event; None: without limit.
 
         Raises:
             ConfigurationError: no name, or a number that is not valid.
@@ -300,8 +301,8 @@ class FrameSource(FrameSink):
         """Begin to read; the device streams from now on.
 
         Args:
-            timeout: seconds that an iteration waits for a frame; None: as long as it takes; left
-                out: the source's.
+            timeout: seconds that an iteration waits for a frame; None: without limit; left out: the
+                source's.
 
         Raises:
             LocalProtocolError: the source is not open.

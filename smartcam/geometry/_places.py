@@ -23,7 +23,7 @@ MAX_PLACES: Final = 1000
 """Largest number of rows, columns or layers of a pattern."""
 
 MIN_SINE: Final = 0.5
-"""Sine of the angle between the touched row and column at least: 30 degrees."""
+"""Least sine of the angle between the touched row and column: 30 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -247,7 +247,7 @@ def _spreads(number: int, *, sided: bool) -> float:
 
 
 def _left_out(left_out: Mapping[str, str]) -> str:
-    """Return the sentence about pictures that nothing was learned from; "" where there are none."""
+    """Return the sentence about pictures that nothing was learned from; "" if there are none."""
     if not left_out:
         return ""
     named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_NAMED]

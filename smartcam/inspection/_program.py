@@ -207,7 +207,7 @@ class FollowedApplication(Tool[ToolSettings]):
 
 
 def _reason(findings: Mapping[str, Finding]) -> str:
-    """Return the first reason among findings; "" where all are ok."""
+    """Return the first reason among findings; "" if all are ok."""
     for name, found in findings.items():
         if not found.ok:
             why = found.reason or "not ok"

@@ -23,7 +23,7 @@ from typing import NamedTuple, NoReturn
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import InterpretationError, LayoutError
 
-MAX_TEXT = 20_000
+MAX_TEXT_CHARACTERS = 20_000
 """A layout text has at most this many characters. A container holds about 64 kB; a thousand fields,
 each configured by hand on the camera, still fit."""
 
@@ -225,11 +225,11 @@ def parse_text(text: str, start: int = 0) -> LayoutSpec:
 
 
 def _check_length(text: str, length: int, start: int, form: str = "") -> None:
-    if length > MAX_TEXT:
+    if length > MAX_TEXT_CHARACTERS:
         raise LayoutError(
-            f"layout: {form}expected at most {MAX_TEXT} characters, got {length}",
+            f"layout: {form}expected at most {MAX_TEXT_CHARACTERS} characters, got {length}",
             text=text,
-            position=min(start + MAX_TEXT, len(text)),
+            position=min(start + MAX_TEXT_CHARACTERS, len(text)),
         )
 
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from smartcam._arguments import check_path, shown
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
+from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -54,7 +54,7 @@ def read_model(
     named = f"{what} {path}"
     try:
         with path.open(encoding="utf-8") as stream:
-            text = stream.read(MAX_YAML_TEXT + 1)
+            text = stream.read(MAX_YAML_TEXT_CHARACTERS + 1)
     except UnicodeDecodeError as exc:
         raise ConfigurationError(f"{named}: {exc}") from exc
     except OSError as exc:

@@ -8,7 +8,7 @@ from typing import Any
 from smartcam import _extras
 from smartcam.exceptions import ConfigurationError
 
-MAX_YAML_TEXT = 1 << 23
+MAX_YAML_TEXT_CHARACTERS = 1 << 23
 """A YAML document has at most this many characters: a container of 1 MiB in hex takes a quarter."""
 
 MAX_NODES = 500_000
@@ -61,8 +61,8 @@ def compose(text: str, *, what: str = "YAML") -> Any:
         MissingExtraError: PyYAML is not installed.
     """
     yaml = yaml_module(what)
-    if len(text) > MAX_YAML_TEXT:
-        raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT} at most")
+    if len(text) > MAX_YAML_TEXT_CHARACTERS:
+        raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT_CHARACTERS} at most")
     try:
         return yaml.compose(text, _loader(yaml))
     except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:

@@ -80,8 +80,8 @@ class Pump:
             they do again.
 
     Attributes:
-        trouble: reason for which nothing is delivered at the time; "" where all is well.
-        disk_trouble: reason for which nothing is spooled at the time; "" where all is well.
+        trouble: reason for which nothing is delivered at the time; "" if all is well.
+        disk_trouble: reason for which nothing is spooled at the time; "" if all is well.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Pump:
 
         Raises:
             ConfigurationError: another process has the spool.
-            sqlite3.Error: its file cannot be made.
+            sqlite3.Error: its file cannot be created.
         """
         try:
             await self._run(lambda: None)  # which opens it

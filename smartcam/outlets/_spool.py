@@ -78,8 +78,8 @@ class Spool:
     """A spool in one file; every method blocks, and belongs to one thread at a time.
 
     Args:
-        path: the file; made if it is not there. A damaged one is put aside, what can be read of it
-            is kept, and a gap tells of the rest.
+        path: the file; made if it does not exist. A damaged one is put aside, what can be read of
+            it is kept, and a gap tells of the rest.
         max_bytes: bytes of entries that wait at most.
         policy: what happens beyond: the oldest entries make room, or the newest are refused; both
             are counted, and a gap stands where they were.
@@ -88,7 +88,7 @@ class Spool:
 
     Raises:
         ConfigurationError: another process has the spool.
-        sqlite3.Error: the file cannot be made or written.
+        sqlite3.Error: the file cannot be created or written.
 
     Attributes:
         epoch: number of this start, larger than all before, whatever the clock says.
@@ -347,7 +347,7 @@ class Spool:
         Args:
             waiting: entries of :meth:`head`.
             count: number of those that were taken.
-            refused: why the far end never takes the next one; "" where none was refused.
+            refused: why the far end never takes the next one; "" if none was refused.
         """
         database = self._there
         if waiting.epoch != self.epoch:
@@ -403,7 +403,7 @@ class Spool:
 
 
 def read_account(path: Path) -> OutletAccount | None:
-    """Return the account in a spool's file, which a process may have; None where there is none.
+    """Return the account in a spool's file, which a process may have; None if there is none.
 
     Raises:
         sqlite3.Error: it cannot be read now.

@@ -292,7 +292,7 @@ class _StoreFile:
         known: dict[str, str],
         wanted: Column,
     ) -> None:
-        """Add the column of a value to those that are known, made if need be."""
+        """Add the column of a value to those that are known, created if needed."""
         name, kind, unit = wanted
         there = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)

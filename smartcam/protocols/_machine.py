@@ -39,7 +39,7 @@ class State(enum.Enum):
 
 
 class Frame(NamedTuple):
-    """One frame: message id and the bytes behind the header."""
+    """One frame: message id and the bytes after the header."""
 
     message_id: int
     payload: bytes

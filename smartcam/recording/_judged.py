@@ -31,7 +31,7 @@ class JudgedResult(NamedTuple):
 
     Attributes:
         result: result of the camera.
-        picture: picture that the result was made of; None where there is none.
+        picture: picture that the result was made of; None if there is none.
         told: True if the recorder was told that the two belong together, as after
             ``read_image()``; False where the picture was found by the times. Without a trigger
             of this client the times say nothing: the picture is None.

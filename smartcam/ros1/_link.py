@@ -77,7 +77,7 @@ def _aiohttp() -> Any:
 
 
 def link_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that a link raises where it cannot be made, or breaks."""
+    """Return the errors that a link raises where it cannot be created, or breaks."""
     return OSError, TimeoutError, _aiohttp().ClientError
 
 
@@ -147,7 +147,7 @@ class BridgeLink:
         url: URL of the bridge.
         outbox: operations and messages to send.
         connected: whether there is a bridge now.
-        failure: reason why there is no bridge; "" where nothing has been tried.
+        failure: reason why there is no bridge; "" if nothing has been tried.
         changed: condition that is notified of each change of ``connected`` and ``failure``.
     """
 

@@ -32,7 +32,8 @@ class Lane:
         self._depth = depth
         self._waiting: collections.deque[tuple[Part, ...]] = collections.deque()
         self.waiting_bytes: int = 0
-        self._last: tuple[Part, ...] | None = None  # of a latched topic, for a bridge to come
+        # last message of a latched topic, for the next bridge
+        self._last: tuple[Part, ...] | None = None
 
     def __bool__(self) -> bool:
         return bool(self._waiting)

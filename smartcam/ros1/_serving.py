@@ -169,6 +169,6 @@ class RosbridgeService:
 
 
 def error_field(kind: MessageType) -> str:
-    """Return the field of a response that says what went wrong, "" where it has none."""
+    """Return the field of a response that says what went wrong, "" if it has none."""
     texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
     return next((one for one in ERROR_FIELDS if one in texts), "")

@@ -29,7 +29,7 @@ MAX_ENTRIES = 1000
 """Log entries that one answer tells; ``next`` says where to go on."""
 
 MAX_WAIT = 30.0
-"""Seconds that a call waits for a log entry at most."""
+"""Seconds that a call may wait for a log entry."""
 
 MAX_WAITING_CHANGES = 16
 """Largest number of calls that may wait for a log entry at a time: with the event streams half of

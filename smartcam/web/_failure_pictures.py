@@ -16,7 +16,7 @@ PERIOD: Final = 0.2
 """Seconds between two looks at the rows that fail."""
 
 CAMERA_PERIOD: Final = 10.0
-"""Seconds between two pictures of one camera, at least."""
+"""Seconds that must pass between two pictures of one camera."""
 
 SETTLING: Final = 0.2
 """Seconds in which a newer result would arrive that the camera had when it sent the picture."""

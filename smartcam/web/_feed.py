@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
-"""Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
+"""Log entries in one event; at ten events per second it keeps up with 2000 messages per second."""
 
 MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""

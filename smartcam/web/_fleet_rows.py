@@ -31,14 +31,14 @@ MAX_QUEUE: Final = 64
 MAX_QUEUE_BYTES: Final = 1 << 18
 """Largest number of bytes of them."""
 
-MAX_KEPT: Final = 1 << 16
+MAX_KEPT_BYTES: Final = 1 << 16
 """Largest number of bytes of a result that is kept for its picture; of a longer one its length is
 told."""
 
 MAX_DRAWN: Final = 30
 """Largest number of parts of a result in its picture."""
 
-MAX_TEXT: Final = 160
+MAX_TEXT_CHARACTERS: Final = 160
 """Largest number of characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
@@ -67,7 +67,7 @@ class RowState(NamedTuple):
     """The state of a camera."""
 
     connected: bool
-    over: bool  # it was given up
+    over: bool  # whether the camera was given up
     status: Status
     application: int | None
     reason: str  # why it is not connected
@@ -99,7 +99,7 @@ class FleetRow:
         stirred: True if the camera may have changed since the last look.
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
-        changed_at: time at which the camera was connected or lost at last, seconds since 1970.
+        changed_at: time at which the camera was last connected or lost, seconds since 1970.
         changed_seen: False if that happened before the camera was followed; the time is then that
             of the first look.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.
@@ -127,7 +127,7 @@ class FleetRow:
         self._units = units
         self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
-        self._layout: Layout | None = None  # of the last result
+        self._layout: Layout | None = None  # layout of the last result
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: RowState = UNKNOWN
         self._connected = False
@@ -210,7 +210,7 @@ class FleetRow:
         self.count += missed + dropped
 
     def _note(self, error: str, now: float) -> None:
-        self.error, self.error_at = error[:MAX_TEXT], now
+        self.error, self.error_at = error[:MAX_TEXT_CHARACTERS], now
 
     def refresh(self, now: float) -> tuple[bool, bool]:
         """Look how the camera is; return whether that changed, and whether it was lost."""
@@ -325,7 +325,7 @@ class FleetRow:
             "number": result.number,
             "outcome": judged(result.value),
         }
-        if len(result.raw) > MAX_KEPT:
+        if len(result.raw) > MAX_KEPT_BYTES:
             return {**told, "text": f"{len(result.raw)} bytes"}
         value = shown_value(result.value, self._layout)
         if "parts" in value:
@@ -336,12 +336,12 @@ class FleetRow:
             ]
             return {**told, "parts": parts, "parts_count": value["count"]}
         if "cut" in value:
-            return {**told, "text": value["cut"][:MAX_TEXT]}
+            return {**told, "text": value["cut"][:MAX_TEXT_CHARACTERS]}
         units = value["units"]
         lines = {"text": line_of(value["value"], units)}
         if units:
             lines["practical"] = line_of(value["value"], units, self._units)
-        return {**told, **{name: text[:MAX_TEXT] for name, text in lines.items()}}
+        return {**told, **{name: text[:MAX_TEXT_CHARACTERS] for name, text in lines.items()}}
 
 
 def _why(camera: FleetCamera[Any]) -> str:
@@ -349,7 +349,7 @@ def _why(camera: FleetCamera[Any]) -> str:
     trouble = camera.trouble
     if trouble is None:
         return ""
-    return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT]
+    return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT_CHARACTERS]
 
 
 class _RowBell(asyncio.Event):

@@ -1,6 +1,6 @@
 """Keep the fleet's page up to date: follow a fleet once, however many look.
 
-One task looks five times a second at what rang, which costs nothing while nothing happens. Nobody
+One task looks five times per second at what rang, which costs nothing while nothing happens. Nobody
 who looks is waited for: they ask for rows in an order, and for what is newer than they know.
 """
 
@@ -78,7 +78,7 @@ class RowOrder(NamedTuple):
     """Names in an order."""
 
     names: list[str]
-    version: int  # of the view, when it was made
+    version: int  # version of the view at its creation
     at: float
 
 

@@ -100,7 +100,8 @@ class TeachSite(ThreadedSite):
         made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
-        self._tried: dict[int, Inspection] = {}  # by picture, by the tools that were tried last
+        # results by picture, of the tools that were tried last
+        self._tried: dict[int, Inspection] = {}
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
         """Have the thread do something.

@@ -54,7 +54,7 @@ def judged(value: Any) -> Outcome:
 
 
 def failing(value: Any) -> str:
-    """Return the truth values that are not as they should be, in words; "" where none is."""
+    """Return the truth values that are not as they should be, in words; "" if none is."""
     bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
     texts = []
     for one in bad:

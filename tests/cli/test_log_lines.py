@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from smartcam._cli import log_lines
-from smartcam._cli.log_lines import FIELDS, MAX_TEXT, json_log
+from smartcam._cli.log_lines import FIELDS, MAX_TEXT_CHARACTERS, json_log
 from smartcam.exceptions import ConnectionLostError
 
 LOGGER = logging.getLogger("smartcam.client")
@@ -61,7 +61,7 @@ def test_a_line_has_the_fields_of_the_table(tmp_path: Path) -> None:
         lambda: LOGGER.warning("! %s", ConnectionLostError("line1/cam1: the link ended")),
         lambda: LOGGER.warning("by hand", extra={"camera": "line1/cam2"}),
         lambda: LOGGER.warning("%d arguments", "that do not fit"),
-        lambda: LOGGER.warning("%s", "x" * (MAX_TEXT + 10)),
+        lambda: LOGGER.warning("%s", "x" * (MAX_TEXT_CHARACTERS + 10)),
     )
     assert [one["camera"] for one in lines] == [
         *("line1/cam2", "line1/cam1", None, "line1/cam1", "line1/cam2", None, None)
@@ -78,7 +78,7 @@ def test_a_line_has_the_fields_of_the_table(tmp_path: Path) -> None:
     assert failed["exception"].endswith("ValueError: it broke")
     assert other["message"] == "something else\nin two lines"
     assert "that do not fit" in wrong["message"]
-    assert len(long["message"]) == MAX_TEXT
+    assert len(long["message"]) == MAX_TEXT_CHARACTERS
     assert {one["agent"] for one in lines} == {"a1"}
 
 

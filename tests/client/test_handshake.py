@@ -20,7 +20,7 @@ from smartcam.exceptions import (
     RemoteProtocolError,
 )
 from smartcam.models import Status
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame
 from smartcam.protocols import BVS, State
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
@@ -198,10 +198,11 @@ async def test_establish_newer_version_is_a_warning(caplog: pytest.LogCaptureFix
 
 
 async def test_establish_hands_the_trace_every_frame() -> None:
-    entries: list[TraceEntry] = []
+    frames: list[RawFrame] = []
     async with scripted(good) as listener:
-        session = await establish(settings(listener.port), entries.append)
+        session = await establish(settings(listener.port), frames.append)
         await session.link.close(LIMIT)
+    entries = [one.entry() for one in frames]
     assert [(entry.direction, entry.message) for entry in entries] == [
         (">", "Disconnect"),
         (">", "Connect"),

@@ -7,8 +7,8 @@ from smartcam.fleet import load_fleet
 from smartcam.inspection import load_cell
 from smartcam.layout import Layout
 from smartcam.layout._inside import load, pack_texts
-from smartcam.layout._text import MAX_TEXT as MAX_LAYOUT
-from smartcam.layout._yamls import MAX_YAML_TEXT
+from smartcam.layout._text import MAX_TEXT_CHARACTERS as MAX_LAYOUT
+from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS
 from tests.budgets.inputs import MERGED, PAST_LOOKAHEAD, YAML, laughs_of
 from tests.budgets.parser import Make, Parser, fill_text, from_file, grown
 
@@ -108,7 +108,7 @@ PARSERS: tuple[Parser, ...] = (
                 for kind in ("keys", "aliases of aliases", "nested brackets")
             },
         },
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -125,7 +125,7 @@ PARSERS: tuple[Parser, ...] = (
         "YAML",
         load,
         YAML,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -136,7 +136,7 @@ PARSERS: tuple[Parser, ...] = (
         "scenarios",
         from_file(load_scenario, "a.yaml"),
         _SCENARIOS,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -147,7 +147,7 @@ PARSERS: tuple[Parser, ...] = (
         "fleet files",
         from_file(load_fleet, "a.yaml"),
         _FLEETS,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -157,7 +157,7 @@ PARSERS: tuple[Parser, ...] = (
         "cell files",
         from_file(load_cell, "a.yaml"),
         _CELL_FILES,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,

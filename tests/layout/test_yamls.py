@@ -29,7 +29,7 @@ def test_load_of_a_bomb_is_refused_with_its_line(
 
 def test_load_of_too_long_a_text_is_refused() -> None:
     with pytest.raises(BadYamlError, match="8388609 characters, expected 8388608 at most"):
-        load(" " * (yamls.MAX_YAML_TEXT + 1))
+        load(" " * (yamls.MAX_YAML_TEXT_CHARACTERS + 1))
 
 
 @pytest.mark.parametrize(

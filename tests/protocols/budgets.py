@@ -9,8 +9,8 @@ from smartcam.models import Status
 from smartcam.protocols import FramedDialect, LineDialect, LineMachine, Machine, Role, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
-from smartcam.protocols._insight.answers import MAX_IMAGE
-from smartcam.protocols._insight.words import MAX_LINE
+from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES
+from smartcam.protocols._insight.words import MAX_LINE_BYTES
 from tests.budgets.inputs import LINE_ROWS, TEXT_LINES, UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, streamed
 from tests.machines import B16, BID, THESIS
@@ -188,14 +188,14 @@ PARSERS: tuple[Parser, ...] = (
                 "empty lines": fill(b"\r\n", b"1\r\n9\r\n"),
             }
         ),
-        2 * MAX_IMAGE,
+        2 * MAX_IMAGE_BYTES,
         "protocols._insight.answers.MAX_IMAGE, in hex",
     ),
     Parser(
         "In-Sight: lines",
         functools.partial(_insight_answers, m.GetStatus),
         streamed(TEXT_LINES),
-        MAX_LINE,
+        MAX_LINE_BYTES,
         "protocols._insight.words.MAX_LINE",
         size=1000,
     ),

@@ -92,7 +92,7 @@ def written(path: Path, *records: bytes) -> Path:
 def test_load_recording_chunk_that_unpacks_beyond_the_bound_is_refused(
     tmp_path: Path, how: str, said: int | None
 ) -> None:
-    path = written(tmp_path / "bomb.mcap", chunk(bytes(3 * bounds.MAX_CHUNK), how, said))
+    path = written(tmp_path / "bomb.mcap", chunk(bytes(3 * bounds.MAX_CHUNK_BYTES), how, said))
     tracemalloc.start()
     try:
         with pytest.raises(RecordingError) as told:
@@ -101,8 +101,8 @@ def test_load_recording_chunk_that_unpacks_beyond_the_bound_is_refused(
     finally:
         tracemalloc.stop()
     assert str(told.value).startswith(f"recording {path}: a chunk unpacks to more than ")
-    assert str(told.value).endswith(f" bytes, expected {bounds.MAX_CHUNK} at most")
-    assert most < 2 * bounds.MAX_CHUNK
+    assert str(told.value).endswith(f" bytes, expected {bounds.MAX_CHUNK_BYTES} at most")
+    assert most < 2 * bounds.MAX_CHUNK_BYTES
 
 
 @pytest.mark.parametrize("how", ["zstd", "lz4", ""])
@@ -303,7 +303,7 @@ def test_load_recording_message_that_is_no_object_is_told(tmp_path: Path, body: 
         record(4, b"x"),
         record(6, b"x" * 30),
         record(12, b"\xff\xff\xff\xff"),
-        record(12, bytes(bounds.MAX_FACTS + 1)),
+        record(12, bytes(bounds.MAX_FACTS_BYTES + 1)),
         struct.pack("<BQ", 6, 1 << 60),
         chunk(message(RESULT)[:-3]),
         chunk(b"\x05\x00"),

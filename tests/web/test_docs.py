@@ -87,11 +87,11 @@ def test_frames_page_has_its_numbers() -> None:
 def test_bounds_are_those_of_the_code() -> None:
     said = {
         f"did not come within {routes.READ_TIMEOUT:g} s",
-        f"more than {routes.MAX_BODY >> 10} KiB",
+        f"more than {routes.MAX_BODY_BYTES >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.SLOW:g} s",
-        f"long payloads to {serialize.MAX_HEX} bytes "
-        f"and decode results up to {serialize.MAX_VALUES}",
+        f"long payloads to {serialize.MAX_HEX_BYTES} bytes "
+        f"and decode results up to {serialize.MAX_VALUES_BYTES}",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit

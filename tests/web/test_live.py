@@ -31,8 +31,8 @@ from smartcam.web._live import CALLS, MAX_NEWS
 from smartcam.web._live_view import (
     MAX_PARTS,
     MAX_RESULTS,
-    MAX_SHOWN_RAW,
-    MAX_VALUE,
+    MAX_SHOWN_RAW_BYTES,
+    MAX_VALUE_CHARACTERS,
     ShownResult,
     shown_value,
 )
@@ -248,10 +248,10 @@ def result_of(value: object, raw: bytes = b"") -> Result[Any]:
 
 
 def test_long_values_are_cut() -> None:
-    told = ShownResult(0, result_of(["x" * MAX_VALUE], bytes(1000)), "").as_json()
+    told = ShownResult(0, result_of(["x" * MAX_VALUE_CHARACTERS], bytes(1000)), "").as_json()
     assert "value" not in told
-    assert len(json.dumps(told)) < MAX_VALUE
-    assert told["raw"] == bytes(MAX_SHOWN_RAW).hex(" ")
+    assert len(json.dumps(told)) < MAX_VALUE_CHARACTERS
+    assert told["raw"] == bytes(MAX_SHOWN_RAW_BYTES).hex(" ")
     assert told["size"] == 1000
 
 

@@ -43,7 +43,7 @@ class Folder:
 
     Raises:
         ConfigurationError: the path is no path.
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -92,7 +92,7 @@ class Folder:
 
         Raises:
             CalibrationError: ``BAD_NAME``.
-            OSError: the folder cannot be made.
+            OSError: the folder cannot be created.
         """
         target = target.removeprefix(f"{EXPORTS}/")
         stem, dot, suffix = target.rpartition(".")

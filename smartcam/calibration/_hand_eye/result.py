@@ -60,7 +60,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
         target_pose: ``T_base_target``; ``T_flange_target`` for a camera beside the robot. It is
             that of a target with ``target_scale`` applied, see :attr:`target`.
-        camera: the camera; None where poses of the target were given instead of views.
+        camera: the camera; None if poses of the target were given instead of views.
         target_scale: size of the target over the nominal one, as the robot's motions show it; 1 if
             it was not adjusted. ``camera_pose``, ``target_pose`` and all errors are those of the
             target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
@@ -87,7 +87,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         robot_poses: ``T_base_flange``, as given.
         used: whether each pose was used; False for a bad pose.
         views: views as given, but all numbered from the same end of a target that looks the same
-            after half a turn; empty where poses were given.
+            after half a turn; empty if poses were given.
         target_poses: ``T_camera_target`` of each pose, from its own view or as given.
         allowed_error: largest error, metres, that the user allows for 95 of 100 points on the
             target; None: :attr:`verdict` takes a hundredth of the target's distance.

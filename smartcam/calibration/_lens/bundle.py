@@ -74,7 +74,7 @@ class Bundle:
     # for each camera (4 + K, F): how fx, fy, cx, cy and the K coefficients change with each of its
     # F unknowns; (4 + K, 0) for a lens that is known
     basis: tuple[Array, ...]
-    rigid: bool = False  # whether ``rig`` is known
+    rigid: bool = False  # whether ``rig`` is known and not adjusted
     # (T, 3), points of the target, metres, if they are not as they were meant to be
     points: Array | None = None
     free: bool = False  # whether ``points`` are adjusted; then they must be given

@@ -151,7 +151,7 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
 
 
 def check_field(robot: Array) -> None:
-    """Raise (UNIT_UNKNOWN) where touched points (N, 3) are farther apart than in any cell."""
+    """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than in any cell."""
     if (found := extent(robot)) > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "

@@ -63,7 +63,7 @@ MAX_PICTURE_BYTES: Final = 1 << 26
 """Largest number of bytes of a picture's file: 20 million pixels of colour in a bitmap."""
 
 MAX_FILES: Final = 10_000
-"""Largest number of entries of a folder of pictures, which is listed several times a second."""
+"""Largest number of entries of a folder of pictures, which is listed several times per second."""
 
 PICTURE_DEADLINE: Final = 25.0
 """Seconds to wait for a picture in a folder."""

@@ -108,7 +108,7 @@ def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
 
 
 def _unfit(camera: CameraUnderTest, item: Item) -> str:
-    """Return the reason why a check makes no sense here, "" where it does."""
+    """Return the reason why a check makes no sense here, "" if it does."""
     try:
         dialect = camera.dialect
     except Differs as exc:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 MAX_CONTAINERS = 1024
-"""Input containers sent at most, to find how many are queued."""
+"""Largest number of input containers sent to find how many are queued."""
 
 MAX_LEFT = 64
 """Triggers at most to use up the input containers that somebody else has left."""

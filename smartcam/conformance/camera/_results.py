@@ -69,7 +69,7 @@ class Question(Item):
     def quirk(self) -> str | None:
         """The field of :class:`~smartcam.emulator.Quirks` that the answer is a value of.
 
-        None where it is a fact for people.
+        None if it is a fact for people.
         """
         return self.name if self.name in Quirks.model_fields else None
 

@@ -34,13 +34,13 @@ class Grade(enum.Enum):
 class ClientCheck:
     """A rule in a scene."""
 
-    name: str  # in reports and for ``-k``
+    name: str  # name in reports and for ``-k``
     scene: Scene  # the camera and the task
-    rule: Callable[[ClientRun], str | None]  # returns what was wrong, None where nothing was
-    expects: str  # what the camera's documents make a client do
-    source: str  # where that stands, with its grade
-    grade: Grade = Grade.MUST  # how much it matters
-    dialects: tuple[str, ...] = EVERY_DIALECT  # those it is about
+    rule: Callable[[ClientRun], str | None]  # returns what was wrong, None if nothing was
+    expects: str  # behaviour that the camera's documents require of a client
+    source: str  # source in the documents, with its grade
+    grade: Grade = Grade.MUST  # severity
+    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that the check is about
 
     def applies(self, dialect: str, transport: str) -> bool:
         """Return True if the check is about such a camera."""

@@ -33,13 +33,13 @@ class Said(NamedTuple):
     """Something that went over the wire."""
 
     time: float  # seconds since the scene began
-    sender: Sender  # whose it is
+    sender: Sender  # side that sent it
     peer: str  # address and port of the client
-    message: Message | None  # what it is; None for bytes that make no message of the dialect
+    message: Message | None  # decoded message; None for bytes that are no message of the dialect
     text: str  # the message with its fields, ``?`` for none
     hex: str  # the frame as it passed, or the bytes
-    error: str | None = None  # why the camera ignored it, None where it did not
-    lost: bool = False  # it did not pass
+    error: str | None = None  # reason why the camera ignored it; None if it did not
+    lost: bool = False  # whether the message was lost on the way
 
     def __str__(self) -> str:
         """Return the message as a line: seconds, direction, message, bytes."""

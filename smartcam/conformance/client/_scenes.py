@@ -40,7 +40,7 @@ def container(application: int, turn: int) -> bytes:
 
 
 def read_container(data: bytes) -> tuple[int, int] | None:
-    """Return application and turn of a result's data, None where it is no such data."""
+    """Return application and turn of a result's data, None if it is no such data."""
     if len(data) != _CONTAINER.size:
         return None
     application, turn = _CONTAINER.unpack(data)

@@ -289,7 +289,7 @@ class Device:
         self._advance(self._now)
 
     def connect(self) -> None:
-        """Begin a session: the answer, then a status, whatever it is.
+        """Begin a session: the answer, then a status, of whatever kind.
 
         Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
         """
@@ -344,7 +344,7 @@ class Device:
         self._advance(self._now + nanoseconds(dt))
 
     def next_event_in(self) -> float | None:
-        """Return the seconds until something happens by itself, None where nothing will."""
+        """Return the seconds until something happens by itself, None if nothing will."""
         if not self._events:
             return None
         return max(0, min(when for when, _ in self._events.values()) - self._now) / NANOSECONDS
@@ -833,7 +833,7 @@ class Device:
         return True
 
     def _read_input(self, data: bytes) -> Mapping[str, Any] | None:
-        """Return the values of input data; None where the application takes none such."""
+        """Return the values of input data; None if the application takes none such."""
         if isinstance(self._active, InspectedApplication):
             return {_DATA: data}
         layout = self._active.input_layout

@@ -161,7 +161,7 @@ class EmulatedInSight(LineCamera):
             ROWS,
             line_end=words.LINE_END,
             ends=words.COMMAND_ENDS,
-            max_line=words.MAX_LINE,
+            max_line=words.MAX_LINE_BYTES,
             encoding=words.ENCODING,
         )
 

@@ -32,7 +32,7 @@ def _code(line: str) -> int:
 
 
 def _value(line: str) -> int:
-    """Return the number behind the status code, or that of no job."""
+    """Return the number after the status code, or that of no job."""
     code, _, value = line.partition("\r\n")
     return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
 

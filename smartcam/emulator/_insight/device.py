@@ -81,7 +81,8 @@ class InSightDevice:
         online: bool = False,
         image: Any = None,
     ) -> None:
-        self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])  # by file name
+        # jobs by file name
+        self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])
         # the active one, None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
         # a context around what an operator does, where something is to follow

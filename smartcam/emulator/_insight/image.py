@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 23
-"""Pixels of an image at most; larger ones are refused. Real sensors have up to 5 megapixels."""
+"""Largest number of pixels of an image; larger ones are refused. Real sensors have up to 5
+megapixels."""
 
 _FILE_HEADER = struct.Struct("<2sIHHI")
 _INFO_HEADER = struct.Struct("<IiiHHIIiiII")

@@ -504,8 +504,8 @@ class FiredFault(NamedTuple):
     Attributes:
         time: seconds of the emulator's clock.
         fault: the fault, as it was given.
-        message: the message that the fault applied to, as its sender meant it; None where it
-            waited for none.
+        message: the message that the fault applied to, as its sender meant it; None if it waited
+            for none.
     """
 
     time: float

@@ -156,7 +156,7 @@ class BaseFault(EmulatorData):
 
     @property
     def speaker(self) -> m.Sender | None:
-        """Sender of the message that the fault waits for, None where it acts at once."""
+        """Sender of the message that the fault waits for, None if it acts at once."""
         if isinstance(self.on, str):
             return MESSAGE_NAMES[self.on].sender
         if self.sender is not None:

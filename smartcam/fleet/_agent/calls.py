@@ -66,7 +66,7 @@ class ProgramCall(NamedTuple):
     reservation: int | None = None
 
     def argument(self, name: str, check: Callable[..., T], *bounds: Any) -> T | None:
-        """Return an argument; None where it is not given.
+        """Return an argument; None if it is not given.
 
         Args:
             name: name of the argument.

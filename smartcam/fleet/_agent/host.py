@@ -59,7 +59,8 @@ CATCH_UP = 0.2
 the reply may have been lost, and nothing else would tell."""
 
 RESULTS_INTERVAL = 0.002
-"""Seconds between two messages with results, at least: those that come faster go together."""
+"""Seconds that must pass between two messages with results: those that come faster are sent
+together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
 """Bytes of results that go at once, however soon after the last."""
@@ -95,7 +96,7 @@ class Host:
         outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: why there is no session yet, None where there is or was one.
+        failure: why there is no session yet, None if there is or was one.
         triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
     """
 

@@ -41,9 +41,9 @@ class CameraSummary:
         agent: name of the agent that shares the camera.
         connected: whether the agent has a session with it.
         status: last status that the camera told; None before the first.
-        application: active application; None where it is not known.
+        application: active application; None if it is not known.
         reserved_by: the program that has reserved the camera, in words; None without one.
-        reason: why there is no session; None where there is one.
+        reason: why there is no session; None if there is one.
     """
 
     camera: str

@@ -378,7 +378,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
 
 
 def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
-    """Return the program and its call in ``payload``; None where it is a JSON message.
+    """Return the program and its call in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``what`` names it.
@@ -445,7 +445,7 @@ def encode_outcome(
 
 
 def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
-    """Return the reply to a trigger in ``payload``; None where it is a JSON message.
+    """Return the reply to a trigger in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``what`` names it.

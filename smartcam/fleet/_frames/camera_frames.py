@@ -148,7 +148,7 @@ class SharedFrames:
 
     @property
     def statistics(self) -> SourceStatistics | None:
-        """Statistics of the source; None where it is not open."""
+        """Statistics of the source; None if it is not open."""
         return None if self._source is None else self._source.statistics()
 
     def forget(self, program: str) -> None:

@@ -24,7 +24,7 @@ LATE_SECONDS = 0.3
 MAX_UNITS_KEPT = 64
 
 KEY_EVERY = 1.0
-"""Seconds from one key frame to the next at least."""
+"""Seconds that must pass from one key frame to the next."""
 
 
 class VideoUnit(NamedTuple):

@@ -159,7 +159,7 @@ class Work(NamedTuple):
         request: the request, of the service's own kind.
         timeout: seconds that the service may take.
         owner: owner of the results that the service's trigger brings.
-        calibrations: calibrations of the agent's cameras; None where there is no folder for them.
+        calibrations: calibrations of the agent's cameras; None if there is no folder for them.
     """
 
     host: Host

@@ -146,8 +146,8 @@ class Door:
 
     Args:
         ports: ports at which the engine listens.
-        links: function for the addresses of links that have come in, such as
-            ``("10.1.0.5", 40123)``; it gives None where they are not known.
+        links: function for the addresses of links that have come in, such as ``("10.1.0.5",
+            40123)``; it gives None if they are not known.
 
     Attributes:
         shut: whether the door takes nobody in.

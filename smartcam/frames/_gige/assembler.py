@@ -135,7 +135,7 @@ class Assembler:
         self._most, self._datagram, self._resend = payload_size, datagram, resend
         self._implied = implied
         self._blocks: dict[int, Block] = {}
-        self._current: Block | None = None  # that of the last packet
+        self._current: Block | None = None  # block of the last packet
         self._newest = self._closed = 0
         self._offset = 0  # a number's distance from its id
         self._begun, self._begins_low = False, begins_low

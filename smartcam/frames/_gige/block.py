@@ -124,7 +124,7 @@ class Block:
         self.leader: Leader | None = None
         self.implied = implied
         self.trailer: int | None = None
-        self.said: Trailer | None = None  # what stands in it
+        self.said: Trailer | None = None  # contents of the trailer
         self.short: int | None = None
         self.last_size = self.full
         self.arrived: float | None = None

@@ -20,7 +20,7 @@ from smartcam.exceptions import MessageError
 MAX_PLAIN_BYTES: Final = 16 << 20
 """An unpacked description has at most this many bytes; those of large cameras have 2 MB."""
 
-LARGEST_PACKED: Final = 4 << 20
+MAX_PACKED_BYTES: Final = 4 << 20
 """The ZIP archive of a description has at most this many bytes: 2 MB of XML take 0.2 MB. Every 46
 bytes can be one more file in it, which takes 8 us."""
 
@@ -109,9 +109,9 @@ def unpack(data: bytes) -> bytes:
     """
     if not data.startswith(b"PK"):
         return data.rstrip(b"\0")
-    if len(data) > LARGEST_PACKED:
+    if len(data) > MAX_PACKED_BYTES:
         raise MessageError(
-            f"the description's ZIP archive: expected at most {LARGEST_PACKED} bytes, got "
+            f"the description's ZIP archive: expected at most {MAX_PACKED_BYTES} bytes, got "
             f"{len(data)}"
         )
     try:

@@ -36,7 +36,7 @@ PACKETS: Final = (576, 16384)
 TEST_WAIT: Final = 0.1
 """Seconds for a test packet."""
 
-LARGEST_FRAME: Final = 1 << 30
+MAX_FRAME_BYTES: Final = 1 << 30
 """A frame has at most this many bytes."""
 
 MAX_NUMBER: Final = 1e12
@@ -204,9 +204,9 @@ async def read_shape(session: GigESession) -> StreamShape:
     )
     least = (width * height * bits_of(number) + 7) // 8
     payload = int(await features.number("PayloadSize") or least)
-    if not 0 < least <= payload <= LARGEST_FRAME:
+    if not 0 < least <= payload <= MAX_FRAME_BYTES:
         raise FrameSourceError(
-            f"{session.label}: expected a PayloadSize of {least} to {LARGEST_FRAME} bytes for "
+            f"{session.label}: expected a PayloadSize of {least} to {MAX_FRAME_BYTES} bytes for "
             f"{width}x{height} pixels of {entry}, got {payload}",
             source=session.label,
         )

@@ -32,8 +32,8 @@ class PixelFormat:
     Attributes:
         name: name in PFNC, as ``Mono8``; where PFNC has none the usual one, as ``NV12`` or
             ``MJPEG``.
-        fourcc: four letters of V4L2, as ``GREY``, or "" where V4L2 has none; without the blanks at
-            its end.
+        fourcc: four letters of V4L2, as ``GREY``, or "" if V4L2 has none; without the blanks at its
+            end.
         bits: bits of a pixel, unused ones included; 0 for a compressed format.
         code: 32 bits of PFNC, as GigE Vision sends it; 0: PFNC has none.
         depth: bits of a sample that mean something.
@@ -271,7 +271,7 @@ def find_format(name: str | int) -> PixelFormat:
     """Return the format that PFNC, or V4L2, calls so, or that has that code of PFNC.
 
     Args:
-        name: small letters and blanks at the end do not matter; or 32 bits of PFNC.
+        name: lower case letters and blanks at the end do not matter; or 32 bits of PFNC.
 
     Raises:
         FrameFormatError: there is no such format; the text lists the known ones.

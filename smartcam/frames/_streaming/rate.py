@@ -55,11 +55,11 @@ class RateStatistics:
 
     Attributes:
         quality: JPEG quality that frames are to have.
-        fps: frames a second at most.
+        fps: frames per second at most.
         why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
             frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
             "no frame may be smaller, nor fewer" where that is not enough.
-        bitrate: bits a second of late.
+        bitrate: bits per second of late.
         latency: seconds from a frame's capture to its arrival, of late.
     """
 
@@ -113,10 +113,10 @@ class RateControl:
     that it does not swing. With both, the lower one counts.
 
     Args:
-        bitrate: bits a second on average.
+        bitrate: bits per second on average.
         latency: seconds from capture to arrival.
         quality: JPEG quality, the lowest and the best, 1 to 100.
-        fps: frames a second, the fewest and the most.
+        fps: frames per second, the fewest and the most.
 
     Raises:
         ConfigurationError: neither of them is given, or one is out of its range.
@@ -137,7 +137,7 @@ class RateControl:
         self._why: str = ""
         self._told_fps = self._fps
         self._went: float | None = None
-        self._comes = 0.0  # frames a second that the source gives, as far as is known; 0: unknown
+        self._comes = 0.0  # frames per second that the source gives, as far as is known; 0: unknown
         self._flow = _Flow()
         self._weight = _Mean()  # bytes that a frame would have with steps of 1
         self._way = _Mean()  # seconds that a byte took
@@ -231,7 +231,7 @@ class RateControl:
         self._tell()
 
     def _wanted(self) -> tuple[float, float, str]:
-        """Return the bytes of a frame, frames a second, and why."""
+        """Return the bytes of a frame, frames per second, and why."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
         found: list[tuple[float, float, str]] = []

@@ -71,7 +71,7 @@ class Setting(NamedTuple):
     Attributes:
         format: format of the pixels.
         layout: how they lie in a buffer.
-        rate: frames a second; None: it does not say.
+        rate: frames per second; None: it does not say.
     """
 
     format: PixelFormat
@@ -172,7 +172,7 @@ class CaptureDevice:
         return [f"{width}x{height}" for width, height in self.sizes(code)]
 
     def rates(self, code: int, width: int, height: int) -> list[float]:
-        """Return the frames a second, fastest first; of steps the fastest and the slowest."""
+        """Return the frames per second, fastest first; of steps the fastest and the slowest."""
         found: list[float] = []
         asked = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
         for _, _, _, _, kind, *numbers in asked:

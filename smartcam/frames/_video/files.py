@@ -406,7 +406,7 @@ class PictureFiles(PictureReading):
         return None if read is None else read._replace(time=None)
 
     def close(self) -> None:
-        """Have nothing left."""
+        """Release everything."""
         self._files.clear()
 
 

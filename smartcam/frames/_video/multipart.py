@@ -56,7 +56,7 @@ class PictureCutter:
         self._seen = 0  # bytes of what is no picture, or of a picture, that were looked at
         self._between = 0
         self._begun = self._in_scan = self._over = False
-        self._length: int | None = None  # of the picture that has begun, as its part says
+        self._length: int | None = None  # length of the current picture, by the head of its part
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Take bytes, and yield the pictures that are whole with them.

@@ -35,13 +35,13 @@ PORTS: Final = {"http": 80, "https": 443}
 _PICTURES: Final = re.compile(r"(?i)\s*(?:multipart/|video/(?:x-)?(?:m|motion-?)?jpe?g\b)")
 
 MAX_INTERIM_ANSWERS: Final = 8
-"""Answers that say that another one comes (1xx), at most."""
+"""Largest number of answers (1xx) that only announce another one."""
 
 _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
-    """An answer whose body goes on; the names of its headers are in small letters."""
+    """An answer whose body goes on; the names of its headers are in lower case."""
 
     status: int
     reason: str

@@ -53,7 +53,7 @@ class Judged(NamedTuple):
     Attributes:
         number: sequence number of the run.
         frame: the frame that was judged.
-        inspection: what the program says about it; None where it failed.
+        inspection: what the program says about it; None if it failed.
         application: id of the program.
     """
 
@@ -70,7 +70,7 @@ class _OrderedRun:
     order: InspectionOrder
     seen: Callable[[], None]
     done: Callable[[Values | None], None]
-    moment: float  # of time.monotonic(); its frame is exposed after it
+    moment: float  # time.monotonic(); the frame is exposed after it
     deadline: asyncio.TimerHandle
     frame: Frame | None = None
     work: Future[Inspection] | None = None
@@ -97,7 +97,7 @@ class Eyes(Inspector):
         judged: the last picture that was judged; None before the first.
         viewers: are shown each picture that was judged.
         format: format of the source's frames; None before it was opened.
-        trouble: why there are no frames; "" where there are.
+        trouble: why there are no frames; "" if there are.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Eyes(Inspector):
         self._sighted = asyncio.Event()  # the first frame came, or cannot come
         self._task: asyncio.Task[None] | None = None
         self._thread: ToolThread | None = None
-        self._hung: list[ToolThread] = []  # those that were given up, and are still at work
+        self._hung: list[ToolThread] = []  # threads that were given up, and still run
 
     def _new_thread(self) -> ToolThread:
         return ToolThread(f"smartcam.inspection {self.name}")
@@ -218,7 +218,7 @@ class Eyes(Inspector):
     async def _follow(self, source: FrameSource) -> bool:
         """Give frames to the runs that wait for them; return whether any came before the end."""
         came = False
-        held: Frame | None = None  # of a recording, whose run was given up
+        held: Frame | None = None  # frame of a recording, whose run was given up
         async with source.reader(timeout=None) as reader:
             while True:
                 if self._recorded:

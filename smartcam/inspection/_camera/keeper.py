@@ -36,7 +36,7 @@ class PictureKeeper:
 
     Args:
         name: name of the camera, for logs.
-        folder: folder for the pictures; it is made if need be.
+        folder: folder for the pictures; it is created if needed.
         keep: settings of keeping.
 
     Attributes:

@@ -38,7 +38,7 @@ MAX_POINTS: Final = 150
 """Largest number of points of a part that are looked up at the places that are followed."""
 
 MIN_RADIUS_PX: Final = 8.0
-"""Pixels from the reference to the farthest point at the smallest level at least."""
+"""Least distance, pixels, from the reference to the farthest point at the smallest level."""
 
 MAX_LEVELS: Final = 6
 """Largest number of levels of the pyramid."""

@@ -42,13 +42,13 @@ MAX_FILE_BYTES: Final = 1 << 24
 """Largest number of bytes of an outline's file."""
 
 MAX_POINTS: Final = 200_000
-"""Corners of an outline at most, curves included."""
+"""Largest number of corners of an outline, those of curves included."""
 
 MAX_NESTED: Final = 30
 """Largest number of groups of SVG in each other."""
 
 MAX_OUTLINE_PX: Final = 4_000_000
-"""Pixels of the picture of an outline at most."""
+"""Largest number of pixels of the picture of an outline."""
 
 FLATNESS_PX: Final = 0.01
 """Pixels by which a curve may leave the polygon that stands for it."""

@@ -177,7 +177,7 @@ class Locate(Tool[LocateSettings]):
         )
 
     def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
-        """Return why what was found is not ok; "" where it is."""
+        """Return why what was found is not ok; "" if it is."""
         least, most = self._wanted
         count, nearest = len(found.parts), found.nearest
         if not least <= count <= most:

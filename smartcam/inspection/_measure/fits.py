@@ -63,7 +63,7 @@ class Line(NamedTuple):
     direction: Array  # (2,), of length 1
     # (2, 2), of the offset along the normal at that middle, and of the angle in radians
     covariance: Array
-    reach: float  # from the middle to the edges at both ends
+    reach: float  # distance from the middle to the edges at both ends
 
     @property
     def normal(self) -> Array:
@@ -93,7 +93,7 @@ class ShapeFit(NamedTuple, Generic[ShapeT]):
     shape: ShapeT
     kept: Mask  # (N,), the edges that agree with it
     residuals: Array  # (N,), distances of the edges from it along their normals
-    excess: float  # by which the edges spread more than their sigmas say, 1 at least
+    excess: float  # ratio of the edges' spread to that by their sigmas, at least 1
 
 
 def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[Line]:

@@ -36,11 +36,11 @@ class Plane(NamedTuple):
     """A plane in which lengths are measured."""
 
     unit: str  # "px" or "mm"
-    # from pixels (N, 2) to points of the plane (N, 2)
+    # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
     # maps that are off by one standard deviation each, in independent ways
     variants: tuple[Callable[[Array], Array], ...] = ()
-    # for people, what of the map's errors nothing tells
+    # unknown errors of the map, for people
     remark: str = ""
 
     def points(self, pixels: Array) -> Array:
@@ -144,7 +144,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
 
 
 def _remark(calibration: Any, plane: Any) -> str:
-    """Return the errors that sigma is without; "" where all are known."""
+    """Return the errors that sigma is without; "" if all are known."""
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")

@@ -40,7 +40,7 @@ MAX_STEPS = 25
 """Largest number of steps of a fit; most fits take four to eight."""
 
 STILL_PX = 1e-4
-"""Pixels by which places move in the last step at most."""
+"""A fit ends when a step moves places by at most this many pixels."""
 
 MIN_SIDE_PX = 1e-3
 """Pixels that a pixel is wide at least, seen along an edge; 0 would be divided by."""

@@ -59,7 +59,7 @@ class Tolerance(NamedTuple):
         """Return the tolerance of a text.
 
         Raises:
-            ConfigurationError: no such text, or the larger limit first.
+            ConfigurationError: there is no such text, or the larger limit first.
         """
         plain = check_text(text, "tolerance", most=100).strip()
         unit = plain[len(plain.rstrip(_LETTERS)) :]
@@ -84,7 +84,7 @@ class Tolerance(NamedTuple):
         return self.text[len(self.text.rstrip(_LETTERS)) :]
 
     def complaint(self, value: float, sigma: float, guard: float) -> str:
-        """Return why a value is not good; "" where it is.
+        """Return why a value is not good; "" if it is.
 
         It has to be inside by ``guard`` times its sigma: otherwise it may be outside, as well.
         Degrees are compared whatever turns of 360 are between them.

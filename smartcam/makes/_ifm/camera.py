@@ -19,7 +19,7 @@ from smartcam.makes._ifm.chunks import JPEG, MONO8, ImageChunk
 from smartcam.makes._ifm.dialect import (
     ASYNCHRONOUS,
     ERRORS,
-    MAX_INPUT,
+    MAX_INPUT_BYTES,
     NOTIFICATIONS,
     OVERRUN,
     PCIC,
@@ -301,7 +301,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     @request(r"j(0\d)(\d{9})(.*)")
     def _j(self, call: IfmClient, number: str, length: str, text: str) -> str:
         """Put a text with its length into an input container, 00 to 09."""
-        if int(length) != len(text) or len(text) > MAX_INPUT:
+        if int(length) != len(text) or len(text) > MAX_INPUT_BYTES:
             return "!"
         self.inputs[int(number)] = text
         return "*"
@@ -351,5 +351,5 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
 
 def _counted(text: str) -> str:
-    """Return a text behind its length."""
+    """Return a text after its length."""
     return f"{len(text):09}{text}"

@@ -12,7 +12,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.makes._keyence.words import (
     ENCODING,
     LINE_END,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     READY,
     asked_word,
     check_done,
@@ -92,7 +92,7 @@ def _reply(line: str) -> LineReply:
 
 
 def _split(line: str) -> tuple[str, str]:
-    """Return the command that a line answers, "" where it is what was read."""
+    """Return the command that a line answers, "" if it is what was read."""
     first, _, rest = line.partition(",")
     return (asked_word(line, {}) if first in {"OK", "ER"} and rest else ""), line
 
@@ -150,7 +150,7 @@ LINES = SrDialect(
     rows=_rows(None),
     ids=range(LAST_BANK + 1),
     line_end=LINE_END,
-    max_line=MAX_LINE,
+    max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
     split=_split,
     at_once=True,

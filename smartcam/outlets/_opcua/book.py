@@ -58,7 +58,7 @@ class ResultBook:
             self._characters -= len(gone.text)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
-        """Return a camera's result by its id; None where it is not there, or not any more."""
+        """Return a camera's result by its id; None if it is not there, or not any more."""
         found = self._kept.get(key)
         return found if found is not None and found.result.camera == camera else None
 

@@ -190,7 +190,7 @@ def _read(path: Any) -> bytes:
     """Return the bytes of a picture.
 
     Raises:
-        OSError: the file is not there any more, or too large.
+        OSError: the file does not exist any more, or too large.
     """
     with path.open("rb") as stream:
         data: bytes = stream.read(MAX_FILE_BYTES + 1)

@@ -93,7 +93,7 @@ class Structure(NamedTuple):
     columns: tuple[Column, ...]
 
     def pack_all(self, records: Sequence[Mapping[str, Any]]) -> list[ua.Variant] | None:
-        """Return records as structures; None where one does not fit, as before a layout changed."""
+        """Return records as structures; None if one does not fit, as before a layout changed."""
         try:
             packed = [self._pack(record) for record in records]
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):

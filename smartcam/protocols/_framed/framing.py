@@ -36,8 +36,8 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 """Reads fields at a place of a buffer."""
 
 
-FIRST_READ = 1 << 12
-"""Largest number of bytes that one read takes, at first. It doubles each time that a read took so
+FIRST_READ_BYTES = 1 << 12
+"""Largest number of bytes that one read takes at first. It doubles each time that a read took so
 many."""
 
 MAX_READ_BYTES = 1 << 15
@@ -127,7 +127,7 @@ class Framer:
         self.buffer: Buffer = (
             b""  # a chunk as it came, or one large frame: of it cut() tells places
         )
-        self.start: int = 0  # where in it the next frame begins
+        self.start: int = 0  # offset of the next frame
         self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
@@ -179,7 +179,7 @@ class Framer:
         if self._large is not None:
             return self._large[self._filled :]
         if not self._store:
-            self._window = self._store = memoryview(bytearray(FIRST_READ))
+            self._window = self._store = memoryview(bytearray(FIRST_READ_BYTES))
         return self._window
 
     def filled(self, count: int) -> bool:
@@ -297,7 +297,7 @@ class Framer:
     def unfinished(self) -> tuple[int, int] | None:
         """Return message id and size, header included, of a frame of which only a part is there.
 
-        None where not even the header is there. To be asked when :meth:`cut` has returned None.
+        None if not even the header is there. To be asked when :meth:`cut` has returned None.
         """
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         if self.buffered < self._header.size:
@@ -333,7 +333,7 @@ class Framer:
         return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:
-        """Skip to the next magic number behind the present place; return the bytes skipped.
+        """Skip to the next magic number after the present place; return the bytes skipped.
 
         Without one in the buffer, only the bytes that may begin one are kept. A dialect without a
         magic number has no such place: everything is dropped.

@@ -43,5 +43,5 @@ class LastBodies(Generic[Key, Value]):
                 del self._known[key]
 
     def get(self, key: Key) -> Value | None:
-        """Return the value added for a key; None where it is not kept."""
+        """Return the value added for a key; None if it is not kept."""
         return self._known.get(key)

@@ -46,15 +46,16 @@ class McapWriter:
         self._stream = stream
         self._compress = compress
         self._chunk_size = chunk_size
-        self._parts: list[bytes] = []  # of the chunk that is being filled
+        self._parts: list[bytes] = []  # parts of the chunk that is being filled
         self._packs = True  # the chunk, when it is ended
         self._size = 0  # bytes in them
-        self._places: dict[int, list[int]] = {}  # by channel: times and places in it, in turn
+        # times and offsets in the chunk by channel, alternating
+        self._places: dict[int, list[int]] = {}
         self._first = self._last = 0  # times of its messages
         self._counts: dict[int, int] = {}  # messages of each channel
         self._began = self._ended = 0  # times of them all
         self._chunks = 0
-        # for what stands at the end
+        # records to repeat at the end
         self._schema_records: list[bytes] = []
         self._channel_records: list[bytes] = []
         self._chunk_indexes: list[bytes] = []

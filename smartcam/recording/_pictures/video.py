@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.frames import Frame
-    from smartcam.recording._mcap.form import Item
-    from smartcam.recording._recorder import Description
+    from smartcam.recording._recorder import Given
 
 TICK_DURATION: Final = Fraction(1, 1000)
 """Step of a Matroska file's times as FFmpeg writes them, seconds."""
@@ -28,7 +27,7 @@ OPTIONS: Final = {"cluster_time_limit": "500", "flush_packets": "1"}
 
 
 def check_writable(frame: Frame) -> None:
-    """Raise FrameFormatError where a video cannot hold a frame without loss."""
+    """Raise FrameFormatError if a video cannot hold a frame without loss."""
     if frame.format.name != "MJPEG":
         try:
             to_lossless_video(frame)
@@ -82,7 +81,7 @@ class VideoFile:
     def start(self) -> None:
         """Do nothing: what stands first says what the pictures are."""
 
-    def add(self, item: Item | Description, /) -> None:
+    def add(self, item: Given, /) -> None:
         """Write a picture.
 
         Raises:

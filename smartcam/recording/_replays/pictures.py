@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
 from smartcam.frames._inside import changed
-from smartcam.recording._replays.schedule import MAX_REPLAY
+from smartcam.recording._replays.schedule import MAX_REPLAY_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,12 +100,14 @@ def _told_apart(
     for result, picture, _ in recording.judged(camera):
         some = found.setdefault((result.application, result.raw), [])
         size += 0 if picture is None else memoryview(picture.data).nbytes
-        if picture is None or size > MAX_REPLAY:
+        if picture is None or size > MAX_REPLAY_BYTES:
             some.append(None)
         else:
             some.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
-    if size > MAX_REPLAY:
-        _log.warning("%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY)
+    if size > MAX_REPLAY_BYTES:
+        _log.warning(
+            "%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
+        )
     counts = _in_one_order(applications)
     return {key: some for key, some in found.items() if counts.get(key) == len(some)}
 
@@ -164,5 +166,5 @@ class _ResultPictures(FrameDriver):
             self._sink = None
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()

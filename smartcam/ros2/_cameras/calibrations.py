@@ -36,7 +36,7 @@ def calibrations_of(
     """Return the calibrations of a camera, made where a folder is given.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
     if not isinstance(given, str | os.PathLike):
         return given
@@ -83,7 +83,7 @@ class RosCalibrationFace:
 
     Args:
         camera: the camera.
-        calibrations: calibrations of the camera; None where there is no folder for them.
+        calibrations: calibrations of the camera; None if there is no folder for them.
     """
 
     def __init__(self, camera: Camera[Any], calibrations: ThesisCalibration | None) -> None:

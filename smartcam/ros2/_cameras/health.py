@@ -42,9 +42,9 @@ class KnownState(NamedTuple):
     Attributes:
         name: the camera's name.
         connected: whether there is a session with the camera.
-        status: status that the camera told in this session; None where it has told none.
-        application: the id of the active application; None where that is not known.
-        why: reason why there is no session; empty where nobody has tried to have one.
+        status: status that the camera told in this session; None if it has told none.
+        application: the id of the active application; None if that is not known.
+        why: reason why there is no session; empty if nobody has tried to have one.
     """
 
     name: str

@@ -181,8 +181,8 @@ class ResultMessages:
 
         Args:
             result: result to send.
-            parts: localizations of the result, in metres; None where the result has none of that
-                kind: the message has the value as JSON then.
+            parts: localizations of the result, in metres; None if the result has none of that kind:
+                the message has the value as JSON then.
         """
         try:
             frame_id = self.frame_of(result)

@@ -83,7 +83,7 @@ class CameraNode(Server):
         status: publisher of the camera's status and diagnostics.
         results: publisher of the camera's results.
         services: services by which other nodes use the camera.
-        calibrations: the camera's calibrations; None where there is no folder for them.
+        calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class CameraNode(Server):
         )
 
     def controls(self) -> CameraControls | None:
-        """Return the parameters of the frames' device; None where there are none."""
+        """Return the parameters of the frames' device; None if there are none."""
         source = self.options.controls
         if self.node.parameters is None or source is None:
             return None

@@ -29,7 +29,7 @@ class CameraNodeOptions:
             a calibration calls it.
         place: hand-eye calibration, which says where the camera is; None without.
         calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
-            calibration of the camera's settings was made; None where the camera stands still.
+            calibration of the camera's settings was made; None if the camera stands still.
         autostart: whether the life cycle goes to Active by itself.
         application: id of the application to have running and ready once configured; None: that
             of the camera's settings.
@@ -38,8 +38,8 @@ class CameraNodeOptions:
         hardware_id: id of the hardware in diagnostics; empty for the camera's address.
         settings: what the session with the camera is told, where that is not what the camera's own
             settings say: the agent's, of a camera of a fleet.
-        heard: whether there is any sign of the agent that has the session; None where
-            nobody is between.
+        heard: whether there is any sign of the agent that has the session; None if nobody is
+            between.
         frames: parameters that say where its frames come from, by v4l2_camera's names:
             ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
         controls: function that returns the open source of the frames, whose device's controls

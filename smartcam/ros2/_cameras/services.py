@@ -51,7 +51,7 @@ class CameraServices:
         node: the camera's node.
         results: the results that the node publishes.
         life: the node's life cycle.
-        calibrations: the camera's calibrations; None where there is no folder for them.
+        calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
     def __init__(

@@ -96,7 +96,7 @@ class _FrameLink:
             self.came = time.monotonic()
 
     def check_new(self) -> None:
-        """Raise (BAD_TIME) where the newest transform is old."""
+        """Raise BAD_TIME if the newest transform is old."""
         silent, behind = time.monotonic() - self.came, time.time() - self.times[-1]
         if silent > MAX_AGE or abs(behind) > MAX_AGE:
             way = "behind" if behind > 0 else "ahead of"

@@ -25,7 +25,7 @@ MAX_WAITING_BYTES = 1 << 26
 class _ThreadJob(NamedTuple):
     do: Callable[[], None]
     size: int
-    dropped: Callable[[], None] | None  # None: the job is never dropped
+    dropped: Callable[[], None] | None  # function for a dropped job; None: the job is never dropped
 
 
 class MessageThread:

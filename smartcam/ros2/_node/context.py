@@ -48,7 +48,7 @@ priority and link under way; topics take the priorities in turn, so that the two
 do not meet in one."""
 
 PAUSE, RATE = 0.002, 5e8
-"""Seconds, and bytes a second: the time that a healthy link needs for one long message."""
+"""Seconds, and bytes per second: the time that a healthy link needs for one long message."""
 
 
 class NewestSlot:

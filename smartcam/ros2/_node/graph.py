@@ -120,7 +120,7 @@ class RosGraph:
         return iter(tuple(self._entities.values()))
 
     def by_gid(self, gid: bytes) -> Entity | None:
-        """Return the entity that has a GID; None where none has it."""
+        """Return the entity that has a GID; None if none has it."""
         return self._by_gid.get(gid)
 
     def nodes(self) -> list[str]:

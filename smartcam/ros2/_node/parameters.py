@@ -209,7 +209,7 @@ class RosParameters:
         return self._of(name).description
 
     def find(self, name: str) -> Typed | None:
-        """Return a value with its type; None where there is none of this name."""
+        """Return a value with its type; None if there is none of this name."""
         found = self._declared.get(name)
         return None if found is None else found.value
 

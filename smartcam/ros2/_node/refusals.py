@@ -34,7 +34,7 @@ UNKNOWN_STATE: Final = {"id": 0, "label": "unknown"}
 
 
 def refusal(kind: ServiceType, why: str, types: RosTypes) -> Any:
-    """Return the response that refuses a call; None where the type has none.
+    """Return the response that refuses a call; None if the type has none.
 
     Args:
         kind: type of the service.

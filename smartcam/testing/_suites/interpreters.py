@@ -219,7 +219,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             see(interpreter, data)
 
     def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
-        """Check that bytes behind a container cause no other kind of error either."""
+        """Check that bytes after a container cause no other kind of error either."""
         interpreter = self.make(sample.layout)
         for more in TRAILING:
             see(interpreter, sample.data + more)
@@ -317,7 +317,7 @@ def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
 
 
 def outcome(interpreter: Interpreter, data: bytes) -> object:
-    """Return an interpreter's value, None where it raises an InterpretationError."""
+    """Return an interpreter's value, None if it raises an InterpretationError."""
     try:
         return interpret(interpreter, data)
     except InterpretationError:

@@ -482,7 +482,7 @@ def test_description_packed_by_other_than_deflate_is_refused(method: int) -> Non
 
 def test_description_in_a_large_archive_is_refused() -> None:
     with pytest.raises(MessageError, match="ZIP archive: expected at most"):
-        _description.unpack(b"PK" + bytes(_description.LARGEST_PACKED))
+        _description.unpack(b"PK" + bytes(_description.MAX_PACKED_BYTES))
 
 
 def test_description_of_a_structure_with_many_entries_is_refused() -> None:

@@ -166,7 +166,7 @@ class UnitDecoding:
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
-        """Tell the sink of an error, whatever it is."""
+        """Tell the sink of an error, of whatever kind."""
         try:
             yield
         except FrameSourceError as error:

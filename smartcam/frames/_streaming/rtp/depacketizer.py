@@ -61,17 +61,18 @@ class Depacketizer:
         self._begin()
 
     def _begin(self) -> None:
-        self._next: int | None = None  # with the wraps counted
+        self._next: int | None = None  # next expected number, with the wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
         self._open: OpenUnit | None = None
         self._sure = False  # that the next packet is the first one of a frame
         self._closed: int | None = None  # timestamp of the last frame that ended
         self._begins = True  # until a frame is whole
-        self._odd: int | None = None  # what would follow a sequence number that was far off
-        self._marked_at: float | None = None  # when the open frame's marker came, while that waits
+        self._odd: int | None = None  # number that would follow a sequence number that was far off
+        # time of the open frame's marker, while the frame waits
+        self._marked_at: float | None = None
         self._marked = False  # whether the last frame that ended had a marker
         self._marks_lie = False
-        self._parameters: OpenUnit | None = None  # that came without a picture
+        self._parameters: OpenUnit | None = None  # parameters that came without a picture
 
     def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
         """Take a packet, and return the frames that are whole with it.

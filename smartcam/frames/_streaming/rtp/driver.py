@@ -137,7 +137,7 @@ class RtpDriver(FrameDriver):
             await stream.end()
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
 

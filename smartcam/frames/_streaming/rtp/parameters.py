@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_PICTURE_PIXELS: Final = 1 << 27
-"""Pixels of a picture at most; parameters with more count as wrong."""
+"""Largest number of pixels of a picture; parameters with more count as wrong."""
 
 CLOCK_RATE: Final = 90_000
 """Ticks a second of the clock of video streams."""

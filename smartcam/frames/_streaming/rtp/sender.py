@@ -97,9 +97,9 @@ class RtpSender:
     Args:
         source: open.
         to: ``HOST:PORT``, or a multicast group's.
-        fps: frames a second, for the bit rate; None: the source's, or 30.
+        fps: frames per second, for the bit rate; None: the source's, or 30.
         crf: quality, 0 (best) to 51.
-        bitrate: bits a second that it keeps to instead of a quality.
+        bitrate: bits per second that it keeps to instead of a quality.
         keyint: frames in which every part of the picture is sent anew.
         payload_type: 96 to 127.
         ttl: networks that multicast passes.

@@ -53,7 +53,7 @@ class PacketDelivery(Protocol):
         ...
 
     def close(self) -> None:
-        """Have nothing left of it."""
+        """Release everything of it."""
         ...
 
 
@@ -66,7 +66,7 @@ class ChannelDelivery:
         self._connection = connection
         self._patient_until = -1.0
         self._waited = 0  # bytes at the last look
-        self._progress: float | None = None  # when it last took something
+        self._progress: float | None = None  # time at which the client last took bytes
 
     def ready(self, now: float) -> bool:
         waiting = self._connection.get_write_buffer_size()

@@ -60,7 +60,7 @@ class RtspError(Exception):
 
 
 class RtspRequest(NamedTuple):
-    """A request; the names of its headers are in small letters."""
+    """A request; the names of its headers are in lower case."""
 
     method: str
     url: str
@@ -115,7 +115,7 @@ class RequestParser:
         return self._start is not None or bool(self._data)
 
     def next(self) -> RtspRequest | ChannelData | None:
-        """Return the next whole message; None: it is not there yet.
+        """Return the next whole message; None if it is not complete yet.
 
         Raises:
             RtspError: the bytes can be no request; the error is fatal.

@@ -58,9 +58,9 @@ class RtspServer(Server):
         user: name of the user who may look; None: everybody may.
         password: password of the user.
         basic: also accept the bare password, from clients that do not know Digest.
-        bitrate: bits a second that an encoder keeps to instead of a quality.
+        bitrate: bits per second that an encoder keeps to instead of a quality.
         crf: quality, 0 (best) to 51.
-        fps: frames a second, for the bit rate; None: as each source says, else 30.
+        fps: frames per second, for the bit rate; None: as each source says, else 30.
         keyint: frames in which every part of the picture is sent anew.
         max_connections: connections at a time.
         max_viewers: sessions of all connections at a time.
@@ -190,7 +190,7 @@ class RtspServer(Server):
 
 
 def _rate(source: FrameSource) -> float:
-    """Return the frames a second that a source says, or the usual where it is not open yet."""
+    """Return the frames per second that a source says, or the usual where it is not open yet."""
     try:
         rates = source.format.rates
     except LocalProtocolError:

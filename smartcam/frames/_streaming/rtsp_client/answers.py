@@ -38,7 +38,7 @@ USUAL_CHANNELS: Final = range(4)
 
 
 class ServerAnswer(NamedTuple):
-    """An answer; the names of its headers are in small letters, with all values of each."""
+    """An answer; the names of its headers are in lower case, with all values of each."""
 
     status: int
     reason: str
@@ -93,7 +93,7 @@ class AnswerParser:
         self._data += data
 
     def next(self) -> Received | None:
-        """Return the next whole message; None: it is not there yet.
+        """Return the next whole message; None if it is not complete yet.
 
         Raises:
             MessageError: too many bytes that belong to no message, or more than there is room for.

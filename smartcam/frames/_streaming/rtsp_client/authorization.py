@@ -25,8 +25,8 @@ class Challenge(NamedTuple):
     """The way in which a server wants the password.
 
     Attributes:
-        scheme: name in small letters.
-        parts: what it says, by names in small letters.
+        scheme: name in lower case.
+        parts: what it says, by names in lower case.
     """
 
     scheme: str
@@ -94,7 +94,7 @@ class Credentials:
         return before is None or stale or found.parts != before.parts
 
     def header(self, method: str, uri: str) -> str:
-        """Return the value of ``Authorization``; "" where nobody asked for one."""
+        """Return the value of ``Authorization``; "" if nobody asked for one."""
         challenge = self._challenge
         if challenge is None:
             return ""

@@ -402,7 +402,7 @@ class RtspConversation:
 
 
 def _address(text: str) -> str:
-    """Return the address of one host, or "" where the text is not such an address."""
+    """Return the address of one host, or "" if the text is not such an address."""
     try:
         found = ipaddress.ip_address(text)
     except ValueError:

@@ -32,7 +32,7 @@ class VideoTrack(NamedTuple):
         payload_type: payload type of its packets.
         encoding: name of the encoding, in capital letters; "": none.
         control: where to ask for it, as it stands there; "": where one asked for the description.
-        parameters: parameters of its encoding (fmtp), by names in small letters.
+        parameters: parameters of its encoding (fmtp), by names in lower case.
         size: size of the pictures where the description says so; None: it does not.
         secure: whether its packets are encrypted (SRTP).
     """
@@ -51,7 +51,7 @@ class VideoTrack(NamedTuple):
 
     @property
     def sets(self) -> bytes:
-        """The parameters that a decoder needs, as in a file; b"" where the description has none."""
+        """The parameters that a decoder needs, as in a file; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
         units = [one for name in names for one in self.parameters.get(name, "").split(",")]
         return b"".join(START_CODE + unit for one in units if (unit := _decoded(one)))

@@ -193,7 +193,7 @@ class RtspDriver(FrameDriver):
             await playing.end()
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
 

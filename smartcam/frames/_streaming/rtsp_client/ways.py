@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def options_of(transport: str) -> dict[str, str]:
-    """Return the options of the first transport of a header, by names in small letters."""
+    """Return the options of the first transport of a header, by names in lower case."""
     protocol, *rest = transport.partition(",")[0].split(";")
     parts = (one.strip().partition("=") for one in rest)
     options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
@@ -22,7 +22,7 @@ def options_of(transport: str) -> dict[str, str]:
 
 
 def pair_of(text: str, most: int) -> tuple[int, int] | None:
-    """Return a pair of channels or ports; the second one is the next where it is not there."""
+    """Return a pair of channels or ports; the second one is the next where it does not exist."""
     found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
     if found is None:
         return None
