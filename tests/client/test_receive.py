@@ -32,7 +32,7 @@ from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer,
 async def test_camera_that_floods_while_a_session_is_made_ends_the_attempt(
     begins: bytes, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handshake, "MAX_EARLY", 100_000)
+    monkeypatch.setattr(handshake, "MAX_EARLY_BYTES", 100_000)
     written: list[int] = []
 
     async def talk(peer: Peer, number: int) -> None:

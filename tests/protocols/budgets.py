@@ -189,14 +189,14 @@ PARSERS: tuple[Parser, ...] = (
             }
         ),
         2 * MAX_IMAGE_BYTES,
-        "protocols._insight.answers.MAX_IMAGE, in hex",
+        "protocols._insight.answers.MAX_IMAGE_BYTES, in hex",
     ),
     Parser(
         "In-Sight: lines",
         functools.partial(_insight_answers, m.GetStatus),
         streamed(TEXT_LINES),
         MAX_LINE_BYTES,
-        "protocols._insight.words.MAX_LINE",
+        "protocols._insight.words.MAX_LINE_BYTES",
         size=1000,
     ),
     Parser(
@@ -204,7 +204,7 @@ PARSERS: tuple[Parser, ...] = (
         _line_machine,
         streamed(TEXT_LINES),
         1 << 15,
-        "protocols._lines.READ_SIZE",
+        "protocols._lines.MAX_READ_BYTES",
         size=1000,
     ),
 )
