@@ -432,6 +432,8 @@ async def test_what_is_said_while_a_link_stands_still_arrives_in_order(urgent: b
                 assert slowest < LOOP_MAY_WAIT
                 relay.flows.set()
                 await heard.come_all(payloads)
+                await until(lambda says=says: not says._behind)  # the loop says it again itself
+                assert (says._doubtful, says.waiting_bytes) == (0, 0)
                 results.close()
         finally:
             await connects.close()
