@@ -221,7 +221,7 @@ class _StoreFile:
 
         Raises:
             EntryRefusedError: no table can have one of them; none is written.
-            OutletError: they went into a file that was moved or deleted meanwhile.
+            OutletError: the file was moved or deleted meanwhile, with these entries.
         """
         self._columns.clear()  # a layout may have changed, and a transaction been undone
         with _transaction(database):

@@ -33,7 +33,7 @@ class TooLongError(Exception):
 
 
 class _Look(NamedTuple):
-    """What has to follow a place of the text, or to be in front of it, or must not.
+    """A condition of what follows a place of the text, or of what is in front of it.
 
     Attributes:
         first: first state of that.
@@ -85,7 +85,7 @@ class TextPattern:
         """Return True if the whole text is what the pattern says.
 
         Raises:
-            TooLongError: that takes too many steps.
+            TooLongError: the comparison takes too many steps.
         """
         return _Comparison(self._states, text).reaches_end(self._start, 0, len(text))
 
