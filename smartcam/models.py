@@ -256,9 +256,12 @@ class _EstimatedPose(Pose):
         known: PoseSigma | None = self.__dict__.get("sigma")
         return known
 
+    def _asdict(self) -> dict[str, Any]:
+        """Return the fields by name, with the errors: JSON has them, too."""
+        return {**super()._asdict(), "sigma": self.sigma}
+
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={one!r}" for name, one in self._asdict().items())
-        return f"Pose({values}, sigma={self.sigma!r})"
+        return f"Pose({', '.join(f'{name}={one!r}' for name, one in self._asdict().items())})"
 
 
 class Localization(NamedTuple):

@@ -115,6 +115,8 @@ class _OutletSource:
 
         options = self._options
         spec = options.interpret_as or "raw"
+        if self.camera is not None:  # one that knows its layouts itself has them there
+            spec = self.camera.settings.interpret_as
         read = Interpretation(spec, lenient=False, y_down=options.y_down)
         return columns_of(read.interpreter(application))
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from smartcam.layout import Layout
-    from smartcam.observers import TraceEntry
+    from smartcam.observers import RawFrame
     from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
 
@@ -193,7 +193,7 @@ async def attempt(
     progress: Try,
     name: str,
     max_length: int,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     disconnect_first: bool = True,
     liveness_timeout: float | None = None,
 ) -> Session:
@@ -304,7 +304,7 @@ def names_of(dialects: Sequence[Dialect]) -> str:
 
 async def establish(
     settings: CameraSettings,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     layout: Layout | None = None,
 ) -> Session:
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam._client.doorbell import make_doorbell
 from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
 from smartcam.protocols._inside import Event, ResultBurst
 from smartcam.protocols.messages import (
@@ -499,7 +499,7 @@ async def open_link(
     *,
     name: str,
     max_length: int,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     liveness_timeout: float | None = None,
 ) -> Link:
     """Open a link; bounded by the caller's deadline.
@@ -521,17 +521,26 @@ async def open_link(
     loop = asyncio.get_running_loop()
     machine: LinkMachine
 
-    def note(entry: TraceEntry) -> None:
-        logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
+    def note(frame: RawFrame) -> None:
+        if logger.isEnabledFor(logging.DEBUG):
+            entry = frame.entry()
+            logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
         if trace is not None:
-            trace(entry)
+            trace(frame)
 
     def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
-        note(_trace_entry(name, machine.dialect, sender, frame))
+        at = datetime.now(UTC)
+        said: Frame | TraceEntry
+        if isinstance(frame, RemoteProtocolError):
+            said = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+        else:
+            said = frame
+        note(RawFrame(at, name, machine.dialect, sender, said))
 
     def on_rest(rest: bytes) -> None:
-        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST_BYTES].hex()
-        note(TraceEntry(datetime.now(UTC), name, "!", None, text, None, shown))
+        at, text = datetime.now(UTC), f"{len(rest)} bytes that make no whole frame"
+        said = TraceEntry(at, name, "!", None, text, None, rest[:MAX_REST_BYTES].hex())
+        note(RawFrame(at, name, machine.dialect, Sender.CAMERA, said))
 
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
     machine = protocol.machine(
@@ -565,14 +574,3 @@ def _keep_alive(sock: socket.socket, timeout: float) -> None:
     for name, value in options.items():
         if hasattr(socket, name):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-
-
-def _trace_entry(
-    name: str, dialect: Dialect, sender: Sender, frame: Frame | RemoteProtocolError
-) -> TraceEntry:
-    at = datetime.now(UTC)
-    if isinstance(frame, RemoteProtocolError):
-        return TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
-    message_id, message, fields, data = dialect.spell(sender, frame)
-    direction = ">" if sender is Sender.CLIENT else "<"
-    return TraceEntry(at, name, direction, message_id, message, fields, data.hex())

@@ -22,7 +22,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.models import Status
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Transport
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, load_protocol
 from smartcam.protocols.messages import QueryAnswer, StatusReport
@@ -260,7 +260,8 @@ async def _try(
     address, transport, dialects = way
     trial = Trial(names_of(dialects), transport.value, address=address)
 
-    def take(entry: TraceEntry) -> None:
+    def take(frame: RawFrame) -> None:
+        entry = frame.entry()
         trial.keep(entry)
         if trace is not None:
             trace(entry)

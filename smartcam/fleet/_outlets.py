@@ -12,17 +12,17 @@ from smartcam._extras import from_part
 from smartcam._server import Server
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.fleet._file.fleet_file import software_camera
 from smartcam.fleet._opening import fleet_camera
 from smartcam.models import ApplicationChanged, Connected, Disconnected, Reconnected
 from smartcam.observers import Observer
 from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._agent.server import FleetServer
-    from smartcam.fleet._file.fleet_file import CameraEntry
     from smartcam.fleet._program.camera import FleetCamera
     from smartcam.models import CameraEvent, Result
     from smartcam.outlets import Outlets
@@ -68,7 +68,7 @@ class FleetOutlets(Server):
             names=self._names,
         )
         self._observer = _OutletObserver(self)
-        self._readings: dict[str, tuple[CameraEntry, Interpretation]] = {}
+        self._readings: dict[str, tuple[object, Interpretation]] = {}
         self._programs: dict[str, FleetCamera[Any]] = {}
         self._opening = asyncio.Lock()
 
@@ -115,12 +115,20 @@ class FleetOutlets(Server):
         planned = self._server.reloads.now.plan.get(camera)
         if planned is None:
             return None
+        entry = planned.entry
+        seeing = entry.software is not None and entry.interpret_as is None
+        host = self._server.hosts.get(camera) if seeing else None
+        of: object = entry if host is None else host.settings
         known = self._readings.get(camera)
-        if known is None or known[0] is not planned.entry:
-            entry = planned.entry
-            spec = "raw" if entry.interpret_as is None else entry.interpret_as
+        if known is None or known[0] is not of:
+            spec: Any = "raw" if entry.interpret_as is None else entry.interpret_as
+            if host is not None:
+                spec = host.settings.interpret_as
+            elif seeing:  # what waits from before may be asked for first
+                made = software_camera(camera, entry.software or {}, self._server.folder)
+                spec = {number: one.interpret_as for number, one in made.programs.items()}
             read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
-            known = self._readings[camera] = entry, read
+            known = self._readings[camera] = of, read
         return known[1]
 
     def endian(self, camera: str) -> int:
@@ -133,6 +141,9 @@ class FleetOutlets(Server):
         return {name: one.entry.emulated is not None for name, one in plan.items()}
 
     def _names(self, camera: str) -> Mapping[str, int]:
+        host = self._server.hosts.get(camera)
+        if host is not None:
+            return host.settings.application_names
         planned = self._server.reloads.now.plan.get(camera)
         return {} if planned is None else planned.entry.application_names
 
@@ -179,10 +190,14 @@ class _OutletObserver(Observer):
             return
         self._owner.outlets.state_changed(name, {**state, "at": event.at})
 
-    def on_result(self, result: Result) -> None:
-        """Hand on a result."""
-        owner, read = self._owner, self._owner.reading(result.camera)
-        endian = owner.endian(result.camera)
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Hand on results that came together."""
+        camera = results[0].camera
+        read, endian = self._owner.reading(camera), self._owner.endian(camera)
+        for result in results:
+            self._offer(result, read, endian)
+
+    def _offer(self, result: Result, read: Interpretation | None, endian: int) -> None:
         cells = result.value.cells
 
         def value() -> tuple[Any, int | None]:
@@ -201,7 +216,7 @@ class _OutletObserver(Observer):
             done = read(container, endian, camera=camera, number=number, at=at)
             return done.value, done.sequence
 
-        owner.outlets.offer_result(result, value)
+        self._owner.outlets.offer_result(result, value)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Hand on how a trigger ended that has no result."""

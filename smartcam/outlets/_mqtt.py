@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import ssl
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 from urllib.parse import urlsplit
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import OutletDesk
 
+logger: logging.Logger = logging.getLogger("smartcam.outlets")
+
 MAX_COMMANDS = 32
 """Largest number of commands under way at a time; more are answered with an error."""
 
@@ -40,6 +43,10 @@ MAX_STATES = 10_000
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _VERBS = ("trigger", "switch")
+_ENTRIES = ("result/", "error/", "gap/")
+"""Beginnings of the topics of entries."""
+
+_NO_TOPIC = dict.fromkeys(map(ord, "+#\0"), "_")
 
 
 def _broker(text: str) -> str:
@@ -172,14 +179,31 @@ class MqttOutlet(Outlet[MqttSettings]):
     def _watch_refusals(self, client: Any) -> None:
         """Learn which messages the broker acknowledges with a failure: aiomqtt does not tell."""
         inner = client._client  # noqa: SLF001
-        told = inner.on_publish
+        send, told = inner.publish, inner.on_publish
+        topics: dict[int, str] = {}  # of messages that are not acknowledged yet
+
+        def publish(topic: str, *given: Any, **named: Any) -> Any:
+            sent = send(topic, *given, **named)
+            topics[sent.mid] = topic
+            return sent
 
         def on_publish(of: Any, data: Any, number: int, reason: Any, properties: Any) -> None:
+            topic = topics.pop(number, "")
             if reason is not None and reason.is_failure:
-                self._refusal = str(reason)
+                if topic.removeprefix(f"{self.settings.topic}/").startswith(_ENTRIES):
+                    self._refusal = str(reason)
+                else:  # a state, or an answer to who has asked for it there
+                    logger.warning(
+                        "outlet %s: the broker refused a message to %.120s: %s",
+                        *(self.name, topic, reason),
+                    )
             told(of, data, number, reason, properties)
 
-        inner.on_publish = on_publish
+        inner.publish, inner.on_publish = publish, on_publish
+
+    def _topic(self, kind: str, camera: str) -> str:
+        """Return the topic of a camera; what no topic may have in its name is _ there."""
+        return f"{self.settings.topic}/{kind}/{camera.translate(_NO_TOPIC)}"
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; the broker has acknowledged each one then."""
@@ -189,7 +213,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         bad = next((place for place, size in enumerate(sizes) if size > largest), None)
         if bad is not None:
             count = bad
-        topics = [f"{self.settings.topic}/{one.kind}/{one.camera or 'all'}" for one in entries]
+        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
         await self._while_here(
             [
                 self._client.publish(topic, message, qos=1)
@@ -275,7 +299,7 @@ class MqttOutlet(Outlet[MqttSettings]):
                 camera = self._fresh.pop()
                 try:
                     text = object_text({"camera": camera, **self._states[camera]})
-                    topic = f"{self.settings.topic}/state/{camera}"
+                    topic = self._topic("state", camera)
                     await client.publish(topic, text, qos=1, retain=True)
                 except BaseException:
                     self._fresh.add(camera)

@@ -47,4 +47,6 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
     told = cast("dict[str, dict[str, Any]]", pose)
     turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
     rest = {name: one for name, one in record.items() if name != "pose"}
-    return {**rest, **told["position"], **turned}
+    errors = (told.get("sigma") or {}).items()
+    off = {name if "_" in name else f"sigma_{name}": one for name, one in errors}
+    return {**rest, **told["position"], **turned, **off}

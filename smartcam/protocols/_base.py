@@ -215,6 +215,14 @@ class Dialect(ABC):
         """Return a status that another dialect has read as this one reads it."""
         return report
 
+    def data_begins(self, sender: Sender, message_id: int) -> int | None:
+        """Return the bytes of a body in front of its ``data``, which is the rest of it.
+
+        :meth:`spell` makes all else of these bytes and the body's length. None where a message has
+        no such data.
+        """
+        return None
+
     @abstractmethod
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""

@@ -30,12 +30,12 @@ from smartcam.recording._mcap.form import (
     PICTURE_SCHEMAS,
     RecordedError,
     RecordedPicture,
-    body_of,
     camera_name,
     count_values,
     message_fields,
     optional,
 )
+from smartcam.recording._mcap.json import body_of
 from smartcam.recording._mcap.records import (
     Channel,
     CutOffError,

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from smartcam.calibration._files import store
 from smartcam.calibration.formats import SAMPLES, TRAJECTORIES, TRANSFORMS
 from smartcam.calibration.formats._cameras import FORMS
 from smartcam.calibration.formats._file_format import Format
 from tests.budgets.inputs import JSON, PAST_LOOKAHEAD, YAML
 from tests.budgets.parser import Make, Parser, fill_text, from_file
+from tests.calibration.inside import store
 
 _CSV = "#t [s],x [m],y [m],z [m],qx [],qy [],qz [],qw []\n"
 
@@ -153,7 +153,7 @@ PARSERS: tuple[Parser, ...] = (
             from_file(functools.partial(_read_between, form, "robot", "camera"), "a"),
             _POSES,
             form.most,
-            "calibration.formats._file_format.MAX_TEXT",
+            "calibration.formats._file_format.MAX_TEXT_BYTES",
             size=2500,
             short=PAST_LOOKAHEAD,
             needs=("yaml",),
@@ -179,7 +179,7 @@ PARSERS: tuple[Parser, ...] = (
             from_file(functools.partial(_read_between, form, "a", "b"), "a"),
             _TRAJECTORIES,
             form.most,
-            "calibration.formats._file_format.MAX_FILE",
+            "calibration.formats._file_format.MAX_FILE_BYTES",
             size=2500,
             short=PAST_LOOKAHEAD,
         )
@@ -191,7 +191,7 @@ PARSERS: tuple[Parser, ...] = (
             from_file(form.read, "a"),
             _CAMERAS,
             form.most,
-            "calibration.formats._cameras.MAX_FILE",
+            "calibration.formats._cameras.MAX_FILE_BYTES",
             size=2500,
             short=PAST_LOOKAHEAD,
             needs=("yaml",),

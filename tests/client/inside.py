@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from smartcam._client import handshake
 from smartcam._client.correlation import (
     Correlation,
     Debt,
@@ -28,4 +29,5 @@ __all__ = [
     "Results",
     "TriggerEvidence",
     "establish",
+    "handshake",
 ]

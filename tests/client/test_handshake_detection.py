@@ -12,14 +12,13 @@ from typing import Any
 
 import pytest
 
-from smartcam._client import handshake
 from smartcam._client._inside import Session
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectFailedError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings
-from tests.client.inside import establish
+from tests.client.inside import establish, handshake
 from tests.handmade import CONNECT_ANSWER, HOST, LIMIT, Peer, datagrams, scripted, until
 
 DETECTION_TIMEOUT = 0.5

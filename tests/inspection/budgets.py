@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from smartcam.inspection._read.gs1 import elements
 from tests.budgets.parser import Make, Parser, fill_text
+from tests.inspection.inside import elements
 
 _ELEMENTS: dict[str, Make] = {
     "elements of a length": fill_text("11250101"),

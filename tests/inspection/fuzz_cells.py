@@ -23,9 +23,10 @@ from smartcam.inspection._camera import eyes
 from smartcam.inspection._camera.eyes import failed_values
 from smartcam.inspection._program import MAX_REASON_BYTES
 from smartcam.inspection._read import gs1
-from smartcam.inspection._read.gs1 import GS, elements
+from smartcam.inspection._read.gs1 import GS
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
+from tests.inspection.inside import elements
 
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection

@@ -58,6 +58,20 @@ async def test_each_trigger_takes_the_next_picture_of_a_folder_and_begins_again(
         assert [one.ok for one in found] == [True, True, False, True, True, False, True]
 
 
+async def test_pictures_of_other_sizes_and_kinds_in_a_folder_have_their_turn(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("av")
+    write_pictures(tmp_path / "shots", [10, 20])
+    others = [np.full((9, 5), 7 * 257, np.uint16), np.full((30, 20, 3), 15, np.uint8)]
+    for number, picture in enumerate(others, start=3):
+        assert cv2.imwrite(str(tmp_path / f"shots/part{number}.png"), picture)
+    (tmp_path / "cell.yaml").write_text(FOLDER.format(frames="shots"))
+    async with smartcam.connect(f"software:{tmp_path / 'cell.yaml'}") as camera:
+        found = [(await camera.trigger(timeout=PATIENCE)).value.level for _ in range(5)]
+        assert found == [10, 20, 7, 15, 10]
+
+
 async def test_a_free_run_goes_round_a_folder_in_order(tmp_path: Path) -> None:
     pytest.importorskip("av")
     write_pictures(tmp_path / "shots", [10, 20, 30])

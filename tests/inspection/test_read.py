@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +16,12 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
 from smartcam.inspection._read.codes import formats_of, read_codes
-from smartcam.inspection._read.gs1 import elements
 from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
+from smartcam.inspection._read.patterns import TextPattern
 from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
+from tests.inspection.inside import elements
 from tests.inspection.proofs import codes
 
 if TYPE_CHECKING:
@@ -139,20 +142,73 @@ def test_pattern_that_is_too_large_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "part"),
+    "pattern",
     [
-        ("LOT([A-Z0-9]+-?)+;", "([A-Z0-9]+-?)+"),
-        ("(?:a|(?P<b>x*?y?))*", "(?:a|(?P<b>x*?y?))*"),
-        ("(a+){2,}", "(a+){2,}"),
-        ("(?=(a+)+)a", "(?=(a+)+)a"),
+        "(a+)+$",
+        "(a|a)+",
+        "(a{1,30}){1,30}",
+        "(a*){30}",
+        "(?:a?){29}a{29}",
+        "(?=(a+)+b).*",
+        "(a|a?)+b",
     ],
 )
-def test_pattern_that_repeats_a_repetition_is_refused_with_its_part(
-    tmp_path: Path, pattern: str, part: str
-) -> None:
-    with pytest.raises(ConfigurationError, match="no repetition without an end") as caught:
-        inspected(tmp_path, f"{{read: {{expect: '{pattern}'}}}}", picture())
-    assert repr(part) in str(caught.value)
+def test_no_pattern_takes_longer_the_more_ways_it_could_match(pattern: str) -> None:
+    expected = TextPattern(pattern)
+    begun = time.process_time()
+    assert not expected.fits(28 * "a" + "!")
+    assert time.process_time() - begun < 1.0  # by re, some of these take years
+
+
+def test_patterns_match_what_those_of_re_match() -> None:
+    random = np.random.default_rng(5)
+    atoms = ["a", "b", ".", r"\d", "[ab]", "[^a]", "(?i:B)", r"\b", "^", "$", r"\B", r"\Z", ""]
+    times = ["*", "+", "?", "{2}", "{1,2}", "*?", "??"]
+
+    def pattern(depth: int) -> str:
+        kind = random.integers(0, 6) if depth else 0
+        inner = [pattern(depth - 1) for _ in range(2)] if kind else []
+        if kind == 0:
+            return str(random.choice(atoms))
+        if kind in (1, 2):
+            return "".join(inner)
+        if kind == 3:
+            return f"(?:{inner[0]}|{inner[1]})"
+        if kind == 4:
+            return f"(?:{inner[0]}){random.choice(times)}"
+        return f"({random.choice(['?=', '?!', '', '?s:', '?m:'])}{inner[0]}){inner[1]}"
+
+    matches = 0
+    for _ in range(80):
+        given = pattern(3)
+        for _ in range(5):
+            text = "".join(random.choice([*"aabB1\n"], random.integers(0, 5)))
+            wanted = re.fullmatch(given, text) is not None
+            assert TextPattern(given).fits(text) is wanted, (given, text)
+            matches += wanted
+    assert matches > 25
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text"),
+    [
+        (r"(a)\1", "references to groups"),
+        ("(?>a)b", "atomic groups"),
+        ("(a{0,100}){0,100}", "each counted as often as it may be repeated"),
+        ("(){1,4294967294}", "each counted as often as it may be repeated"),
+        ("(?<=a*)b", "no fixed width"),
+    ],
+)
+def test_pattern_that_is_not_compared_is_refused(pattern: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        TextPattern(pattern)
+
+
+def test_text_that_takes_too_long_to_compare_is_not_ok(tmp_path: Path) -> None:
+    hard = f"({'(?!.*b)' * 100}.)*"  # each place of the text looks at all behind it, 100 times
+    cell = f"{{read: {{codes: DataMatrix, length: 200, expect: '{hard}'}}}}"
+    found = inspected(tmp_path, cell, picture(text=200 * "a"))
+    assert (found.ok, found.reason.endswith("takes too long")) == (False, True)
 
 
 def test_other_repetitions_are_taken(tmp_path: Path) -> None:

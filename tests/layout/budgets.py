@@ -102,7 +102,7 @@ _CELL_FILES: dict[str, Make] = {
 }
 
 PARSERS: tuple[Parser, ...] = (
-    Parser("layouts", Layout, _LAYOUTS, MAX_LAYOUT, "layout._text.MAX_TEXT", size=4000),
+    Parser("layouts", Layout, _LAYOUTS, MAX_LAYOUT, "layout._text.MAX_TEXT_CHARACTERS", size=4000),
     Parser(
         "layouts as YAML",
         Layout.from_yaml,
@@ -115,7 +115,7 @@ PARSERS: tuple[Parser, ...] = (
             },
         },
         MAX_YAML_TEXT_CHARACTERS,
-        "layout._yamls.MAX_YAML_TEXT",
+        "layout._yamls.MAX_YAML_TEXT_CHARACTERS",
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml",),
@@ -132,7 +132,7 @@ PARSERS: tuple[Parser, ...] = (
         load,
         YAML,
         MAX_YAML_TEXT_CHARACTERS,
-        "layout._yamls.MAX_YAML_TEXT",
+        "layout._yamls.MAX_YAML_TEXT_CHARACTERS",
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml",),
@@ -143,7 +143,7 @@ PARSERS: tuple[Parser, ...] = (
         from_file(load_scenario, "a.yaml"),
         _SCENARIOS,
         MAX_YAML_TEXT_CHARACTERS,
-        "layout._yamls.MAX_YAML_TEXT",
+        "layout._yamls.MAX_YAML_TEXT_CHARACTERS",
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml",),
@@ -154,7 +154,7 @@ PARSERS: tuple[Parser, ...] = (
         from_file(load_fleet, "a.yaml"),
         _FLEETS,
         MAX_YAML_TEXT_CHARACTERS,
-        "layout._yamls.MAX_YAML_TEXT",
+        "layout._yamls.MAX_YAML_TEXT_CHARACTERS",
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml",),
@@ -164,7 +164,7 @@ PARSERS: tuple[Parser, ...] = (
         from_file(load_cell, "a.yaml"),
         _CELL_FILES,
         MAX_YAML_TEXT_CHARACTERS,
-        "layout._yamls.MAX_YAML_TEXT",
+        "layout._yamls.MAX_YAML_TEXT_CHARACTERS",
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml", "cv2", "zxingcpp"),

@@ -76,7 +76,7 @@ PARSERS: tuple[Parser, ...] = (
             "a long text": _ifm_layout('{"type":"string","id":"s","value":"aaaaaaaaaaaaaaaa"},'),
         },
         64 << 10,
-        "emulator._ticketed_camera.MAX_REQUEST",
+        "emulator._ticketed_camera.MAX_REQUEST_BYTES",
         refuses=(ValueError, RecursionError),
     ),
 )

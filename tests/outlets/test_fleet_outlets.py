@@ -10,11 +10,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
+from smartcam.outlets import StoreQuestion
+from smartcam.outlets._inside import read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
 from tests.outlets.outletkit import FarEnd, ListOutlet, until
@@ -65,6 +68,48 @@ async def test_results_of_an_agents_triggers_are_rows_by_the_layout(tmp_path: Pa
     parts = rows(tmp_path, "SELECT DISTINCT id FROM app_7 WHERE x IS NOT NULL")
     assert len(parts) == 5
     assert (("x", "real64", "m")) in rows(tmp_path, "SELECT name, type, unit FROM fields")
+
+
+SOFTWARE = """
+cameras:
+  line1/cam1:
+    software:
+      frames: shots
+      applications:
+        7:
+          name: spot
+          present: {grey: [200, 255], area: [50, 5000]}
+          measure: {edge: {across: [[10, 30], [40, 30]]}}
+outlets:
+  store: {kind: sqlite, file: results.sqlite}
+"""
+
+
+async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_found(
+    tmp_path: Path,
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    pytest.importorskip("av")
+    (tmp_path / "shots").mkdir()
+    part = np.full((60, 80), 40, np.uint8)
+    cv2.imwrite(str(tmp_path / "shots" / "1.png"), cv2.circle(part.copy(), (30, 30), 12, 240, -1))
+    cv2.imwrite(str(tmp_path / "shots" / "2.png"), part)
+    async with serving(fleet(tmp_path, SOFTWARE)) as (server, outlets):
+        reading = server.hosts["line1/cam1"].camera
+        assert reading.settings.application_names == {"spot": 7}
+        for _ in range(4):
+            await reading.trigger(timeout=20)
+        await until(lambda: outlets.states["store"].account.delivered >= 4)
+        found = read_store(tmp_path / "results.sqlite", StoreQuestion(failed=True))
+        assert (found.total, found.failed) == (4, 2)
+    assert rows(tmp_path, "SELECT ok, present_count FROM app_7 ORDER BY id") == [(1, 1), (0, 0)] * 2
+    units = dict(rows(tmp_path, "SELECT column_name, unit FROM fields WHERE unit != ''"))
+    assert units["measure_place"] == units["present_x"] == "px"
+    made = FleetOutlets(FleetServer(tmp_path / "fleet.yaml", bus=MemoryBus().end()))
+    read = made.reading("line1/cam1")  # what waits may be delivered before there is a camera
+    assert read is not None
+    layout: Any = getattr(read.interpreter(7), "layout", None)
+    assert layout.text.startswith("ok: bool, reason: string[80], present_ok: bool")
 
 
 async def test_a_trigger_without_a_result_is_an_error_row(tmp_path: Path) -> None:

@@ -116,6 +116,58 @@ async def test_what_the_broker_refuses_is_told_and_not_lost(tmp_path: Path) -> N
         assert outlets.states["mqtt"].account.spooled == 1
 
 
+async def test_a_camera_whose_name_is_no_topic_keeps_nothing_back(tmp_path: Path) -> None:
+    async with broker(tmp_path) as there, listener(there.port, "smartcam/+/#") as heard:
+        async with Outlets(section(there.url), tmp_path) as outlets:
+            outlets.state_changed("a+b", {"connected": True})
+            for name in ("a+b/#", "c"):
+                outlets.offer_result(result(1, name))
+            await until(lambda: outlets.states["mqtt"].account.delivered == 2)
+        await until(lambda: sum("result" in str(one.topic) for one in heard) == 2)
+        topics = {str(one.topic): json.loads(one.payload) for one in heard}
+    assert topics["smartcam/result/a_b/_"]["camera"] == "a+b/#"
+    assert topics["smartcam/state/a_b"]["camera"] == "a+b"
+
+
+async def test_an_answer_that_the_broker_refuses_keeps_no_result_back(tmp_path: Path) -> None:
+    import aiomqtt
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    done = asyncio.Event()
+
+    async def command(_camera: str, _verb: str, _given: Mapping[str, Any]) -> dict[str, Any]:
+        done.set()
+        return {}
+
+    (tmp_path / "acl").write_text("topic readwrite smartcam/#\n")  # and not answers/#
+    lines = f"allow_anonymous true\nacl_file {tmp_path}/acl\n"
+    settings = {"commands": True}
+    async with (
+        broker(tmp_path, lines) as there,
+        listener(there.port, "smartcam/result/#") as heard,
+        listener(there.port, "smartcam/outlet/mqtt") as online,
+        Outlets(section(there.url, **settings), tmp_path, command=command) as outlets,
+    ):
+        await until(lambda: bool(online))
+        async with aiomqtt.Client(
+            "127.0.0.1", there.port, protocol=aiomqtt.ProtocolVersion.V5
+        ) as client:
+            make: Any = Properties  # paho has no types
+            asked = make(PacketTypes.PUBLISH)
+            asked.ResponseTopic = "answers/mine"
+            topic = "smartcam/command/trigger/line1/cam1"
+            await client.publish(topic, "", qos=1, properties=asked)
+            await asyncio.wait_for(done.wait(), 30)
+            for number in range(1, 51):
+                outlets.offer_result(result(number))
+                await asyncio.sleep(0.005)
+        await until(lambda: outlets.states["mqtt"].account.delivered == 50)
+        await until(lambda: len(heard) >= 50)
+    assert [json.loads(one.payload)["value"]["n"] for one in heard] == [*range(1, 51)]
+    assert len(online) == 2  # it came, and left at the end
+
+
 async def test_a_message_that_is_too_large_is_dropped_and_counted(tmp_path: Path) -> None:
     async with (
         broker(tmp_path) as there,

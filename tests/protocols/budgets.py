@@ -10,12 +10,11 @@ from smartcam.protocols import FramedDialect, LineDialect, LineMachine, Machine,
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
 from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES
-from smartcam.protocols._insight.dialect import NATIVE
-from smartcam.protocols._insight.machine import InSightMachine
 from smartcam.protocols._insight.words import MAX_LINE_BYTES
 from tests.budgets.inputs import LINE_ROWS, TEXT_LINES, UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, streamed
 from tests.machines import B16, BID, THESIS
+from tests.protocols.inside import NATIVE, InSightMachine
 
 
 def _session(dialect: FramedDialect, role: Role, transport: Transport, pieces: list[bytes]) -> None:
@@ -191,14 +190,14 @@ PARSERS: tuple[Parser, ...] = (
             }
         ),
         2 * MAX_IMAGE_BYTES,
-        "protocols._insight.answers.MAX_IMAGE, in hex",
+        "protocols._insight.answers.MAX_IMAGE_BYTES, in hex",
     ),
     Parser(
         "In-Sight: lines",
         functools.partial(_insight_answers, m.GetStatus),
         streamed(TEXT_LINES),
         MAX_LINE_BYTES,
-        "protocols._insight.words.MAX_LINE",
+        "protocols._insight.words.MAX_LINE_BYTES",
         size=1000,
     ),
     Parser(
@@ -206,7 +205,7 @@ PARSERS: tuple[Parser, ...] = (
         _line_machine,
         streamed(TEXT_LINES),
         1 << 15,
-        "protocols._lines.READ_SIZE",
+        "protocols._lines.MAX_READ_BYTES",
         size=1000,
     ),
 )

@@ -16,15 +16,9 @@ from smartcam.models import Status
 from smartcam.protocols import INSIGHT, Frame, LinkEnded, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Event
-from smartcam.protocols._insight.dialect import NATIVE
-from smartcam.protocols._insight.machine import (
-    MAX_READ_BYTES,
-    Command,
-    InSightMachine,
-    Piece,
-    Reply,
-)
+from smartcam.protocols._insight.machine import MAX_READ_BYTES, Command, Piece, Reply
 from smartcam.protocols._insight.words import MAX_LINE_BYTES
+from tests.protocols.inside import NATIVE, InSightMachine
 from tests.protocols.insight_lines import (
     BITMAP,
     DIGITS,

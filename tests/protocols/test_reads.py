@@ -318,7 +318,7 @@ def test_bursts_and_what_came_before_are_the_frames_that_come_one_by_one(
     expected = outcome(alone, events[0])
     assert outcome(fed, one_by_one(events[1])) == expected
     assert outcome(written, one_by_one(events[2])) == expected
-    assert outcome(looked_at, events[3]) == expected  # not a burst among them
+    assert outcome(looked_at, one_by_one(events[3])) == expected
     heard = [what for sender, what in traced if sender is m.Sender.CAMERA]
     frames = [what for what in heard if isinstance(what, Frame)]
     assert len(frames) == looked_at.counters.frames_received

@@ -14,7 +14,6 @@ import pytest
 from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
-from smartcam.recording import _recorder as recorder
 from smartcam.recording._folder import FileName, files_of
 from smartcam.recording._folders import files as folder_files
 from smartcam.recording._folders import pictures as folder_pictures
@@ -25,6 +24,7 @@ from smartcam.recording._recorder import MAX_WAITING_BYTES
 from smartcam.recording._replays.pictures import ReplayedPictures
 from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
+from tests.recording.inside import _recorder as recorder
 
 __all__ = [
     "MAX_WAITING_BYTES",

@@ -35,6 +35,7 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Result,
@@ -445,9 +446,11 @@ def test_bag_value_that_is_nearly_a_localization_is_none(tmp_path: Path) -> None
         {"photo_index": 1.5},
         {"feature_id": 3},
         {"pose": {"position": {}}},
+        {"pose": {**good["pose"], "sigma": {"x": 0.1}}},
         {"more": 1},
     ]
-    items = [result(number, [{**good, **one}]) for number, one in enumerate([{}, *broken])]
+    sigma = {"pose": jsonable(part().pose.with_sigma(PoseSigma(1e-4, 2e-4, 1e-3, 0.5)))}
+    items = [result(number, [{**good, **one}]) for number, one in enumerate([sigma, *broken])]
     recording = write(tmp_path / "run.mcap", items)
     assert write_bag(recording, tmp_path / "bag").localizations == 1
     messages = read(tmp_path / "bag")

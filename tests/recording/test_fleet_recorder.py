@@ -20,6 +20,9 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
 from smartcam.models import ApplicationChanged, Connected, Result, Status, StatusChanged
+from smartcam.observers import RawFrame
+from smartcam.protocols import BVS
+from smartcam.protocols.messages import Sender
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folders import files as folder_files
@@ -386,7 +389,8 @@ async def test_record_that_makes_no_json_is_counted_and_the_rest_is_written(
             for _ in range(5000):
                 deep = [deep]
             odd = frame(0, "> Query", odd=deep)._replace(camera=NAME)
-            agent.observers[0].on_frame(odd)
+            dialect = BVS.dialects["handbook"]
+            agent.observers[0].on_raw_frame(RawFrame(odd.at, NAME, dialect, Sender.CLIENT, odd))
             await agent.hosts[NAME].camera.trigger()
         assert recorder.accounts[NAME].lost == 1
     assert all_runs(tmp_path) == [1]

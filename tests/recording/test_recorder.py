@@ -25,8 +25,8 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Connected, Disconnected, Result, StatusChanged
 from smartcam.recording import Recorder, load_recording
-from smartcam.recording import _recorder as recorder
 from tests.recording.inside import KINDS
+from tests.recording.inside import _recorder as recorder
 from tests.recording.recordingkit import COUNTER, at, frame, record, write
 
 

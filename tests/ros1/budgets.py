@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 from smartcam.exceptions import SmartCamError
-from smartcam.ros1._json_messages import from_json
 from tests.budgets.inputs import JSON, ros_types
 from tests.budgets.parser import Make, Parser, fill_text
+from tests.ros1.inside import from_json
 
 _OPERATIONS: dict[str, Make] = {
     "messages": fill_text("{},".replace("{}", "{ }"), '{"parts":[', "{ }]}"),

@@ -69,7 +69,7 @@ PARSERS: tuple[Parser, ...] = (
         _body,
         _BODIES,
         256 << 10,
-        "web._routes.MAX_BODY",
+        "web._routes.MAX_BODY_BYTES",
         refuses=(RefusedError,),
         needs=("aiohttp",),
     ),
@@ -78,7 +78,7 @@ PARSERS: tuple[Parser, ...] = (
         _heads,
         streamed(_HEADS),
         32 << 10,
-        "web._connections.MAX_HEAD",
+        "web._connections.MAX_HEAD_BYTES",
         needs=("aiohttp",),
     ),
 )

@@ -15,9 +15,9 @@ from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectionTakenError
 from smartcam.fleet import Fleet, FleetFile, MemoryBus
 from smartcam.web import FleetSite
-from smartcam.web import _fleet as fleet_module
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, Plant
 from tests.handmade import until
+from tests.web.inside import _fleet as fleet_module
 from tests.web.sitekit import Answer, Caller, Listener
 
 if TYPE_CHECKING:

@@ -28,6 +28,7 @@ from smartcam.calibration._least_squares import independent_parts
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
 from smartcam.calibration._verdict import CalibrationVerdict, Judgement
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from smartcam.calibration._targets import Target
+    from smartcam.models import PoseSigma
 
 KIND = "sheet"
 """Name of these calibrations' files in the store."""
@@ -223,6 +225,9 @@ class SheetCalibration(storage.SavedCalibration):
             localizations: localizations of the camera, one or many: pixels, with y turned up.
             tool_flip: as in :meth:`PlaneCalibration.to_robot`.
 
+        Where a pose has a ``sigma``, and the touches' sigma is known, the robot's has one, too,
+        with the errors of view, touches and lens in it.
+
         Raises:
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
         """
@@ -232,7 +237,34 @@ class SheetCalibration(storage.SavedCalibration):
 
     def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
-        return self.plane.to_robot(self.sheet.solve(Poses.of(parts)).put(parts), tool_flip=flip)
+        flat = self.sheet.solve(Poses.of(parts)).put(parts)
+        told = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
+        if told and self.plane.touch_sigma is not None:
+            for n, sigma in zip(told, self._sigmas([parts[n] for n in told]), strict=True):
+                flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
+        return self.plane.to_robot(flat, tool_flip=flip)
+
+    def _sigmas(self, parts: list[Localization]) -> list[PoseSigma]:
+        """Return the errors of poses on the sheet: the camera's, the view's and the lens'."""
+        lenses = self.lens_planes
+        y_up = np.array([1.0, -1.0])
+
+        def on_sheet(points: Array) -> Array:
+            flat = self.sheet.near_sheet(points * y_up)
+            return np.column_stack([flat, np.zeros(len(flat))])
+
+        def by_values(points: Array) -> Array:
+            flat = self.sheet.near_sheet(points * y_up)
+            rows = np.zeros((len(flat), 3, 9 + len(lenses)))
+            rows[:, :2, :9] = self.sheet.by_elements(flat)
+            for number, one in enumerate(lenses, start=9):
+                rows[:, :2, number] = one.near_sheet(points * y_up) - flat
+            return rows
+
+        covariance = np.eye(9 + len(lenses))
+        covariance[:9, :9] = self.sheet.covariance
+        normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
+        return robot_sigmas(parts, on_sheet, normal, by_values, covariance, size, flip=False)
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.

@@ -110,13 +110,24 @@ class SheetPlane:
         Raises:
             CalibrationError: as :meth:`on_sheet`.
         """
-        flat = self.on_sheet(pixels)
+        moves = self.by_elements(self.on_sheet(pixels))
+        covariance: Array = moves @ self.covariance @ moves.swapaxes(1, 2)
+        return covariance
+
+    def by_elements(self, flat: Array) -> Array:
+        """Return the derivatives (N, 2, 9) of points (N, 2) of the sheet by the matrix' elements.
+
+        Each point is the one that its pixel shows.
+        """
         # The pixel does not change: 0 = D dx + E dm, with the derivatives D by the point and E by
         # the elements, so dx = -D^-1 E dm.
         by_elements = element_derivatives(self.matrix, flat)
         moves = np.linalg.solve(derivatives(self.matrix, flat), by_elements)
-        covariance: Array = moves @ self.covariance @ moves.swapaxes(1, 2)
-        return covariance
+        return np.asarray(-moves, dtype=np.float64)
+
+    def near_sheet(self, pixels: Array) -> Array:
+        """Map pixels (N, 2), v down, as :meth:`on_sheet`, some beside the image, too."""
+        return self._mapped(self._straight(pixels), pixels)
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses on the sheet.

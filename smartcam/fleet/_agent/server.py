@@ -360,9 +360,10 @@ class FleetServer(Server):
             if entry.software is not None:
                 device, frames = await self._see(planned, folder, stack)
                 url = device.url
-                if entry.interpret_as is None:
-                    update = {"interpret_as": device.interpret_as}
-                    entry = entry.model_copy(update=update)
+                names = {one.name: number for number, one in device.camera.programs.items()}
+                usual = {"interpret_as": device.interpret_as, "application_names": names}
+                update = {name: one for name, one in usual.items() if not getattr(entry, name)}
+                entry = entry.model_copy(update=update)
             else:
                 url = entry.url or await self._emulate(planned, stack)
             settings = entry.settings(planned.name, url, restore=self._restore)

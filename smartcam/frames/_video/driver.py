@@ -52,7 +52,7 @@ LIVE_OPTIONS: Final = {"fpsprobesize": "0", "probesize": "32768", "analyzedurati
 _COMMON: Final = ("delay", "elsewhere", "format", "name", "timeout")
 _RECORDED: Final = ("fps", "pace")
 _KNOWN: Final = {
-    "file": ("format", "name", "timeout", *_RECORDED),
+    "file": ("format", "mixed", "name", "timeout", *_RECORDED),
     "http": (*_COMMON, *_RECORDED),
     "https": (*_COMMON, *_RECORDED, "ca", "verify"),
     "rtsp": (*_COMMON, "transport"),
@@ -81,6 +81,8 @@ class VideoDriver(FrameDriver):
                       when the readers have taken the last one; none is skipped
     ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
                       files in a folder
+    ``mixed``         of files: ``yes`` takes pictures of other sizes and formats than the first
+                      one's, too; usual ``no``
     ``verify``        of TLS: ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
     ``elsewhere``     of a server: ``yes`` goes where it sends us, by a redirect to another host or
@@ -106,6 +108,7 @@ class VideoDriver(FrameDriver):
         self._paced = one_of(address, "pace", said, ("real", "none")) == "real"
         self._format = wanted_format(address, said.get("format"))
         self._options = _options(address, said)
+        self._mixed = one_of(address, "mixed", said, ("no", "yes")) == "yes"
         self._elsewhere = one_of(address, "elsewhere", said, ("no", "yes")) == "yes"
         self._tls = tls_of(address, said)
         self._thread: _ReadingThread | None = None
@@ -218,7 +221,7 @@ class VideoDriver(FrameDriver):
     def _frame(self, read: Read, live: bool) -> Frame:
         pixels, now = read.pixels, time.monotonic()
         comes = (pixels.format, pixels.width, pixels.height)
-        if self._stream is not None and comes != self._stream[:3]:
+        if self._stream is not None and comes != self._stream[:3] and not self._mixed:
             raise FrameFormatError(
                 f"{self.name}: expected {StreamFormat(*self._stream[:3])}, as it was opened, got "
                 f"{StreamFormat(*comes)}: open it anew",

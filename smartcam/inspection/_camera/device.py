@@ -39,7 +39,6 @@ NO_VALUE: Final = "#ERR"
 """Text of a cell without a value."""
 
 _RECORDED: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-9+.-]*:)|file:)")
-_PACE: Final = re.compile(r"#(.*&)?pace=")
 
 
 class SoftwareDevice(Server):
@@ -293,8 +292,10 @@ def source_of(address: str, *, recorded: bool) -> FrameSource:
     Raises:
         ConfigurationError: the address cannot work.
     """
-    if recorded and _PACE.search(address) is None:
-        address += "&pace=none" if re.search(r"#\w+=[^#/]*$", address) else "#pace=none"
+    for name, value in (("pace", "none"), ("mixed", "yes")) if recorded else ():
+        if re.search(rf"#(.*&)?{name}=", address) is None:
+            mark = "&" if re.search(r"#\w+=[^#/]*$", address) else "#"
+            address += f"{mark}{name}={value}"
     return frames.open(address)
 
 

@@ -24,10 +24,15 @@ from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
-from smartcam.inspection._locate.edges import edge_points, fit_segments, segments_of
+from smartcam.inspection._locate.edges import (
+    blurred_moves,
+    edge_points,
+    fit_segments,
+    segments_of,
+)
 from smartcam.inspection._locate.fine import FineSettings, fit_pose
 from smartcam.inspection._locate.outlines import MM, drawn_outline, read_outline
-from smartcam.inspection._locate.segments import Bands, Segments, make_bands
+from smartcam.inspection._locate.segments import BLURS_PX2, Bands, Segments, make_bands
 from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
@@ -43,7 +48,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.inspection._locate.outlines import Unit
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of the files of models."""
 
 MAX_FILE_BYTES: Final = 1 << 21
@@ -345,6 +350,8 @@ def _taught(
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.some(exact)
+    moves = blurred_moves(levels, segments, found.points)
+    segments = segments._replace(moves=moves)
     _check_directions(segments)
     centre = found.points.mean(axis=0)
     segments = _ordered(segments._replace(middles=segments.middles - centre))
@@ -374,7 +381,7 @@ def _off_middle(
     """
     levels, (x, y), noise = taught
     turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
-    use = FineSettings(MIN_SELF_CONTRAST, noise, turned=fold != 0)
+    use = FineSettings(np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, turned=fold != 0)
     found = []
     for number in range(turns if fold != 1 else 0):
         start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
@@ -493,6 +500,8 @@ Part = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
 Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
 Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
 Row = tuple[Place, Place, Part, Part, Part, Length, Height, Length, Length]
+Move = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
+Moves = Annotated[list[Move], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
 
 
 class _ModelFile(BaseModel):
@@ -503,7 +512,7 @@ class _ModelFile(BaseModel):
     )
 
     kind: Literal["smartcam part model"] = "smartcam part model"
-    version: Literal[1] = VERSION
+    version: Literal[2] = VERSION
     name: Annotated[str, Field(min_length=1, max_length=50)]
     reference: tuple[Number, Number]
     border: Annotated[float, Field(ge=0, le=1)]
@@ -512,6 +521,7 @@ class _ModelFile(BaseModel):
     alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
     about: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
+    moves: Annotated[list[Moves], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
     outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
 
@@ -520,6 +530,8 @@ class _ModelFile(BaseModel):
         for number, level in enumerate(self.levels):
             if not level or max(level) >= len(self.segments):
                 raise ValueError(f"levels.{number}: expected indices of segments")
+        if len(self.moves) != len(self.segments):
+            raise ValueError("moves: expected as many as segments")
         places = np.array([row[:2] for row in self.segments] + self.outline)
         if float(np.prod(np.ptp(places, axis=0))) > MAX_REGION_PX:
             raise ValueError(f"expected a part of {MAX_REGION_PX} pixels at most")
@@ -543,6 +555,7 @@ class _ModelFile(BaseModel):
             alike=list(model.symmetry.alike),
             about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
+            moves=one.moves.round(5).tolist(),
             levels=[one.tolist() for one in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )
@@ -550,10 +563,11 @@ class _ModelFile(BaseModel):
     def model(self) -> PartModel:
         """Return the model of the file."""
         rows = np.array(self.segments, np.float64)
+        numbers = (rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], rows[:, 8])
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
         return PartModel(
             name=self.name,
-            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T),
+            segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(np.array(one, np.intp) for one in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),

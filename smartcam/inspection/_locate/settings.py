@@ -91,7 +91,7 @@ class LocateSettings(ToolSettings):
         None,
         ge=1,
         le=255,
-        description="grey levels of 255 of an edge at least; default: a seventh of the taught ones",
+        description="grey levels of 255 of an edge at least; default: an eighth of its taught ones",
     )
     sigma: float | None = Field(
         None,

@@ -479,6 +479,10 @@ class FramedDialect(Dialect):
         word = reader.status_bits.write(report.status)
         return dataclasses.replace(report, status=self.status_bits.read(word))
 
+    def data_begins(self, sender: Sender, message_id: int) -> int | None:
+        codec = self.decoders(sender).get(message_id)
+        return codec.size if codec is not None and codec.has_data else None
+
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""
         fields: dict[str, Any] | None = None

@@ -240,7 +240,7 @@ class Machine:
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
-        self._takes_bursts = self._plain and result.size > 0
+        self._takes_bursts = self._asks and result.size > 0
         self._said = {}
         self._forget_familiar()
 
@@ -664,6 +664,10 @@ class Machine:
         if not more:
             return
         self.counters.frames_received += len(more)
+        if self._trace is not None:
+            front = framer.take(begin, begin + self._burst_size)
+            for data in more:
+                self._trace(self._sender, Frame(self._result_id, front + data))
         size = len(first.data) + framer.start - start - len(more) * head
         more.insert(0, first.data)
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)

@@ -18,6 +18,7 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Reconnected,
@@ -320,16 +321,18 @@ def _part(said: Mapping[str, Any]) -> Localization:
         raise TypeError("no text")
     if type(photo) is not int:
         raise TypeError("no index")
-    return Localization(
-        feature,
-        _number(said["quality"]),
-        photo,
-        Pose(
-            Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
-            Position(*(_number(pose["position"][name]) for name in "xyz")),
-            Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
-        ),
+    place = Pose(
+        Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
+        Position(*(_number(pose["position"][name]) for name in "xyz")),
+        Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
     )
+    if "sigma" in pose:
+        told = {name: pose["sigma"][name] for name in PoseSigma._fields}
+        errors: dict[str, Any] = {
+            name: None if one is None else _number(one) for name, one in told.items()
+        }
+        place = place.with_sigma(PoseSigma(**errors))
+    return Localization(feature, _number(said["quality"]), photo, place)
 
 
 def _number(said: object) -> float:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
     from smartcam.models import Result
     from smartcam.observers import TraceEntry
-    from smartcam.recording._mcap.form import Item
+    from smartcam.recording._recorder import Given
 
 
 DISTRIBUTION = "jazzy"
@@ -91,7 +91,7 @@ class _BagFile:
         self.start, self.flush = self._writer.start, self._writer.flush
         self.finish, self.close = self._writer.finish, self._writer.close
 
-    def add(self, item: Item | Description, /) -> None:
+    def add(self, item: Given, /) -> None:
         """Write one thing; raises ValueError: no message can be made of it."""
         if isinstance(item, Description):
             self.items.describe(item.facts)

@@ -209,7 +209,16 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
         ValueError: nobody could read it back.
     """
     to_text = KINDS[kind].to_text
-    data = (to_text(item) if raw_from is None else to_text(item, raw_from)).encode()
+    return bounded(to_text(item) if raw_from is None else to_text(item, raw_from))
+
+
+def bounded(text: str) -> bytes:
+    """Return a message's text as bytes.
+
+    Raises:
+        ValueError: nobody could read it back.
+    """
+    data = text.encode()
     if len(data) > min(MAX_MESSAGE_BYTES, MAX_VALUES):  # a shorter one has fewer values
         count_values(data)
     return data
@@ -225,12 +234,6 @@ def message_fields(data: bytes) -> dict[str, Any]:
     if not isinstance(parsed, dict):
         raise ValueError(f"a message is a {type(parsed).__name__}, expected an object")  # noqa: TRY004
     return cast("dict[str, Any]", parsed)
-
-
-def body_of(entry: TraceEntry) -> str:
-    """Return the data that a frame of the camera has, as hex; "" if it has none."""
-    data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
-    return data if type(data) is str else ""
 
 
 def topic_of(camera: str, kind: str) -> str:

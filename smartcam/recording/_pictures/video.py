@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.frames import Frame
-    from smartcam.recording._mcap.form import Item
-    from smartcam.recording._recorder import Description
+    from smartcam.recording._recorder import Given
 
 TICK_DURATION: Final = Fraction(1, 1000)
 """Step of a Matroska file's times as FFmpeg writes them, seconds."""
@@ -82,7 +81,7 @@ class VideoFile:
     def start(self) -> None:
         """Do nothing: what stands first says what the pictures are."""
 
-    def add(self, item: Item | Description, /) -> None:
+    def add(self, item: Given, /) -> None:
         """Write a picture.
 
         Raises:

@@ -343,7 +343,7 @@ class RosClient(RosEnd):
                 zenoh.in_loop(end, 0)
 
         self._querier.get(
-            zenoh.engine.handlers.Callback(on_reply, on_end, indirect=False),
+            direct(on_reply, on_end),
             payload=data,
             attachment=attachment.encode(),
         )

@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.calibration._files import store
 from smartcam.exceptions import CalibrationError
-from tests.calibration.inside import keep_backup, read, read_document, replace_file, write
+from tests.calibration.inside import keep_backup, read, read_document, replace_file, store, write
 
 
 def files(folder: Path) -> list[str]:
