@@ -357,7 +357,7 @@ class Host:
         return fields
 
     def known(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return whether there is a session, its status and application, or why there is none."""
+        """Return the presence of a session, its status and application, or why there is none."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)

@@ -29,17 +29,17 @@ class PatternError(ValueError):
 
 
 class TooLongError(Exception):
-    """Comparing a text takes longer than anybody waits."""
+    """Comparing a text takes too long."""
 
 
 class _Look(NamedTuple):
-    """What has to follow a place of the text, or to be in front of it, or must not.
+    """A condition on the text after a place, or before it.
 
     Attributes:
-        first: first state of that.
-        back: characters in front of the place at which it begins.
+        first: first state of the text in question.
+        back: number of characters before the place at which it begins.
         ends: whether it has to end at the place.
-        wanted: whether it has to be there.
+        wanted: whether it has to be there, or must not.
     """
 
     first: int
@@ -85,7 +85,7 @@ class TextPattern:
         """Return True if the whole text is what the pattern says.
 
         Raises:
-            TooLongError: that takes too many steps.
+            TooLongError: the comparison takes too many steps.
         """
         return _Comparison(self._states, text).reaches_end(self._start, 0, len(text))
 

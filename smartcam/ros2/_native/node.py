@@ -376,7 +376,7 @@ class NativeNode(NamedNode):
 
 
 def how_to_build(type: str) -> str:
-    """Return how to install the package of a type, as the end of a sentence."""
+    """Return instructions to install the package of a type, as the end of a sentence."""
     package = type.partition("/")[0]
     if package == "smartcam_msgs":
         return "; copy ros2/smartcam_msgs into a workspace, build it with colcon and source it"

@@ -54,7 +54,7 @@ class PacketDelivery(Protocol):
         ...
 
     def close(self) -> None:
-        """Release its sockets."""
+        """Release the sockets."""
         ...
 
 

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 MAX_CUTS = 64
 """Largest number of places at which one delivery is cut in two."""
 
-MAX_ERROR_TEXT = 500
-"""Largest number of characters of an error's text, which has at most 64 bytes of a peer."""
+MAX_ERROR_CHARACTERS = 500
+"""Largest number of characters of an error's text, with at most 64 bytes of a peer."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 """Bytes of a camera that sends one of them without an end."""
@@ -391,7 +391,8 @@ class _Judge:
     def _see_error(self, error: RemoteProtocolError) -> None:
         assert isinstance(error, RemoteProtocolError), f"LinkFailed with {error!r}"
         assert str(error), f"{error!r} says nothing"
-        assert len(str(error)) <= MAX_ERROR_TEXT, f"a text of {len(str(error))}: {error!r:.200}"
+        length = len(str(error))
+        assert length <= MAX_ERROR_CHARACTERS, f"a text of {length}: {error!r:.200}"
         copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
         assert str(copy) == str(error), f"{error!r} is {copy!r} behind pickle"
         assert self.machine.state is State.FAILED, f"after {error!r} it is {self.machine.state}"
