@@ -1,4 +1,4 @@
-"""Report on a client to people: in a failed test, and at the end of a run."""
+"""Report on a client in words: in a failed test, and at the end of a run."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
 def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """Write findings into pytest's report.
 
-    What must be is shown in full by its failed test, so here it is a line; what should be is shown
-    in full.
+    A breach of ``must`` is shown in full by its failed test, so here it is one line; a breach of
+    ``should`` is shown in full.
     """
     reporter.section("smartcam: the client")
     for grade in Grade:

@@ -1,4 +1,4 @@
-"""Services for programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
+"""Serve programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MAX_RESULTS = 1000
-"""Largest number of results that one answer brings."""
+"""Largest number of results in one answer."""
 
 MAX_INPUT_BYTES = 1 << 16
 MAX_PICTURE_BYTES = 1 << 20
@@ -151,14 +151,14 @@ class _PlainSetFeature(PlainRequest):
 
 
 class Work(NamedTuple):
-    """A service under way.
+    """A running service.
 
     Attributes:
         host: the camera.
         topics: topics of the camera in JSON.
-        request: the request, of the service's own kind.
+        request: request of the service's kind.
         timeout: seconds that the service may take.
-        owner: owner of the results that the service's trigger brings.
+        owner: owner of the results of the service's trigger.
         calibrations: calibrations of the agent's cameras; None if there is no folder for them.
     """
 
@@ -175,9 +175,9 @@ class Service(NamedTuple):
 
     Attributes:
         request: kind of the requests.
-        do: function that does the service and returns the fields of its answer, but ``error``.
+        do: function that does the service and returns the fields of its answer except ``error``.
         command: whether the service waits while another program has the camera reserved.
-        timeout: seconds, where the request says none.
+        timeout: seconds, if the request has none.
         nothing: fields of the answer beside an error.
     """
 
@@ -197,7 +197,7 @@ async def triggered(
     wanted: int = 1,
     wait: bool = True,
 ) -> list[ResultRun]:
-    """Trigger; return its containers, each a run of its own.
+    """Trigger; return the containers, each as its own run.
 
     Raises:
         SmartCamError: as :meth:`smartcam.Camera.trigger`.
@@ -237,7 +237,7 @@ async def _status(work: Work) -> dict[str, Any]:
 
 
 def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
-    """Return the function of a service that does the same as a call of smartcam's programs."""
+    """Return the function of a service that does the same as a call by smartcam's own programs."""
 
     async def service(work: Work) -> dict[str, Any]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
@@ -289,7 +289,7 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
         )
     said = to_fields(frame, 0.0, took, 0)
     own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
-    if "trigger" in own:  # the time of it is by a clock of the agent's own
+    if "trigger" in own:  # its time is that of the agent's clock
         own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
     return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
 
@@ -299,7 +299,7 @@ async def _unknown(work: Work) -> dict[str, Any]:
 
 
 UNKNOWN = Service(PlainRequest, _unknown)
-"""Service that answers in place of one that is not there."""
+"""Service that answers in place of an unknown one."""
 
 _OF_ALL = {*PlainRequest.model_fields}
 

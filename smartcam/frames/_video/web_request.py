@@ -1,4 +1,4 @@
-"""One request for a web camera's stream: redirects on its own host, passwords, and the bytes."""
+"""Request a web camera's stream: with redirects on its own host, passwords, and its bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Mapping, Sequence
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Largest number of bytes of an answer's lines."""
+"""Largest number of bytes of an answer's head."""
 
 MAX_REFUSALS: Final = 3
 """Largest number of refusals for a password, such as by a nonce that is too old."""
@@ -25,10 +25,10 @@ MAX_LINE_BYTES: Final = 4096
 """Largest number of bytes of a line before a chunk."""
 
 PIECE_BYTES: Final = 64 << 10
-"""Bytes that are taken at a time."""
+"""Largest number of bytes that are read at a time."""
 
 INTERIM: Final = range(100, 200)
-"""Status of answers behind which the one that counts comes."""
+"""Status codes of answers that only announce another one."""
 
 PORTS: Final = {"http": 80, "https": 443}
 
@@ -41,7 +41,7 @@ _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
-    """An answer whose body goes on; the names of its headers are in lower case."""
+    """An answer whose body is still being read; the names of its headers are in lower case."""
 
     status: int
     reason: str
@@ -53,7 +53,7 @@ class WebAnswer(NamedTuple):
 
     @property
     def is_pictures(self) -> bool:
-        """True if the answer is a stream of JPEGs, in parts or one behind the other."""
+        """True if the answer is a stream of JPEGs, in parts or one after the other."""
         return _PICTURES.match(self.header("content-type")) is not None
 
 
@@ -63,7 +63,7 @@ class WebStream:
     Args:
         name: name of the source, for errors.
         url: URL with user and password.
-        tls: how the server shows who it is, where it is asked by TLS.
+        tls: options for checking the server's certificate.
 
     Attributes:
         answer: head of the server's answer; there once :meth:`open` has returned.
@@ -78,10 +78,10 @@ class WebStream:
         self._rest = b""
 
     async def open(self) -> None:
-        """Ask for it; redirects on its host and port are followed, and a password is shown.
+        """Send the request; follow redirects on its host and port, and send the password.
 
         Raises:
-            FrameSourceError: a redirect elsewhere, or too many.
+            FrameSourceError: the answer is a redirect to another host, or the last of too many.
             OSError: there is no connection.
             ValueError: the address is no web server.
 

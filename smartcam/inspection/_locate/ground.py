@@ -35,19 +35,19 @@ MIN_BANDS: Final = 12
 """Bands that tell what the ground is like at least."""
 
 NEAR_PX: Final = 10.0
-"""Standard deviation of the distance of the bands that tell what the ground beside one is like, in
-pixels of the picture that was taught."""
+"""Standard deviation of the distance of the bands from which the ground beside a band is measured,
+in pixels of the taught picture."""
 
 COMMON_PX, COMMON_DIRECTION = 24.0, 0.5
 """Distance in pixels, and cosine of the angle between the normals, of edges that may have errors in
 common."""
 
 LEAST_PART: Final = 1e-4
-"""Standard deviation of a slope in parts of the noise at least."""
+"""Least standard deviation of a slope, as a share of the noise."""
 
 
 class Ground(NamedTuple):
-    """How much the light beside N edges varies: (N,), grey levels for a band's half width."""
+    """Variation of the light beside N edges: (N,), grey levels for a band's half width."""
 
     dark: Array  # standard deviation of the slope on the darker side
     bright: Array
@@ -60,7 +60,7 @@ def ground_beside(
     segments: Segments,
     used: NDArray[np.bool_],
 ) -> Ground | None:
-    """Return what the light does along edges; None: each side has one level.
+    """Return the variation of the light along edges; None: each side has one level.
 
     ``places``: across and along, (P,) each; ``used`` (N,): the bands that have an edge.
     """
