@@ -37,6 +37,7 @@ from smartcam.protocols.messages import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from smartcam._client.doorbell import Outcome
     from smartcam.protocols import Frame, Protocol
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
@@ -74,7 +75,7 @@ long as other tasks take longer than one turn."""
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
 """Number of links that are open on each loop."""
 
-MIN_FRAMES_PER_CHUNK = 4
+MIN_FRAMES_PER_CHUNK = 5
 """Fewest frames into which a chunk is cut."""
 
 FIRST_CHUNK = 64
@@ -117,6 +118,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
+        outcome: makes what one task may wait for, to be set by the receive task, or by others.
         heard_at: loop time of the last byte received.
     """
 
@@ -147,7 +149,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._most = FIRST_CHUNK  # frames of the next chunk
         self._busy_since: float | None = None  # with the last chunk, where it was a large one
         self._busy_with = 0
-        self._doorbell = make_doorbell(self.loop)  # of the task that receives
+        self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
+        self.outcome: Callable[[], Outcome[Any] | asyncio.Future[Any]] = bell.outcome
         self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
@@ -410,7 +413,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._transport.abort()
         elif frames > self._most or len(self._chunks) >= MAX_CHUNKS:
             self._pause()
-        self._doorbell.ring()
+        self._doorbell.deliver()
 
     async def _give_way(self) -> None:
         """Let the loop go round; more often where it is shared and the others are at work."""

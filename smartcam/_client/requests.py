@@ -32,7 +32,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
-    from smartcam._client.waits import OwedAnswer, Waits
+    from smartcam._client.waits import OwedAnswer, Waiter, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -55,7 +55,7 @@ class Requests:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        self._late: asyncio.Future[None] | None = None  # of the wait that has the timer
+        self._late: Waiter | None = None  # of the wait that has the timer
         self._timer = DeadlineTimer(self._wake_late)
 
     def finish(self) -> None:
@@ -288,7 +288,7 @@ class Requests:
         The answer is left alone when the task that waits is cancelled: it stays owed.
         """
         loop = asyncio.get_running_loop()
-        waiter: asyncio.Future[None] = loop.create_future()
+        waiter: Waiter = self._connection.require_link().outcome()
         answer.waiters.append(waiter)
         timer = None  # a wait beside another one has a timer of its own
         if self._late is None:
@@ -321,6 +321,6 @@ class Requests:
         )
 
 
-def _wake(waiter: asyncio.Future[None]) -> None:
+def _wake(waiter: Waiter) -> None:
     if not waiter.done():
         waiter.set_result(None)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
+    from smartcam._client.doorbell import Outcome
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.listeners import Listeners
     from smartcam.protocols._inside import ResultBurst
@@ -49,10 +50,10 @@ _CURRENT = {"triggered", "nobody"}
 
 @dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
-    """The trigger under way, and the future of the caller that waits for it.
+    """The trigger under way, and what the caller waits for.
 
     Attributes:
-        outcome: future of the results or the error.
+        outcome: what the caller waits for: the results or the error.
         interpretation: interpretation that reads the results.
         has_input: True if input data was sent with the trigger.
         sent_at: loop time at which the trigger was sent.
@@ -63,7 +64,7 @@ class PendingTrigger(SentTrigger):
             fate ``triggered`` are its own then), and the containers behind them.
     """
 
-    outcome: asyncio.Future[list[Result]]
+    outcome: Outcome[list[Result]] | asyncio.Future[list[Result]]
     interpretation: Interpretation
     has_input: bool
     sent_at: float

@@ -260,7 +260,7 @@ class Triggers:
             request.results,
             number,
             _evidence(features),
-            link.loop.create_future(),
+            link.outcome(),
             interpretation,
             request.input_data is not None,
             link.loop.time(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import SmartCamError
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam._client.counters import ClientCounters
+    from smartcam._client.doorbell import Outcome
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
@@ -35,17 +36,19 @@ def told(error: ErrorT) -> ErrorT:
     return made
 
 
+Waiter: TypeAlias = "Outcome[None] | asyncio.Future[None]"
+
+
 class OwedAnswer(asyncio.Future[Answer]):
     """An answer that the camera owes; it belongs to nobody who waits for it.
 
     Attributes:
-        waiters: futures of those who wait, each one's own: they are woken in one turn of the loop,
-            where a callback would take two.
+        waiters: what those who wait go on by, each one's own.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__(loop=loop)
-        self.waiters: list[asyncio.Future[None]] = []
+        self.waiters: list[Waiter] = []
 
     def set_result(self, result: Answer) -> None:
         """Have the answer, or why there is none, and wake those who wait."""
