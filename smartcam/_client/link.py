@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import functools
 import logging
 import socket
 import weakref
@@ -24,12 +25,10 @@ from smartcam._datagrams import LARGEST_DATAGRAM, read_no_more_than_needed, seco
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
-from smartcam.protocols._inside import Event, ResultBurst
+from smartcam.protocols._inside import Event, ResultBurst, send_each
 from smartcam.protocols.messages import (
     Disconnect,
-    GetStatus,
     Message,
-    Query,
     Sender,
     TriggerAnswer,
 )
@@ -142,6 +141,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
+        # where the machine can say several at once
+        each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
+        self._send_all = getattr(machine, "send_all", each)
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
         self.deliveries = 0  # of bytes that gave events, so far
@@ -176,7 +178,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.machine.send(message, answered=answered)
         self._flush()
 
-    def send_all(self, messages: Iterable[Message]) -> None:
+    def send_all(self, messages: Sequence[Message]) -> None:
         """Write messages at once: one write on TCP, a datagram each on UDP.
 
         Raises:
@@ -186,14 +188,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._loss is not None:
             raise self.lost_error()
         try:
-            queried = False
-            for message in messages:
-                kind = type(message)
-                if kind is Query and queried:  # a trigger stands between two
-                    self.machine.send(message, again=True)
-                else:  # a status comes by itself as well: it is owed to nobody
-                    self.machine.send(message, answered=False if kind is GetStatus else None)
-                queried = queried or kind is Query
+            self._send_all(messages)
         finally:
             self._flush()
 

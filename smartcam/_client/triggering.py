@@ -39,7 +39,7 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Sequence
     from typing import Any
 
     from smartcam._client.camera_state import CameraState
@@ -85,6 +85,10 @@ _WHY_READY = "; it does not while it inspects, and an application that runs free
 _HINT = "; where it never shows that, shows_triggers=no in its URL lets results do without"
 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
+
+_FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
+"""What goes out with a trigger where statuses alone tell what became of it: one object, by which
+the machine knows it."""
 
 
 @dataclass(slots=True)
@@ -275,21 +279,9 @@ class Triggers:
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[Result]:
         requests, features, outcome = self._requests, self._connection.features, pending.outcome
-        asked = features.fences and features.polled and features.shows_triggers
-        words: list[m.Message] = [_QUERY] if features.fences else []
-        if asked:
-            words.append(_GET_STATUS)
-        if pending.number is not None:
-            words.append(m.SetSequenceNumber(number=pending.number))
-        if features.acknowledged:
-            await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
-        if input_data is not None and link.machine.dialect.answers(m.SetInput):
-            await requests.command(m.SetInput(data=input_data), deadline)
-        elif input_data is not None:
-            words.append(m.SetInput(data=input_data))
-        words.append(_TRIGGER)
-        if features.fences and features.shows_triggers:
-            words.append(_GET_STATUS if asked else _QUERY)
+        words: Sequence[m.Message] = _FENCED_TRIGGER
+        if not features.tells_all or pending.number is not None or input_data is not None:
+            words = await self._prepare(pending, link, input_data, deadline)
         while True:  # another task may have asked whenever this one has waited
             if features.acknowledged and self._waits.owes(m.TriggerAnswer):
                 await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
@@ -347,6 +339,28 @@ class Triggers:
             if features.polled:
                 self._polling.end_trigger()
             self._results.end_trigger()
+
+    async def _prepare(
+        self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
+    ) -> list[m.Message]:
+        """Return what goes out with a trigger; its input goes out now, where that is answered."""
+        requests, features = self._requests, self._connection.features
+        asked = features.fences and features.polled and features.shows_triggers
+        words: list[m.Message] = [_QUERY] if features.fences else []
+        if asked:
+            words.append(_GET_STATUS)
+        if pending.number is not None:
+            words.append(m.SetSequenceNumber(number=pending.number))
+        if features.acknowledged:
+            await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
+        if input_data is not None and link.machine.dialect.answers(m.SetInput):
+            await requests.command(m.SetInput(data=input_data), deadline)
+        elif input_data is not None:
+            words.append(m.SetInput(data=input_data))
+        words.append(_TRIGGER)
+        if features.fences and features.shows_triggers:
+            words.append(_GET_STATUS if asked else _QUERY)
+        return words
 
     def _end_reading(self, link: Link) -> None:
         """Have the camera end the trigger under way, which it would not do by itself."""
