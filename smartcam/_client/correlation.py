@@ -147,6 +147,15 @@ class EvidenceByStatus(TriggerEvidence):
             self.doubtful = self.began > 1
         return self.reached
 
+    @property
+    def is_fresh(self) -> bool:
+        """True if nothing has come of what went out with the trigger."""
+        return not (self._answers or self.began)
+
+    def on_round(self) -> None:
+        """Note an answer, the beginning of an inspection and the other answer."""
+        self._answers, self.began, self.reached, self.proven = 2, 1, True, True
+
 
 class EvidenceByAnswer(TriggerEvidence):
     """Evidence by the trigger's answer and the statuses asked for around it (``bid`` over TCP)."""
@@ -364,6 +373,21 @@ class Correlation:
         """Note that the last trigger itself is answered, and was not refused."""
         if self._last is not None:
             self._last.on_trigger_answer()
+
+    def awaits_round(self, pending: SentTrigger) -> bool:
+        """Return True if one inspection between the answers is all that is missing for a trigger.
+
+        And nothing is owed from before, so that a container behind it is this trigger's.
+        """
+        evidence = pending.evidence
+        if type(evidence) is not EvidenceByStatus or self._last is not evidence:
+            return False
+        return self._complete and not self.owed and evidence.is_fresh
+
+    def on_round(self, evidence: EvidenceByStatus) -> None:
+        """Note both answers, and the one inspection between them (:meth:`awaits_round`)."""
+        evidence.on_round()
+        self.doubted = False
 
     def on_status(self, previous: int | None, status: int) -> bool:
         """Note where an inspection begins: Waiting for Trigger drops while running.

@@ -8,7 +8,7 @@ import random
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from smartcam._client.correlation import Correlation, Match, SentTrigger
+from smartcam._client.correlation import Correlation, EvidenceByStatus, Match, SentTrigger
 from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.interpretation import new_tuple
 from smartcam.exceptions import (
@@ -400,6 +400,32 @@ class Results:
             owner.results.append(result)
             owner.came += 1
             self._complete(owner, now)
+
+    def awaits_round(self, container: m.ResultContainer) -> bool:
+        """Return True if a container is the trigger's once all of its answers are there.
+
+        Nothing has come of the trigger under way so far, and nothing but its evidence decides.
+        """
+        pending = self._pending
+        if pending is None or pending.ended or pending.outcome.done():
+            return False
+        if self._lossy or self._numbering is not None or container.asked is not None:
+            return False
+        expected = self._state.expected
+        if expected is None:
+            expected = pending.application
+        if expected is not None and expected != container.application:
+            return False
+        unread = pending.came == 0 and not pending.unproven and not pending.given_up
+        return unread and self.correlation.awaits_round(pending)
+
+    def on_round(self, container: m.ResultContainer, now: float, at: datetime) -> None:
+        """Take a container with what shows that it is the trigger's (:meth:`awaits_round`)."""
+        pending = self._pending
+        if pending is None or not isinstance(pending.evidence, EvidenceByStatus):
+            raise AssertionError("no trigger waits for its answers")
+        self.correlation.on_round(pending.evidence)
+        self._hand_on(container, pending, "triggered", None, now, at)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if a container equal to this one is there, as when a datagram comes twice."""

@@ -161,6 +161,10 @@ class Waits:
         """Note that Queries went out with a trigger, for whose answers nobody waits."""
         self._fences_open = count
 
+    def awaits_fences(self, count: int) -> bool:
+        """Return True if so many Queries of a trigger are open, and nobody waits for anything."""
+        return self._fences_open == count and not self.answers and not self.statuses
+
     def take_fence(self) -> bool:
         """Return True if nobody waits for an answer to Query; count that answer off."""
         if not self._fences_open:
