@@ -131,5 +131,8 @@ class Connection:
         Raises:
             ConfigurationError: the timeout is no finite number of seconds, 0 or more.
         """
-        loop = self._loop or asyncio.get_running_loop()
-        return loop.time() + check_seconds(timeout, "timeout", self.name)
+        return self.in_seconds(check_seconds(timeout, "timeout", self.name))
+
+    def in_seconds(self, timeout: float) -> float:
+        """Return the loop time in ``timeout`` seconds, which were checked."""
+        return (self._loop or asyncio.get_running_loop()).time() + timeout

@@ -79,6 +79,10 @@ class TriggerEvidence:
     def on_status(self, status: int) -> None:
         """Note a status."""
 
+    def take_round(self) -> bool:
+        """Note all that comes of a trigger at once; False where each is to be noted by itself."""
+        return False
+
     def on_beginning(self) -> bool:
         """Note that an inspection began; return True if it may be the trigger's."""
         self.began += 1
@@ -147,14 +151,12 @@ class EvidenceByStatus(TriggerEvidence):
             self.doubtful = self.began > 1
         return self.reached
 
-    @property
-    def is_fresh(self) -> bool:
-        """True if nothing has come of what went out with the trigger."""
-        return not (self._answers or self.began)
-
-    def on_round(self) -> None:
-        """Note an answer, the beginning of an inspection and the other answer."""
+    def take_round(self) -> bool:
+        """Note an answer, the beginning of an inspection and the other answer, if none came yet."""
+        if self._answers or self.began:
+            return False
         self._answers, self.began, self.reached, self.proven = 2, 1, True, True
+        return True
 
 
 class EvidenceByAnswer(TriggerEvidence):
@@ -374,20 +376,19 @@ class Correlation:
         if self._last is not None:
             self._last.on_trigger_answer()
 
-    def awaits_round(self, pending: SentTrigger) -> bool:
-        """Return True if one inspection between the answers is all that is missing for a trigger.
+    def take_round(self, pending: SentTrigger) -> bool:
+        """Note two answers, and one inspection between them; False where more is to be judged.
 
-        And nothing is owed from before, so that a container behind it is this trigger's.
+        That is where something has come of the trigger already, or is owed from before, or where
+        its evidence is another one. A container behind the inspection is this trigger's then.
         """
         evidence = pending.evidence
-        if type(evidence) is not EvidenceByStatus or self._last is not evidence:
+        if not self._complete or self.owed or self._last is not evidence:
             return False
-        return self._complete and not self.owed and evidence.is_fresh
-
-    def on_round(self, evidence: EvidenceByStatus) -> None:
-        """Note both answers, and the one inspection between them (:meth:`awaits_round`)."""
-        evidence.on_round()
+        if not evidence.take_round():
+            return False
         self.doubted = False
+        return True
 
     def on_status(self, previous: int | None, status: int) -> bool:
         """Note where an inspection begins: Waiting for Trigger drops while running.

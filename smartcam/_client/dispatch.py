@@ -132,12 +132,14 @@ class Dispatch:
         """
         for chunk in chunks:
             self._hand_on(chunk)
-        self._ask_in_doubt()
+        if self._state.active_in_doubt:
+            self._requests.ask_what_is_active()
 
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
         self._hand_on(chunk)
-        self._ask_in_doubt()
+        if self._state.active_in_doubt:
+            self._requests.ask_what_is_active()
 
     def _hand_on(self, chunk: Chunk) -> None:
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
@@ -181,17 +183,15 @@ class Dispatch:
             or not self._waits.awaits_fences(2)
             or not state.stays(known.application, known.bits, known.endian)
             or container.application != known.application
-            or not self._results.awaits_round(container)
         ):
+            return False
+        owner = self._results.take_round(container)
+        if owner is None:
             return False
         self._waits.expect_fences(0)
         state.report_round(known.ended)
-        self._results.on_round(container, now, at)
+        self._results.on_own(container, owner, now, at)
         return True
-
-    def _ask_in_doubt(self) -> None:
-        if self._state.active_in_doubt:
-            self._requests.ask_what_is_active()
 
     def _only_streams(self) -> bool:
         """Return True if nobody looks at statuses, and containers go to streams in any case."""

@@ -187,7 +187,8 @@ class Outcome(Generic[T]):
     def __await__(self) -> Generator[Outcome[T], None, T]:
         if not self._done:
             self._asyncio_future_blocking = True
-            yield self
+            yield self  # which raises the error
+            return self._value  # type: ignore[return-value]
         return self.result()
 
     def get_loop(self) -> asyncio.AbstractEventLoop:

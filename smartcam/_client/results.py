@@ -8,7 +8,7 @@ import random
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from smartcam._client.correlation import Correlation, EvidenceByStatus, Match, SentTrigger
+from smartcam._client.correlation import Correlation, Match, SentTrigger
 from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.interpretation import new_tuple
 from smartcam.exceptions import (
@@ -401,31 +401,31 @@ class Results:
             owner.came += 1
             self._complete(owner, now)
 
-    def awaits_round(self, container: m.ResultContainer) -> bool:
-        """Return True if a container is the trigger's once all of its answers are there.
+    def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
+        """Return the trigger under way if a container with its answers around it is its result.
 
-        Nothing has come of the trigger under way so far, and nothing but its evidence decides.
+        That is noted then, and :meth:`on_own` takes the container. None where anything but its
+        evidence decides, or something has come of it already.
         """
         pending = self._pending
-        if pending is None or pending.ended or pending.outcome.done():
-            return False
+        if pending is None or pending.ended or pending.outcome.done() or pending.came:
+            return None
         if self._lossy or self._numbering is not None or container.asked is not None:
-            return False
+            return None
         expected = self._state.expected
         if expected is None:
             expected = pending.application
         if expected is not None and expected != container.application:
-            return False
-        unread = pending.came == 0 and not pending.unproven and not pending.given_up
-        return unread and self.correlation.awaits_round(pending)
+            return None
+        if pending.unproven or pending.given_up or not self.correlation.take_round(pending):
+            return None
+        return pending
 
-    def on_round(self, container: m.ResultContainer, now: float, at: datetime) -> None:
-        """Take a container with what shows that it is the trigger's (:meth:`awaits_round`)."""
-        pending = self._pending
-        if pending is None or not isinstance(pending.evidence, EvidenceByStatus):
-            raise AssertionError("no trigger waits for its answers")
-        self.correlation.on_round(pending.evidence)
-        self._hand_on(container, pending, "triggered", None, now, at)
+    def on_own(
+        self, container: m.ResultContainer, owner: PendingTrigger, now: float, at: datetime
+    ) -> None:
+        """Take a container that is known to be a trigger's."""
+        self._hand_on(container, owner, "triggered", None, now, at)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if a container equal to this one is there, as when a datagram comes twice."""
