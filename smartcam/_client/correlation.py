@@ -129,9 +129,9 @@ class EvidenceByStatus(TriggerEvidence):
 
     __slots__ = ("_answers",)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.reached = self.proven = False
+    def __init__(self) -> None:  # without its base's: each trigger makes one
+        self.began = 0
+        self.reached = self.proven = self.doubtful = False
         self._answers = 0  # to the Queries in front of the trigger and behind it
 
     def on_query_answer(self) -> None:

@@ -156,7 +156,9 @@ class _Delivery(NamedTuple):
 
     Attributes:
         head: its bytes in front of the result's data; all of them where it has no result.
+        begin: where the data begins.
         tail: the bytes behind that data.
+        end: where the data ends.
         owed: ids of the answers that were owed when it came, and of those owed twice.
         left: the same behind it.
         before: messages in front of the result; all of them where it has no result.
@@ -166,7 +168,9 @@ class _Delivery(NamedTuple):
     """
 
     head: bytes
+    begin: int
     tail: bytes
+    end: int
     owed: tuple[set[int], set[int]]
     left: tuple[set[int], set[int]]
     before: list[Message]
@@ -476,17 +480,15 @@ class Machine:
             LocalProtocolError: the state forbids one; those before it are said.
         """
         volley = self._volley
-        if (
-            volley is not None
-            and volley.messages is messages
-            and volley.owed == (self._open, self._open_twice)
-        ):
-            _, frames, size, _, left = volley
-            self._outbox += frames
-            self._open, self._open_twice = set(left[0]), set(left[1])
-            self.counters.frames_sent += len(frames)
-            self.counters.bytes_sent += size
-            return
+        if volley is not None:
+            known, frames, size, owed, left = volley
+            if known is messages and owed[0] == self._open and owed[1] == self._open_twice:
+                self._open, self._open_twice = left[0].copy(), left[1].copy()
+                self._outbox += frames
+                counters = self.counters
+                counters.frames_sent += len(frames)
+                counters.bytes_sent += size
+                return
         owed, state, said = self._owed(), self._state, len(self._outbox)
         send_each(self, messages)
         if self._plain and state is self._state and isinstance(messages, tuple):
@@ -595,7 +597,9 @@ class Machine:
                 make = self._results[buffer[begin - self._result_head : begin]][1]
         self._deliveries[len(buffer)] = _Delivery(
             buffer[:begin],
+            begin,
             buffer[end:],
+            end,
             owed,
             self._owed(),
             events[:at],
@@ -611,21 +615,21 @@ class Machine:
         """
         framer, events = self._framer, self._events
         buffer = framer.buffer
-        known = self._deliveries.get(len(buffer))
-        if known is None or events or framer.start or isinstance(buffer, memoryview):
+        size = len(buffer)
+        known = self._deliveries.get(size)
+        if known is None or events or framer.start or type(buffer) is not bytes:
             return False
-        head, tail, owed, left, before, make, behind, frames = known
-        if not (buffer.startswith(head) and buffer.endswith(tail)):
+        head, begin, tail, end, owed, left, before, make, behind, frames = known
+        if buffer[:begin] != head or buffer[end:] != tail:
             return False
-        if owed != (self._open, self._open_twice):
+        if owed[0] != self._open or owed[1] != self._open_twice:
             return False
-        if owed != left:
-            self._open, self._open_twice = set(left[0]), set(left[1])
+        self._open, self._open_twice = left[0].copy(), left[1].copy()
         events += before
         if make is not None:
-            events.append(make(buffer[len(head) : len(buffer) - len(tail)]))
+            events.append(make(buffer[begin:end]))
             events += behind
-        framer.start = len(buffer)
+        framer.start = size
         self.counters.frames_received += frames
         return True
 
