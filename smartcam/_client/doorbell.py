@@ -83,7 +83,7 @@ class Doorbell:
                 loop.call_soon(_raise, exc)
 
     def outcome(self) -> Outcome[Any]:
-        """Return what one task may wait for, to be set by the task that this wakes, or by others."""
+        """Return what one task may wait for, for this one's task or others to set."""
         return Outcome(self)
 
     # ------------------------------------------------------------------ for the task's machinery

@@ -34,7 +34,7 @@ from smartcam.protocols.messages import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from smartcam._client.doorbell import Outcome
     from smartcam.protocols import Frame, Protocol
