@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     import socket
 
 LARGEST_DATAGRAM = 1 << 16
-"""Bytes that one read makes room for: UDP's length field, 16 bits, cannot say more."""
+"""Largest number of bytes that one read makes room for: UDP's length field, 16 bits, cannot say
+more."""
 
 
 def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Result
 
 MAX_ROWS = 100
-"""Rows that are shown; the number of those left out is told."""
+"""Largest number of rows that are shown; the number of those left out is told."""
 
 
 def localizations_html(parts: Sequence[Localization]) -> str:

@@ -21,7 +21,8 @@ MAX_KNOWN_WORDS = 10_000
 """Known words that are compared; a word that a file or a camera says may be one of many more."""
 
 MAX_PARTS = 8
-"""Parts of a word that are compared each for itself; what follows them counts as unexplained."""
+"""Largest number of parts of a word that are compared each for itself; what follows them counts as
+unexplained."""
 
 MAX_CANDIDATES = 20
 """Known words, alike by their letters, whose edits are counted."""
@@ -30,7 +31,8 @@ LETTERS_PER_EDIT = 3
 """Letters of a word for each edit that it may be away: a typo in three letters, two in six."""
 
 MIN_PREFIX_LETTERS = 3
-"""Letters of a part that may stand for a longer one which begins with it, as ``int`` does."""
+"""Least number of letters of a part that may stand for a longer one which begins with it, as
+``int`` does."""
 
 MIN_EXPLAINED_SHARE = 0.6
 """Share of a word's letters that the parts of a known one have to explain."""

@@ -33,7 +33,7 @@ MAX_DELAY: Final = 3600.0
 
 MAX_QUEUED_RESULTS: Final = 10_000
 DEFAULT_QUEUED_RESULTS: Final = 100
-"""Results that wait for a delay to pass at most, where the request gives no number."""
+"""Largest number of results that wait for a delay to pass, where the request gives no number."""
 
 _KEYWORDS: Final = {"localizations": "localizations", "50bytestrings": "strings50"}
 

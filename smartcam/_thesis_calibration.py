@@ -28,7 +28,7 @@ STEP_TIMEOUT: Final = 150.0
 """Seconds for a step where the request says none: a calculation has 120, a picture 60."""
 
 MAX_INPUTS: Final = 100
-"""Answers of one kind that a request may have; a step asks for some dozen."""
+"""Largest number of answers of one kind that a request may have; a step asks for some dozen."""
 
 MAX_COORDINATE: Final = 1e9
 """Coordinate of a pose that is transformed, in the calibration's unit, either way from 0."""

@@ -69,8 +69,9 @@ listens there.
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes that wait for the event loop, as many of patient things, or for the thread that says what
-is long; what comes beyond is dropped, and results are asked for again later."""
+"""Largest number of bytes that wait for the event loop, as many of patient things, or for the
+thread that says what is long; what comes beyond is dropped, and results are asked for again
+later."""
 
 QUERY_BYTES = 256
 """Bytes that a query counts beside its payload."""
@@ -79,7 +80,7 @@ REPLY_THREADS = 4
 """Threads that answer queries; a client that does not read its answer blocks one of them."""
 
 MAX_WAITING_QUERIES = 4096
-"""Queries that may wait for an answering thread; further ones get no answer."""
+"""Largest number of queries that may wait for an answering thread; further ones get no answer."""
 
 TURN = 64
 """Callbacks that run in one turn of the event loop."""

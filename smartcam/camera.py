@@ -66,7 +66,7 @@ DEFAULT_MAX_QUEUE_BYTES = 1 << 26
 it bounds nothing but larger ones; what is made of them may take several times as much."""
 
 MAX_INTERPRETATIONS = 32
-"""Texts given as ``interpret_as`` whose interpreters a client keeps."""
+"""Largest number of texts given as ``interpret_as`` whose interpreters a client keeps."""
 
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
@@ -90,7 +90,8 @@ MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
 """Largest number of a run that a request has room for, 32 bits."""
 
 MAX_RESULTS_PER_TRIGGER = 10_000
-"""Results of one trigger that may be asked for: a camera has a few "send results" tools."""
+"""Largest number of results of one trigger that may be asked for: a camera has a few "send results"
+tools."""
 
 
 class FrameRequest(NamedTuple):

@@ -101,12 +101,12 @@ __all__ = [
 ]
 
 MAX_EXCERPT = 64
-"""Bytes of a peer's data that an error text or a log line shows at most."""
+"""Largest number of bytes of a peer's data that an error text or a log line shows."""
 
 
 MAX_TEXT = 10_000
-"""Characters of an error's text: a net under texts that quote what somebody gave, each of which
-shows a part of it only."""
+"""Largest number of characters of an error's text: a net under texts that quote what somebody gave,
+each of which shows a part of it only."""
 
 _LEFT_OUT = " ... "
 

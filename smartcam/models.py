@@ -132,10 +132,10 @@ def as_status(word: int) -> Status:
 
 
 MAX_RAW_BYTES_IN_REPR = 16
-"""Bytes of a container that a result's repr shows."""
+"""Largest number of bytes of a container that a result's repr shows."""
 
 MAX_CHARACTERS_IN_REPR = 300
-"""Characters of a value that a result's repr shows."""
+"""Largest number of characters of a value that a result's repr shows."""
 
 
 def _cut(value: object) -> str:

@@ -139,7 +139,7 @@ UNITS = {"Milliseconds": "MS", "Microseconds": "US", "Nanoseconds": "NS"}
 """Ends of the names of constants that count times in another unit, by the unit."""
 
 UNNAMED_TIMES = {
-    *("_cli", "calibration.wizards", "conformance", "fleet", "ros1", "ros2", "web"),
+    *("_cli", "conformance", "fleet", "ros1", "ros2", "web"),
 }
 """Rooms in which some times still have names that do not say so; a room that is mended goes."""
 

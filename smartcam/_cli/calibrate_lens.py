@@ -31,7 +31,7 @@ MIN_NEW_VIEW_SHARE: Final = 0.05
 MAX_VIEWS: Final = 200
 
 MAX_DESCRIPTION: Final = 65_536
-"""Bytes of a target's description."""
+"""Largest number of bytes of a target's description."""
 
 
 @dataclass(slots=True)
@@ -214,10 +214,10 @@ def _files(pictures: Sequence[str]) -> Iterator[Path]:
 
 def _view_of_file(path: Path, target: Target) -> TargetView:
     from smartcam.calibration import find_target
-    from smartcam.calibration._inside import MAX_PICTURE, decode_picture
+    from smartcam.calibration._inside import MAX_PICTURE_BYTES, decode_picture
 
     with naming(str(path)), path.open("rb") as stream:
-        data = stream.read(MAX_PICTURE + 1)
+        data = stream.read(MAX_PICTURE_BYTES + 1)
     return find_target(decode_picture(data, path.name), target, name=path.name)
 
 

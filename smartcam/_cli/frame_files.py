@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MIN_NUMBER_DIGITS: Final = 4
-"""Digits of the number in the name of one file of several, at least."""
+"""Least number of digits of the number in the name of one file of several."""
 
 
 @dataclass(frozen=True, slots=True)

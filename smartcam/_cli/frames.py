@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FoundSource, Frame, FrameSource
 
 MAX_GRABBED = 100_000
-"""Files that one command writes at most."""
+"""Largest number of files that one command writes."""
 
 
 @click.group(

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
 
 MAX_WAITING = 10_000
-"""Lines that may wait to be written."""
+"""Largest number of lines that may wait to be written."""
 
 MAX_TEXT = 1 << 16
-"""Characters of a message, or of an exception's text; what is longer is cut."""
+"""Largest number of characters of a message, or of an exception's text; what is longer is cut."""
 
 FAREWELL = 1.0
 """Seconds that the last lines may take at the end."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.systemd")
 
 MAX_STATUS = 500
-"""Characters of a status: one line in ``systemctl status``."""
+"""Largest number of characters of a status: one line in ``systemctl status``."""
 
 MAX_UNSENT = 32
 STATUS_PERIOD = 5.0

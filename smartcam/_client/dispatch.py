@@ -43,7 +43,7 @@ ROUND_EVENTS = 5
 result."""
 
 MAX_NOTICE = 4096
-"""Characters of a camera's remark that are kept."""
+"""Largest number of characters of a camera's remark that are kept."""
 
 _LOGGED = (
     (
@@ -63,16 +63,16 @@ _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
 
 class _Round(NamedTuple):
-    """What a camera says around the result of a trigger: the same objects each time.
+    """The messages around the result of a trigger: the same objects each time.
 
     Attributes:
-        first: the answer to the Query in front of the trigger.
-        began: the status when the inspection begins.
-        ended: the status when the camera waits again.
-        last: the answer to the Query behind the trigger.
-        application: the one that both answers name.
-        bits: of the status in the end, which is also the one from before.
-        endian: the byte order in both statuses.
+        first: answer to the Query in front of the trigger.
+        began: status when the inspection begins.
+        ended: status when the camera waits again.
+        last: answer to the Query behind the trigger.
+        application: the application that both answers name.
+        bits: bits of the last status, which is also the one from before.
+        endian: byte order in both statuses.
     """
 
     first: Event
@@ -161,7 +161,7 @@ class Dispatch:
 
         Neither in who looks at them: nobody but the trigger's caller, and streams of results. It
         leaves everything as one event after the other would, which
-        ``python -m tests.proofs.straight`` shows, or does nothing and returns False.
+        ``python -m tests.client.proofs.straight`` shows, or does nothing and returns False.
         """
         first, began, container, ended, last = events
         known = self._round
@@ -276,7 +276,7 @@ class Dispatch:
 
 
 def _round_of(events: list[Event]) -> _Round | None:
-    """Return what is around a trigger's result, None where it is more than the usual."""
+    """Return the messages around a trigger's result; None where they are not the usual ones."""
     first, began, _, ended, last = events
     if (
         not isinstance(began, m.StatusReport)

@@ -83,7 +83,7 @@ class Doorbell:
                 loop.call_soon(_raise, exc)
 
     def outcome(self) -> Outcome[Any]:
-        """Return what one task may wait for, for this one's task or others to set."""
+        """Return an outcome that one task may wait for."""
         return Outcome(self)
 
     # ------------------------------------------------------------------ for the task's machinery
@@ -247,7 +247,7 @@ class PlainDoorbell:
         self.ring()
 
     def outcome(self) -> asyncio.Future[Any]:
-        """Return what one task may wait for."""
+        """Return an outcome that one task may wait for."""
         return self._loop.create_future()
 
     def __await__(self) -> Generator[Any, None, None]:

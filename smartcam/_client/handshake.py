@@ -62,8 +62,9 @@ BUSY_PAUSE = 0.05
 
 
 MAX_EARLY = 1 << 20
-"""Bytes that may come while a session is made, beside one frame of ``max_length``. Making one takes
-a few round trips, and the fastest camera sends a fraction of it meanwhile."""
+"""Largest number of bytes that may come while a session is made, beside one frame of
+``max_length``. Making one takes a few round trips, and the fastest camera sends a fraction of it
+meanwhile."""
 
 
 class Session(NamedTuple):

@@ -42,18 +42,20 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 2
-"""Chunks that may wait for the receive task before the link stops reading from TCP.
+"""Largest number of chunks that may wait for the receive task before the link stops reading from
+TCP.
 
 The link stops sooner if one chunk is more than the task handles in a turn, and reads on when no
 chunk is left: a camera that sends results faster than they can be delivered has to wait.
 """
 
 MAX_DATAGRAMS = 256
-"""Datagrams that may wait for the receive task; further ones are dropped and counted."""
+"""Largest number of datagrams that may wait for the receive task; further ones are dropped and
+counted."""
 
 MAX_DATAGRAMS_AT_ONCE = 8
-"""Datagrams that are taken in one turn of the loop where they have come already: twice a trigger's
-answers."""
+"""Largest number of datagrams that are taken in one turn of the loop where they have come already:
+twice a trigger's answers."""
 
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
@@ -81,10 +83,12 @@ FIRST_CHUNK = 64
 """Frames of a chunk as long as it is not known how long they take."""
 
 LARGEST_CHUNK = 512
-"""Frames of a chunk, however fast they are worked off: the next ones may take longer."""
+"""Largest number of frames of a chunk, however fast they are worked off: the next ones may take
+longer."""
 
 MAX_REST = 256
-"""Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
+"""Largest number of bytes of an unfinished frame that a trace shows: it may be as long as the
+largest frame."""
 
 
 @dataclass(slots=True)

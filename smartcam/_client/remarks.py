@@ -8,7 +8,7 @@ from dataclasses import dataclass
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 MAX_REMARKS = 20
-"""Lines of one kind that a camera may cause in each period."""
+"""Largest number of lines of one kind that a camera may cause in each period."""
 
 PERIOD = 60.0
 """Seconds in which the lines of a kind are counted together."""

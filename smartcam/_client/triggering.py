@@ -86,9 +86,9 @@ _HINT = "; where it never shows that, shows_triggers=no in its URL lets results 
 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
 
-_FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
-"""What goes out with a trigger where statuses alone tell what became of it: one object, by which
-the machine knows it."""
+FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
+"""The messages of a trigger where statuses alone tell what became of it: one object, by which the
+machine knows it."""
 
 
 @dataclass(slots=True)
@@ -267,7 +267,7 @@ class Triggers:
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        words: Sequence[m.Message] = _FENCED_TRIGGER
+        words: Sequence[m.Message] = FENCED_TRIGGER
         if not features.tells_all or number is not None or request.input_data is not None:
             words = await self._prepare(pending, link, request.input_data, deadline)
             await self._await_turn(deadline)
@@ -319,7 +319,7 @@ class Triggers:
         """Write a trigger and what goes with it; note what is owed for it."""
         requests, features = self._requests, self._connection.features
         link.send_all(words)
-        if features.tells_all and words is _FENCED_TRIGGER:
+        if features.tells_all and words is FENCED_TRIGGER:
             requests.expect_fences(2, pending.sent_at, deadline)
             return
         if features.ends_triggers:
@@ -354,7 +354,7 @@ class Triggers:
     async def _prepare(
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[m.Message]:
-        """Return what goes out with a trigger; its input goes out now, where that is answered."""
+        """Return the messages of a trigger; its input goes out now, where that is answered."""
         requests, features = self._requests, self._connection.features
         asked = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []

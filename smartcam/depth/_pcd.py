@@ -40,7 +40,8 @@ TYPES: Final = {
 """numpy's type for each TYPE and SIZE."""
 
 MAX_UNPACKED: Final = 1 << 30
-"""Bytes that compressed points may unpack to, as many as an uncompressed file has."""
+"""Largest number of bytes that compressed points may unpack to, as many as an uncompressed file
+has."""
 
 COLOURS: Final = ("rgb", "rgba")
 """Fields of 4 bytes that are a colour, blue in the lowest byte; as a float its bits are meant."""

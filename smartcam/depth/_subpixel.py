@@ -17,7 +17,7 @@ MIN_COARSE_SIGMA_PX: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
 
 MAX_GAUSS_NEWTON_STEPS: Final = 3
-"""Steps of Gauss and Newton that refine the disparities."""
+"""Largest number of steps of Gauss and Newton that refine the disparities."""
 
 MAX_LAST_MOVE_SIGMAS: Final = 1.0
 """Sigmas, rms, by which the last step may move the disparities: another would by about a tenth."""

@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_HEADER: Final = 1 << 16
-"""Bytes."""
+"""Largest number of bytes ."""
 
 MAX_FIELDS: Final = 256
 
 MAX_ROW: Final = 1 << 12
-"""Bytes of a row."""
+"""Largest number of bytes of a row."""
 
 MAX_LINE: Final = 1 << 20
-"""Bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
+"""Largest number of bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
 
 WORDS: Final = 1 << 18
 """Numbers of text at a time; each is an object in memory for a while."""

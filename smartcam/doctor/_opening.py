@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._networks import HostAddress
 
 MAX_SAID = 512
-"""Bytes that are read at most of what comes by itself."""
+"""Largest number of bytes that are read of what comes by itself."""
 
 Outcome = Literal["open", "refused", "no answer", "unreachable", "failed"]
 

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
-"""Entries that a trial keeps: making a session takes six, and a camera may send results at once."""
+"""Largest number of entries that a trial keeps: making a session takes six, and a camera may send
+results at once."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""

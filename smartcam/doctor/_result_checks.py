@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40
-"""Rows of a dump at most: a screen."""
+"""Largest number of rows of a dump: a screen."""
 
 
 # ---------------------------------------------------------------------- the layout

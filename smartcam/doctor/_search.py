@@ -51,7 +51,7 @@ MAX_NETWORK_TEXT = 300
 """Characters of a network's text: a host's name has 253 at most."""
 
 MAX_OPEN_CONNECTIONS = 1_000
-"""Connections at a time at most."""
+"""Largest number of connections at a time."""
 
 MAX_OPENINGS_PER_SECOND = 10_000.0
 """Openings a second at most."""

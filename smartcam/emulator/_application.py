@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder
 
 MAX_CONTAINER = 1 << 16
-"""Bytes of a result container: about 64 kB (HALCON script manual p. 15, published)."""
+"""Largest number of bytes of a result container: about 64 kB (HALCON script manual p. 15,
+published)."""
 
 
 def _layout_text(value: object) -> object:

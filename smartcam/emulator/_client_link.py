@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT = 1 << 16
-"""Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
-script manual p. 35, published for the other direction)."""
+"""Largest number of bytes of payload the camera takes: input data has the container's limit of
+about 64 kB (HALCON script manual p. 35, published for the other direction)."""
 
 _ENDED = "connection ended"
 _UNSENT = "not sent"

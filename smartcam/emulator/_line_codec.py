@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import LineRow, Transport
 
 MAX_LOGGED = 4096
-"""Bytes of a line, or of an answer of several, that the log keeps."""
+"""Largest number of bytes of a line, or of an answer of several, that the log keeps."""
 
 HIDDEN = b"***"
 """The text that the log shows in place of a secret line."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import LineRow
 
 MAX_REQUEST = 1 << 16
-"""Bytes of a request's content at most."""
+"""Largest number of bytes of a request's content."""
 
 
 class TicketedClient(LineClient):

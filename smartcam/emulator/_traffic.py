@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 
 
 MAX_ENTRIES = 10_000
-"""Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+"""Largest number of entries kept; the oldest go first. A day of a fast line is not what the log is
+for."""
 
 MAX_BYTES = 1 << 25
-"""Bytes that the entries hold, read or not; the oldest go first. 10,000 results of seven parts
-fit; of the largest containers, 64 kB, it keeps 120."""
+"""Largest number of bytes that the entries hold, read or not; the oldest go first. 10,000 results
+of seven parts fit; of the largest containers, 64 kB, it keeps 120."""
 
 MAX_IDS = 1000
 """Message ids of which it is counted how often they came. Those of the dialect always are: more
@@ -34,7 +35,7 @@ _ENTRY = 400  # bytes of an entry with its message, without what is as long as t
 _PER_BYTE = 4  # of each byte of a payload: one in the message, three in hex
 
 MAX_VISITS = 1000
-"""Connections that have ended of which a record is kept; the oldest go first."""
+"""Largest number of connections that have ended of which a record is kept; the oldest go first."""
 
 
 Direction = Literal["in", "out"]

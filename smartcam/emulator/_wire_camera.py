@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_LINKS = 32
-"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
-always gets in: the one without a session for longest makes room."""
+"""Largest number of clients that are looked at. The camera serves one; a few more may wait to take
+over. A newcomer always gets in: the one without a session for longest makes room."""
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read, or held back by faults; more end its connection."""

@@ -141,14 +141,16 @@ class FrameSource(FrameSink):
     def features(self) -> FrameFeatures:
         """Features of the device: ``await source.features["ExposureTime"].set(5000.0)``.
 
-        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls.
+        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls,
+        and RTSP cameras the parameters whose names their maker tells.
         """
         return FrameFeatures(self._device_features, self._feature_changed)
 
     @property
     def has_features(self) -> bool:
-        """True if devices of this kind have features that can be read and set."""
-        return type(self._driver).features is not FrameDriver.features
+        """True if devices of this kind have features, and tell which ones."""
+        driver = type(self._driver)
+        return driver.lists_features and driver.features is not FrameDriver.features
 
     def events(self, *names: str, size: int = 1000, timeout: float | None = None) -> FrameEvents:
         """Return the events that the device tells, such as ``ExposureEnd``; see the class.

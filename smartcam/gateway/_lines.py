@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from smartcam.gateway._settings import Style
 
 MAX_LINE_BYTES: Final = 256
-"""Bytes of a request; a longer one ends the connection."""
+"""Largest number of bytes of a request; a longer one ends the connection."""
 
 MAX_BRACKETED_NUMBERS: Final = 30
-"""Numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module interfaces)."""
+"""Largest number of numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module
+interfaces)."""
 
 MAX_NUMBER: Final = 1e9
 """Largest number that is written; controllers read 32-bit floats."""

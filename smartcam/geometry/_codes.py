@@ -9,7 +9,7 @@ from smartcam._arguments import shown
 from smartcam.exceptions import CalibrationError
 
 MAX_TEXT_OF_VALUE = 200
-"""Characters of a value that the text of an error shows at most."""
+"""Largest number of characters of a value that the text of an error shows."""
 
 
 class Code(enum.StrEnum):

@@ -42,7 +42,7 @@ FEW: Final = 8.0
 5 to 200 pictures of good parts, 2 % at most then have one that is left out (simulated)."""
 
 MAX_NAMED: Final = 5
-"""Pictures that a remark names; it counts the others."""
+"""Largest number of pictures that a remark names; it counts the others."""
 
 MAX_DIGITS: Final = 9
 """Decimals of a learned tolerance."""

@@ -21,7 +21,7 @@ MAX_SIDE_PX: Final = 20_000
 """Width and height that a picture may have, in pixels."""
 
 MAX_FILE_BYTES: Final = 1 << 28
-"""Bytes that a picture's file may have."""
+"""Largest number of bytes that a picture's file may have."""
 
 LIMITED_BLACK: Final = 16
 LIMITED_WHITE: Final = 235

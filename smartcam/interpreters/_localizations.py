@@ -56,7 +56,8 @@ MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
 
 MAX_NAMES = 64
-"""Names of features that are kept as texts: an application has a handful, a peer could send any."""
+"""Largest number of names of features that are kept as texts: an application has a handful, a peer
+could send any."""
 
 # half the time of the NamedTuples' own; the cast because a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import OutletDesk
 
 MAX_COMMANDS = 32
-"""Commands under way at a time; more are answered with an error."""
+"""Largest number of commands under way at a time; more are answered with an error."""
 
 MAX_COMMAND_BYTES = 1 << 16
-"""Bytes of a command's message."""
+"""Largest number of bytes of a command's message."""
 
 MAX_STATES = 10_000
-"""Cameras whose state is kept."""
+"""Largest number of cameras whose state is kept."""
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _VERBS = ("trigger", "switch")

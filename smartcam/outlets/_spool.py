@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._database import open_database, open_for_reading
 from smartcam.outlets._entry import OutletAccount, OutletEntry
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
 MAX_REASON_CHARACTERS = 500
-"""Characters of the reasons of a gap, which may be several gaps in one."""
+"""Largest number of characters of the reasons of a gap, which may be several gaps in one."""
 
 MAX_DAMAGED_FILES = 3
 """Damaged spools that are kept beside the new one."""
@@ -139,6 +140,7 @@ class Spool:
         try:
             database.execute("PRAGMA journal_mode = WAL")
             database.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'NORMAL'}")
+            _check_versions(self.path)
             database.execute("BEGIN IMMEDIATE")
             database.execute("COMMIT")
             ((found,),) = database.execute("PRAGMA quick_check(1)").fetchall()
@@ -408,8 +410,7 @@ def read_account(path: Path) -> OutletAccount | None:
     """
     if not path.exists():
         return None
-    place = f"{path.absolute().as_uri()}?mode=ro"
-    with contextlib.closing(sqlite3.connect(place, uri=True, timeout=1.0)) as database:
+    with contextlib.closing(open_for_reading(path, timeout=1.0)) as database:
         database.execute("BEGIN")
         counts = _counts_of(database)
         spooled, _ = database.execute(_TOTALS).fetchone()
@@ -417,9 +418,21 @@ def read_account(path: Path) -> OutletAccount | None:
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
+    database = open_database(path, timeout=0.5)
     database.text_factory = _text  # a damaged text is found by its checksum
     return database
+
+
+def _check_versions(path: Path) -> None:
+    """Check the versions in the file's header: SQLite takes a damaged one for a file to read only.
+
+    Raises:
+        sqlite3.DatabaseError: they are damaged.
+    """
+    with path.open("rb") as file:
+        versions = file.read(20)[18:]
+    if any(one not in {1, 2} for one in versions):
+        raise sqlite3.DatabaseError(f"expected the versions 1 or 2, got {versions.hex(' ')}")
 
 
 def _text(data: bytes) -> str:

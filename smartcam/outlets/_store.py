@@ -9,12 +9,14 @@ import re
 import sqlite3
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import Field
 
 from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
-from smartcam.exceptions import ConfigurationError
+from smartcam._user_code import text_of
+from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.outlets._database import open_database
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._records import picture_of, records_of
 from smartcam.outlets._settings import OutletSettings
@@ -22,6 +24,7 @@ from smartcam.outlets._stored import read_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
+    from concurrent.futures import Future
     from pathlib import Path
 
     from smartcam.outlets._entry import OutletEntry
@@ -32,7 +35,8 @@ VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
-"""Columns of an application's table; what has more stays in ``results.value`` alone."""
+"""Largest number of columns of an application's table; what has more stays in ``results.value``
+alone."""
 
 MAX_COLUMN_CHARACTERS = 100
 
@@ -42,7 +46,7 @@ EXPIRE_SECONDS = 60.0
 _TABLES = """
 CREATE TABLE IF NOT EXISTS results(
     id TEXT PRIMARY KEY, camera TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL,
-    kind TEXT NOT NULL, at TEXT NOT NULL, application INTEGER, sequence INTEGER,
+    kind TEXT NOT NULL, at TEXT NOT NULL, application INTEGER, sequence BLOB,
     triggered_at TEXT, latency REAL, error TEXT, error_kind TEXT, lost INTEGER, value TEXT,
     records INTEGER, picture TEXT, at_least INTEGER);
 CREATE INDEX IF NOT EXISTS results_at ON results(at);
@@ -51,7 +55,13 @@ CREATE TABLE IF NOT EXISTS fields(
     type TEXT NOT NULL, unit TEXT NOT NULL, since TEXT NOT NULL,
     PRIMARY KEY (application, column_name));
 """
-_TYPES = {"bool": "INTEGER", "string": "TEXT", "real32": "REAL", "real64": "REAL"}
+_TYPES = {
+    "bool": "INTEGER",
+    "string": "TEXT",
+    "real32": "REAL",
+    "real64": "REAL",
+    "uint64": "BLOB",  # as they come; an INTEGER's column makes a REAL of digits that are too many
+}
 _OWN = frozenset({"id", "record", "rowid"})
 
 
@@ -83,24 +93,27 @@ class ResultStore(Outlet[StoreSettings]):
     def __init__(self, name: str, settings: StoreSettings, folder: Path, desk: OutletDesk) -> None:
         super().__init__(name, settings, folder, desk)
         self.path = folder / settings.file
-        self._thread: ThreadPoolExecutor | None = None
-        self._database: sqlite3.Connection | None = None
-        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
-        self._expired = 0.0
+        self._file: _StoreFile | None = None
+        self._closing: Future[None] | None = None  # of the file before
 
     async def open(self) -> None:
-        """Open the file, and bring its tables to this version.
+        """Open the file, and bring its tables to this version, as soon as it is closed.
 
         Raises:
             ConfigurationError: a newer version of smartcam made it.
             sqlite3.Error: it cannot be opened.
         """
-        self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{self.name}.store")
-        await self._run(self._open)
+        if self._closing is not None:  # a disk may still hold it
+            await asyncio.wait({asyncio.wrap_future(self._closing)})
+        self._file = _StoreFile(self.name, self.path, self.settings, self.desk)
+        await _done(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, all or none."""
-        await self._run(lambda: self._write(entries))
+        """Write entries, all or none; those before one that no table can have are written."""
+        file = self._file
+        if file is None:
+            raise sqlite3.OperationalError("the store is closed")
+        await _done(file.submit(lambda: file.write(entries)))
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
         """Return the results in the file.
@@ -112,24 +125,50 @@ class ResultStore(Outlet[StoreSettings]):
 
     async def close(self) -> None:
         """Close the file."""
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            closing = asyncio.wrap_future(thread.submit(self._close))
-            thread.shutdown(wait=False)
-            await asyncio.shield(closing)
+        file, self._file = self._file, None
+        if file is not None:
+            self._closing = file.submit(file.close, last=True)
+            await _done(self._closing)
 
-    async def _run(self, work: Callable[[], None]) -> None:
-        if self._thread is None:
-            raise sqlite3.OperationalError("the store is closed")
-        await asyncio.shield(asyncio.wrap_future(self._thread.submit(work)))
+
+async def _done(running: Future[None]) -> None:
+    """Wait for work of a thread, which goes on to its end also for a cancelled caller."""
+    await asyncio.shield(asyncio.wrap_future(running))
+
+
+class _StoreFile:
+    """The file while it is open once: a connection, and a thread that alone uses it.
+
+    A disk may hold the thread for longer than the outlet waits. The store is opened again when the
+    thread has closed this connection: it is nobody else's.
+
+    Args:
+        name: name of the outlet.
+        path: path of the file.
+        settings: settings of the store.
+        desk: what it may ask of the process that has the cameras.
+    """
+
+    def __init__(self, name: str, path: Path, settings: StoreSettings, desk: OutletDesk) -> None:
+        self.path, self.settings, self.desk = path, settings, desk
+        self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{name}.store")
+        self._database: sqlite3.Connection | None = None
+        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
+        self._expired = 0.0
+
+    def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
+        """Have work done in the thread; ``last``: the thread ends with it."""
+        running = self._thread.submit(work)
+        if last:
+            self._thread.shutdown(wait=False)
+        return running
 
     # ------------------------------------------------------------------ in the thread
 
-    def _open(self) -> None:
+    def open(self) -> None:
+        """Open the file, and bring its tables to this version."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._database = database = sqlite3.connect(
-            self.path, timeout=10.0, isolation_level=None, check_same_thread=False
-        )
+        self._database = database = open_database(self.path, timeout=10.0)
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version > VERSION:
             raise ConfigurationError(
@@ -148,25 +187,42 @@ class ResultStore(Outlet[StoreSettings]):
             database.execute(f"PRAGMA user_version = {VERSION}")
         self._expired = 0.0
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close the file."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
 
-    def _write(self, entries: Sequence[OutletEntry]) -> None:
+    def write(self, entries: Sequence[OutletEntry]) -> None:
+        """Write entries, and delete those that are too old, or too many."""
         database = self._database
         if database is None:
             raise sqlite3.OperationalError("the store is closed")
-        self._columns.clear()  # a layout may have changed, and a transaction been undone
-        with _transaction(database):
-            for entry in entries:
-                self._write_one(database, entry)
+        try:
+            self._write_all(database, entries)
+        except EntryRefusedError as exc:
+            self._write_all(database, entries[: exc.place])
+            raise
         if time.monotonic() - self._expired > EXPIRE_SECONDS or not self._expired:
             self._expire(database)
             self._expired = time.monotonic()
 
+    def _write_all(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
+        """Write entries in one transaction.
+
+        Raises:
+            EntryRefusedError: no table can have one of them; none is written.
+        """
+        self._columns.clear()  # a layout may have changed, and a transaction been undone
+        with _transaction(database):
+            for place, entry in enumerate(entries):
+                try:
+                    self._write_one(database, entry)
+                except _UNFIT as exc:
+                    raise EntryRefusedError(text_of(exc), place=place) from exc
+
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
-        said: dict[str, Any] = json.loads(entry.body)
+        said: dict[str, Any] = _readable(json.loads(entry.body))
         value = said.get("value")
         records = records_of(value)
         row = (
@@ -174,7 +230,7 @@ class ResultStore(Outlet[StoreSettings]):
             *entry[:4],
             said.get("received_at") or _time(entry.at),
             said.get("application"),
-            said.get("sequence"),
+            _cell(said.get("sequence")),
             said.get("triggered_at"),
             said.get("latency"),
             said.get("error"),
@@ -292,6 +348,20 @@ class ResultStore(Outlet[StoreSettings]):
         return len(ids)
 
 
+_UNFIT = (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, sqlite3.DataError)
+"""Errors of an entry's own, which come again however often it is written."""
+
+
+def _readable(value: Any) -> Any:
+    """Return a value of JSON whose texts all have a form in UTF-8, with ? for what has none."""
+    if isinstance(value, str):
+        return value if value.isascii() else value.encode(errors="replace").decode()
+    if isinstance(value, dict):
+        fields = cast("dict[str, Any]", value)
+        return {_readable(name): _readable(one) for name, one in fields.items()}
+    return [*map(_readable, value)] if isinstance(value, list) else value
+
+
 def _used_bytes(database: sqlite3.Connection) -> int:
     pages, free, size = (
         database.execute(f"PRAGMA {name}").fetchone()[0]
@@ -304,7 +374,7 @@ def _kind(value: Any) -> str:
     if isinstance(value, bool):
         return "bool"
     if isinstance(value, int):
-        return "int64"
+        return "int64" if -(1 << 63) <= value < 1 << 63 else "uint64"
     return "real64" if isinstance(value, float) or value is None else "string"
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam._file_values import chosen
 from smartcam._meanings import meaning
 from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._database import open_for_reading
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -83,9 +84,9 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
     """
     if not path.is_file():
         raise ConfigurationError(f"results {path}: there is no such file")
-    place, end = f"{path.absolute().as_uri()}?mode=ro", time.monotonic() + READ_TIMEOUT
+    end = time.monotonic() + READ_TIMEOUT
     try:
-        with contextlib.closing(sqlite3.connect(place, uri=True, timeout=5.0)) as database:
+        with contextlib.closing(open_for_reading(path, timeout=5.0)) as database:
             database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_LOOKS)
             return _read(database, question)
     except sqlite3.Error as exc:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     """Yields lines, is sent the answer to each, and returns what it found out."""
 
 READ_SIZE = 1 << 15
-"""Bytes that one read takes at most."""
+"""Largest number of bytes that one read takes."""
 
 DONE = CodeMeaning("done", Verdict.DONE)
 

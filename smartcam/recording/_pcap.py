@@ -46,7 +46,7 @@ FIRST_PORT, PORTS = 49_152, 16_384
 """The ports that a system gives to clients (RFC 6335); each link takes the next."""
 
 MAX_DATAGRAM = 65_507
-"""Bytes of a UDP datagram over IPv4."""
+"""Largest number of bytes of a UDP datagram over IPv4."""
 
 MAX_TIME_NS = (1 << 32) * 10**9
 """Nanoseconds since 1970 that a packet's time stays below: pcap counts seconds in 32 bits."""

@@ -57,7 +57,8 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Values in the messages of a file that every file may have: ten seconds of work."""
+"""Least number of values in the messages of a file that every file may have: ten seconds of
+work."""
 
 VALUES_PER_BYTE = 100
 """Values for each byte of a larger file. Real recordings have less than one, since each message

@@ -66,11 +66,12 @@ CHUNK = 1 << 20
 """Bytes that wait before a chunk is written sooner; also the largest chunk."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes that wait for the disk before the recording gives up: a minute of a fast camera."""
+"""Largest number of bytes that wait for the disk before the recording gives up: a minute of a fast
+camera."""
 
 MAX_WAITING_PICTURE_BYTES = 1 << 26
-"""Bytes of pictures that wait for the disk before further ones are left out; one may wait however
-large it is."""
+"""Largest number of bytes of pictures that wait for the disk before further ones are left out; one
+may wait however large it is."""
 
 VIDEO_SUFFIX = ".mkv"
 """Suffix of a file that becomes a video."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.models import (
@@ -18,6 +17,7 @@ from smartcam.recording._mcap.form import MAX_NAME, time_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from datetime import datetime
 
 STATE_METADATA = "smartcam.state"
 """Name of the metadata records that say what a camera was at their place in the file: where a file
@@ -57,11 +57,15 @@ class RecordedState(NamedTuple):
             case _:
                 return self
 
-    def facts(self, endian: int) -> dict[str, str]:
-        """Return the texts by which a file tells the state, with the present time."""
+    def facts(self, endian: int, at: datetime) -> dict[str, str]:
+        """Return the texts by which a file tells the state that the camera has at a time.
+
+        The time is that of the record behind the state, not that of writing: records wait for the
+        disk, and a replay of a span would begin too early.
+        """
         found = {
             "camera": self.camera,
-            "at": datetime.now(UTC).isoformat(),
+            "at": at.isoformat(),
             "connected": "yes" if self.connected else "no",
             "endian": str(endian),
         }

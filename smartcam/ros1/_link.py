@@ -39,7 +39,7 @@ HEARTBEAT_INTERVAL = 10.0
 MIN_LIFETIME = 5.0
 """Seconds that a link must have lived for the next try to come at once."""
 MAX_MESSAGE_BYTES = 8 << 20
-"""Bytes of a message from a bridge; a longer one ends the link."""
+"""Largest number of bytes of a message from a bridge; a longer one ends the link."""
 
 
 class LinkListener(Protocol):

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 MAX_WAITING_OPERATIONS = 256
 """Operations that wait before nothing more is read from the bridge."""
 MAX_WAITING_BYTES = 32 << 20
-"""Bytes that the waiting messages of one topic may have together; one message may have more."""
+"""Largest number of bytes that the waiting messages of one topic may have together; one message may
+have more."""
 
 
 class Lane:

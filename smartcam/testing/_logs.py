@@ -46,7 +46,7 @@ ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
 camera's time (inferred)."""
 
 MAX_SHOWN_ENTRIES = 40
-"""Entries of the log that a failure shows: the last ones."""
+"""Largest number of entries of the log that a failure shows: the last ones."""
 
 LOOK_INTERVAL = 0.005
 """Seconds between two looks."""

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_CONNECTIONS = 64
-"""Connections at a time, event streams among them. A browser opens six, a page keeps one of them
-for its events; some systems give a process 256 file descriptors."""
+"""Largest number of connections at a time, event streams among them. A browser opens six, a page
+keeps one of them for its events; some systems give a process 256 file descriptors."""
 
 HEAD_TIMEOUT = 10.0
 """Seconds within which a request's head must have come, from its first byte; the first head of a
@@ -32,7 +32,8 @@ KEEP_ALIVE = 60.0
 """Seconds that a connection stays open without a request, or with an answer that nobody reads."""
 
 MAX_HEAD = 1 << 15
-"""Bytes of a request's head: about four times what a browser with many cookies sends."""
+"""Largest number of bytes of a request's head: about four times what a browser with many cookies
+sends."""
 
 _HEAD_END = b"\r\n\r\n"
 _BUSY = (

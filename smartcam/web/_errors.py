@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 MAX_SHOWN = 200
-"""Characters of what a client sent that a refusal shows."""
+"""Largest number of characters of what a client sent that a refusal shows."""
 
 
 @dataclass(eq=False)

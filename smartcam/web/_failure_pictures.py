@@ -22,10 +22,10 @@ SETTLING: Final = 0.2
 """Seconds in which a newer result would arrive that the camera had when it sent the picture."""
 
 MAX_BYTES: Final = 1 << 28
-"""Bytes that the pictures of all cameras may have together."""
+"""Largest number of bytes that the pictures of all cameras may have together."""
 
 MAX_PICTURES: Final = 10_000
-"""Pictures of all cameras that are kept."""
+"""Largest number of pictures of all cameras that are kept."""
 
 
 class FailurePictures:

@@ -26,19 +26,20 @@ if TYPE_CHECKING:
     from smartcam.streams import BatchSubscription, Subscription
 
 MAX_QUEUE: Final = 64
-"""Results of a camera that may wait for a look; further ones are only counted."""
+"""Largest number of results of a camera that may wait for a look; further ones are only counted."""
 
 MAX_QUEUE_BYTES: Final = 1 << 18
-"""Bytes of them."""
+"""Largest number of bytes of them."""
 
 MAX_KEPT: Final = 1 << 16
-"""Bytes of a result that is kept for its picture; of a longer one its length is told."""
+"""Largest number of bytes of a result that is kept for its picture; of a longer one its length is
+told."""
 
 MAX_DRAWN: Final = 30
-"""Parts of a result in its picture."""
+"""Largest number of parts of a result in its picture."""
 
 MAX_TEXT: Final = 160
-"""Characters of a text in a row."""
+"""Largest number of characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
 """Seconds over which a rate is counted."""

@@ -24,13 +24,13 @@ PROTOCOL: Final = "smartcam.fleet"
 """Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
-"""Rows that may be in sight: three times those of a tall screen."""
+"""Largest number of rows that may be in sight: three times those of a tall screen."""
 
 MAX_SEARCH: Final = 100
-"""Characters of a search text at most."""
+"""Largest number of characters of a search text."""
 
 MAX_MESSAGE_BYTES: Final = 1024
-"""Bytes of a message from a page at most."""
+"""Largest number of bytes of a message from a page."""
 
 ALIVE_INTERVAL: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""

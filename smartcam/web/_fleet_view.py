@@ -28,16 +28,18 @@ PERIOD: Final = 0.2
 """Seconds between two looks, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Events of cameras between two looks; after more the whole fleet is read anew."""
+"""Largest number of events of cameras between two looks; after more the whole fleet is read
+anew."""
 
 MAX_GONE: Final = 10_000
-"""Cameras shown although nobody shares them any more; those gone longest are forgotten."""
+"""Largest number of cameras shown although nobody shares them any more; those gone longest are
+forgotten."""
 
 AT_ONCE: Final = 50
 """Rows or results that are handled before other tasks of the loop have a turn."""
 
 MAX_SIFTED_ROWS: Final = 1000
-"""Rows that are searched before other tasks of the loop have a turn."""
+"""Largest number of rows that are searched before other tasks of the loop have a turn."""
 
 BUCKET: Final = 5
 """Seconds of one bar of the outcomes."""

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 MIN_TOKEN = 16
-"""Characters of a token at least, so that nobody guesses it; made ones have 32."""
+"""Least number of characters of a token, so that nobody guesses it; made ones have 32."""
 
 BEARER = "bearer."
 """Begins the protocol of a WebSocket that is a token."""

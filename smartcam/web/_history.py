@@ -29,13 +29,13 @@ MAX_FAILURES: Final = 50
 """Failures that are kept; equal ones in a row are one."""
 
 MAX_PICTURES: Final = 12
-"""Pictures of failures that are kept."""
+"""Largest number of pictures of failures that are kept."""
 
 MAX_PICTURE_BYTES: Final = 1 << 25
-"""Bytes that the pictures of failures may have together."""
+"""Largest number of bytes that the pictures of failures may have together."""
 
 MAX_TEXT: Final = 300
-"""Characters that say what failed."""
+"""Largest number of characters that say what failed."""
 
 KINDS: Final = ("passed", "failed", "other", "errors")
 """Outcomes of a result, in the order of a bar's numbers."""

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from smartcam.layout import Layout
 
 MAX_RESULTS = 100
-"""Results that the page can show: those before are on it no more."""
+"""Largest number of results that the page can show: those before are on it no more."""
 
 MAX_VALUE = 20_000
-"""Characters of JSON that a value may have on the page; a larger one is cut."""
+"""Largest number of characters of JSON that a value may have on the page; a larger one is cut."""
 
 MAX_PARTS = 500
 """Localizations of a result that the page draws."""
 
 MAX_SHOWN_RAW = 64
-"""Bytes of a container that the page shows."""
+"""Largest number of bytes of a container that the page shows."""
 
 SERIES = 300
 """Seconds of rate and latency that the page draws."""

@@ -48,7 +48,8 @@ PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
 
 MAX_PICTURE: Final = 1 << 24
-"""Bytes of a picture that is sent; what a camera sends as a JPEG may be of any size."""
+"""Largest number of bytes of a picture that is sent; what a camera sends as a JPEG may be of any
+size."""
 
 ACCOUNT_PERIOD: Final = 1.0
 """Seconds without a frame after which the page is told the account all the same."""

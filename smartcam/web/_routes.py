@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_BODY = 1 << 18
-"""Bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
+"""Largest number of bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
 
 READ_TIMEOUT = 10.0
 """Seconds within which a call's body must have come."""

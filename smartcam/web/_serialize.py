@@ -26,17 +26,19 @@ SENSOR = (1280, 1024)
 """Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
 
 MAX_HEX = 512
-"""Bytes of a payload that a list of log entries shows; the entry alone has all."""
+"""Largest number of bytes of a payload that a list of log entries shows; the entry alone has
+all."""
 
 MAX_VALUES = 2048
-"""Bytes of a result that a list of log entries shows decoded; the entry alone shows any."""
+"""Largest number of bytes of a result that a list of log entries shows decoded; the entry alone
+shows any."""
 
 MAX_TOLD = 1 << 18
-"""Bytes of payload in a list of log entries, as far as they are shown, or of faults: the list ends
-there, so an answer stays a few megabytes of JSON."""
+"""Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
+faults: the list ends there, so an answer stays a few megabytes of JSON."""
 
 MAX_LISTED = 1000
-"""Faults that a list shows at most."""
+"""Largest number of faults that a list shows."""
 
 LOOKING = {"tangram": False, "tangram_pixels": True}
 """Generators that look at the table, and whether they tell pixels."""

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from smartcam.inspection import Drawing, Inspection, Teaching
 
 MAX_PICTURES: Final = 200
-"""Pictures on the page; of a source the oldest one makes room."""
+"""Largest number of pictures on the page; of a source the oldest one makes room."""
 
 MAX_TOOLS: Final = 32
-"""Tools that the page may try at once."""
+"""Largest number of tools that the page may try at once."""
 
 MAX_MARKS: Final = 400
-"""Marks of a picture that the page draws."""
+"""Largest number of marks of a picture that the page draws."""
 
 MAX_POINTS: Final = 200
-"""Points of a mark that the page draws."""
+"""Largest number of points of a mark that the page draws."""
 
 SHOT_TIMEOUT: Final = 5.0
 """Seconds that a picture of the camera is waited for."""

@@ -9,7 +9,7 @@ from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
-"""Records of a result that are looked at for pass or fail."""
+"""Largest number of records of a result that are looked at for pass or fail."""
 
 Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 """Outcome of a result; one that tells neither good nor bad is "other"."""

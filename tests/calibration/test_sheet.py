@@ -20,11 +20,11 @@ from smartcam.calibration import (
     fit_corners,
     load_calibration,
 )
-from smartcam.calibration._files.store import write
 from smartcam.calibration.simulation import _scenes as scenes
 from smartcam.calibration.wizards import CalibrationService
 from smartcam.exceptions import ConfigurationError
 from smartcam.geometry._inside import Array
+from tests.calibration.inside import write
 from tests.calibration.scenes import refused
 from tests.calibration.sheetkit import (
     CAMERA,

@@ -28,10 +28,10 @@ from smartcam.frames import (
     find_format,
 )
 from smartcam.frames import open as open_frames
-from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.registry import FRAMES
 from tests.cli.commandline import run
 from tests.frames.drivers import ShowingDriver
+from tests.frames.pictures import stripes, write_stamp
 from tests.processes import PATIENCE, Process
 
 codecs = pytest.importorskip("imagecodecs", reason="needs the extra frames")

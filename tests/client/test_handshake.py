@@ -13,7 +13,6 @@ import pytest
 
 from smartcam._client import handshake
 from smartcam._client._inside import Session, Try
-from smartcam._client.handshake import establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -25,10 +24,10 @@ from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols import BVS, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
+from tests.client.inside import establish
 from tests.handmade import (
     BUSY,
     CONNECT,
@@ -52,6 +51,7 @@ from tests.handmade import (
     scripted,
     until,
 )
+from tests.machines import THESIS
 
 RUNNING = m.StatusReport(status=Status(0x280))
 ANSWERS = [m.ConnectAnswer(version=1), RUNNING, m.QueryAnswer(application=21)]

@@ -10,13 +10,14 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 
 from smartcam._client import link as connection
-from smartcam._client.link import Chunk, Link, open_link
+from smartcam._client.link import open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
+from tests.client.inside import Chunk, Link
 from tests.handmade import (
     BUSY,
     CONNECT,

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import CameraModel, StereoCalibration, Transform, calibrate_stereo
 from smartcam.calibration._inside import rectify
-from smartcam.calibration._stereo.rectification import _parallel
 from smartcam.calibration.formats import CameraChain, write_camera_info
 from smartcam.depth import StereoDepth, StereoMatcher, read_camera_infos
 from smartcam.depth._pair import CalibratedPair, _spread, scaled
@@ -327,7 +326,8 @@ def test_the_sigma_of_the_calibration_is_in_that_of_the_depth() -> None:
             exp_rotation(off[:3]) @ RIGHT_LEFT.rotation,
             RIGHT_LEFT.translation + off[3:],
         )
-        turns, projections, _ = _parallel(left, right, wrong, 0.0, SIZE)
+        flattened = rectify(left, right, wrong, size=SIZE)
+        turns, projections = flattened.rotations, flattened.projections
         columns = []
         for side, camera in enumerate((left, right)):
             flat = np.column_stack([camera.directions(seen[side]), np.ones(4)])

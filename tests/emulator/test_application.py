@@ -11,11 +11,12 @@ import pytest
 from pydantic import ValidationError
 
 from smartcam.emulator import Application, Run, TablePose, TableScene, register_generator
-from smartcam.emulator._application import BUILTIN_APPLICATIONS, LOCALIZATIONS, make_application
-from smartcam.emulator._generators import generator_names
+from smartcam.emulator._application import make_application
 from smartcam.emulator._inside import PIECES, TABLE_SIZE, Observation, find_generator, wrap_number
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
+from tests.emulator.builtins import BUILTIN_APPLICATIONS, LOCALIZATIONS
+from tests.emulator.inside import generator_names
 
 
 def container(application: Application, **options: Any) -> bytes:

@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator._application import BUILTIN_APPLICATIONS
 from smartcam.emulator._client_link import MAX_INPUT
-from smartcam.emulator._links import TcpListener, _TcpLink
+from smartcam.emulator._links import TcpListener
 from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
@@ -22,11 +21,13 @@ from smartcam.models import Status
 from smartcam.protocols import Frame, Machine, Role
 from smartcam.protocols import Transport as CarriedBy
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MESSAGES, THESIS
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
+from tests.emulator.builtins import BUILTIN_APPLICATIONS
 from tests.emulator.camera_wire import RawClient, UdpClient
+from tests.emulator.inside import _TcpLink
 from tests.handmade import until
+from tests.machines import MESSAGES, THESIS
 
 if TYPE_CHECKING:
     from smartcam.emulator._client_link import Trace

@@ -23,7 +23,6 @@ from smartcam import _zenoh
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.exceptions import ConnectFailedError, ConnectionLostError, ReservationLostError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._bus.zenoh import MAX_DIRECT_BYTES
 from smartcam.fleet._inside import ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
@@ -31,6 +30,9 @@ from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, P
 from tests.fleet.partner import partner
 from tests.handmade import refusing
 from tests.processes import free_place, printed_by
+
+MAX_DIRECT_BYTES = 64 << 10
+
 
 pytestmark = pytest.mark.real_time
 

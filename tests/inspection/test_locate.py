@@ -28,7 +28,7 @@ from smartcam.layout import Layout
 from smartcam.registry import INTERPRETERS
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
-from tests.proofs.locate import PartSearch, locate
+from tests.inspection.proofs.locate import PartSearch, locate
 
 if TYPE_CHECKING:
     from pathlib import Path

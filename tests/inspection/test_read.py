@@ -19,7 +19,7 @@ from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
 from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
-from tests.proofs import codes
+from tests.inspection.proofs import codes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
-from smartcam.interpreters._basic import TableInterpreter
 from smartcam.interpreters._inside import plain, run_plain
 from smartcam.layout import Layout
 from smartcam.models import ByteOrder
+from tests.interpreters.inside import TableInterpreter
 
 NUMBERS = {
     "int8": ("b", -5),

@@ -9,16 +9,12 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, LayoutError, PluginError
 from smartcam.interpreters import Context, Interpreter, Reader, resolve, run
-from smartcam.interpreters._basic import (
-    RawInterpreter,
-    RecordInterpreter,
-    Strings50Interpreter,
-    TableInterpreter,
-)
+from smartcam.interpreters._basic import RawInterpreter, RecordInterpreter, Strings50Interpreter
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.models import jsonable
 from smartcam.registry import INTERPRETERS
+from tests.interpreters.inside import TableInterpreter
 
 XY = "(x: real32 mm, y: real32 mm)*"
 

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.fleet import FleetServer, load_fleet
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto

@@ -22,7 +22,6 @@ FOLDER = Path(os.environ.get("SMARTCAM_NODE_OPCUA", "/usr/local/lib/node_modules
 pytestmark = [
     pytest.mark.real_time,
     pytest.mark.long,
-    pytest.mark.widest,
     pytest.mark.skipif(
         NODE is None or not (FOLDER / "node-opcua-client").is_dir(),
         reason="needs npm's node-opcua-client: npm install --global node-opcua-client, or in "

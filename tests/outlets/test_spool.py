@@ -6,6 +6,7 @@ import json
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -14,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets import OutletAccount, OutletEntry
 from smartcam.outlets._spool import ROW_BYTES, Spool, read_account
 
 
@@ -269,6 +270,38 @@ def test_a_killed_process_loses_nothing_that_was_spooled_and_a_gap_tells_of_the_
         assert head[-1].kind == "gap"
         assert json.loads(head[-1].body)["at_least"]
         spool.close()
+
+
+def test_a_spool_whose_tables_have_no_readable_names_is_put_aside(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(1, spool)])
+    spool.close()
+    path = tmp_path / "a.spool"
+    damaged = path.read_bytes().replace(b"tableentriesentries", b"tableentr\xd4\xd4sentries")
+    assert damaged != path.read_bytes()
+    path.write_bytes(damaged)
+    with pytest.raises(sqlite3.DatabaseError, match="malformed database schema"):
+        read_account(path)
+    again = opened(tmp_path)
+    assert [one.kind for one in again.head(10).entries] == ["gap"]
+    assert [*tmp_path.glob("a.spool.damaged-*")]
+    again.close()
+
+
+@pytest.mark.parametrize("place", [18, 19])
+def test_a_spool_whose_version_is_damaged_is_put_aside(tmp_path: Path, place: int) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(1, spool)])
+    spool.close()
+    path = tmp_path / "a.spool"
+    data = bytearray(path.read_bytes())
+    data[place] = 0xD4
+    path.write_bytes(data)
+    again = opened(tmp_path)
+    kinds = [one.kind for one in again.head(10).entries]
+    assert kinds == (["result", "gap"] if place == 18 else ["gap"])  # 19: nobody may read it
+    assert [*tmp_path.glob("a.spool.damaged-*")]
+    again.close()
 
 
 @pytest.mark.parametrize("seed", range(12))

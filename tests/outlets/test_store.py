@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import sqlite3
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,9 @@ from typing import Any
 import pytest
 
 from smartcam._client._inside import Interpretation
-from smartcam.exceptions import ConfigurationError
-from smartcam.outlets import OutletDesk, OutletEntry
-from smartcam.outlets._inside import columns_of
+from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.outlets import OutletDesk, OutletEntry, StoreQuestion
+from smartcam.outlets._inside import columns_of, read_store
 from smartcam.registry import OUTLETS
 
 pytestmark = pytest.mark.real_time
@@ -104,6 +106,48 @@ async def test_names_that_are_no_columns_are_harmless(tmp_path: Path) -> None:
     assert rows(tmp_path, f"SELECT {cells} FROM app_7") == [(1, 2, 3, 4, 5)]  # noqa: S608
 
 
+async def test_texts_and_numbers_that_sqlite_does_not_know_keep_nothing_else_back(
+    tmp_path: Path,
+) -> None:
+    value = {"t": "a\ud800b", "k\udfff": 1, "n": 2**64 - 1}
+    given = entry(1, value)
+    said = json.loads(given.body) | {"sequence": 2**64 - 1}
+    await written(store(tmp_path, []), given._replace(body=json.dumps(said)), entry(2, {"n": 5}))
+    assert rows(tmp_path, "SELECT t, k_, n FROM app_7 ORDER BY id") == [
+        ("a?b", 1, str(2**64 - 1)),
+        (None, None, 5),
+    ]
+    assert rows(tmp_path, "SELECT sequence FROM results WHERE number = 1") == [(str(2**64 - 1),)]
+
+
+async def test_an_entry_that_no_table_can_have_is_refused_and_those_before_it_are_written(
+    tmp_path: Path,
+) -> None:
+    made = store(tmp_path, [])
+    with pytest.raises(EntryRefusedError) as refused:
+        await written(made, entry(1, {"n": 1}), entry(2, {})._replace(body="{"), entry(3, {"n": 3}))
+    assert refused.value.place == 1
+    assert rows(tmp_path, "SELECT number FROM results") == [(1,)]
+    assert rows(tmp_path, "SELECT n FROM app_7") == [(1,)]
+
+
+async def test_a_store_that_a_disk_held_for_too_long_is_opened_again_when_it_is_closed(
+    tmp_path: Path,
+) -> None:
+    made = store(tmp_path)
+    await made.open()
+    with contextlib.closing(sqlite3.connect(tmp_path / "results.sqlite")) as other:
+        other.execute("BEGIN IMMEDIATE")  # as slow as a disk may be
+        for do in (lambda: made.deliver([entry(1, {"n": 1})]), made.close, made.open):
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.05):
+                    await do()
+        assert sum("store" in one.name for one in threading.enumerate()) == 1
+        other.execute("COMMIT")
+    await written(made, entry(2, {"n": 2}))
+    assert rows(tmp_path, "SELECT number FROM results ORDER BY number") == [(1,), (2,)]
+
+
 async def test_old_results_are_deleted_with_their_records(tmp_path: Path) -> None:
     now = time.time()
     old = [entry(n, {"n": n}, at=now - 7200) for n in range(1, 1203)]
@@ -132,6 +176,18 @@ async def test_a_picture_is_referred_to_where_it_is_there(tmp_path: Path) -> Non
     await written(made, entry(1, {"n": 1}), entry(2, {"n": 2}))
     found = rows(tmp_path, "SELECT picture FROM results ORDER BY number")
     assert found == [("pictures/line1/cam1-1.png",), (None,)]
+
+
+async def test_a_store_whose_tables_have_no_readable_names_is_told(tmp_path: Path) -> None:
+    await written(store(tmp_path), entry(1, {"n": 1}))
+    path = tmp_path / "results.sqlite"
+    damaged = path.read_bytes().replace(b"tableresultsresults", b"tablere\xd4\xd4ltsresults")
+    assert damaged != path.read_bytes()
+    path.write_bytes(damaged)
+    with pytest.raises(ConfigurationError, match="malformed database schema"):
+        read_store(path, StoreQuestion(None, False, "**", 10))
+    with pytest.raises(sqlite3.DatabaseError, match="malformed database schema"):
+        await store(tmp_path).open()
 
 
 async def test_a_store_of_a_newer_version_is_refused(tmp_path: Path) -> None:

@@ -464,6 +464,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     begun = time.monotonic()
     numbers = range(options.first, options.first + options.cells)
+    if options.keep is not None:
+        options.keep.mkdir(parents=True, exist_ok=True)
     failed, figures = cells(options.seed, numbers, options.keep)
     total: collections.Counter[str] = collections.Counter()
     for kind, each in figures.items():

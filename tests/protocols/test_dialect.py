@@ -24,11 +24,23 @@ from smartcam.protocols import (
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import UNDOCUMENTED
-from smartcam.protocols._bvs import B16, BID, CODES, MESSAGES, THESIS
 from smartcam.protocols._framed.dialect import MAX_KNOWN, SWITCH_CODES
 from smartcam.protocols._inside import HANDBOOK, ResultCode
-from tests.machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, EVERYTHING, EXAMPLES, NO_ID, label
+from tests.machines import (
+    B16,
+    BID,
+    BIG_ENDIAN_NUMBER,
+    CODE,
+    CODES,
+    DIALECTS,
+    EVERYTHING,
+    EXAMPLES,
+    MESSAGES,
+    NO_ID,
+    THESIS,
+    label,
+)
+from tests.protocols.inside import UNDOCUMENTED
 from tests.strategies import over
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT

@@ -30,16 +30,18 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
-from smartcam.protocols._framed.machine import MAX_FAMILIAR, TRANSITIONS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event, Policy, ResultBurst
 from tests.machines import (
+    B16,
+    BID,
     BIG_ENDIAN_NUMBER,
     CODE,
     DIALECTS,
     EVERYTHING,
     EXAMPLES,
     NO_ID,
+    THESIS,
+    TRANSITIONS,
     camera,
     carried,
     client,
@@ -50,6 +52,9 @@ from tests.machines import (
     request_for,
 )
 from tests.strategies import over
+
+MAX_FAMILIAR = 64
+
 
 TCP, UDP = Transport.TCP, Transport.UDP
 CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA

@@ -45,10 +45,10 @@ from smartcam.models import (
 from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording, write_bag
 from smartcam.recording._bags.items import topic_of_camera
 from smartcam.recording._inside import BagConversion
-from smartcam.recording._mcap.form import nanoseconds as recorded_time
-from smartcam.ros2._types.stores import stored
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
+from tests.recording.inside import nanoseconds as recorded_time
 from tests.recording.recordingkit import COUNTER, URL, at, container, containers, session, write
+from tests.ros2.typekit import forget_stores
 
 if TYPE_CHECKING:
     from smartcam.recording import Recording
@@ -630,7 +630,7 @@ def test_bag_without_a_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
-    stored.cache_clear()
+    forget_stores()
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\['):
         BagRecorder(tmp_path / "bag").open()
     assert list(tmp_path.iterdir()) == []

@@ -18,10 +18,8 @@ from typing import Any
 
 import pytest
 
-from smartcam._client._inside import TriggerRequest
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
-from smartcam.fleet._agent.shared import Carrier
-from smartcam.models import ApplicationChanged, Connected, Status, StatusChanged
+from smartcam.models import ApplicationChanged, Connected, Result, Status, StatusChanged
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folders import files as folder_files
@@ -31,7 +29,7 @@ from smartcam.recording._folders.track import CameraTrack
 from smartcam.recording._mcap.form import GAP, load_compress
 from smartcam.recording._replays.schedule import plan_replay
 from smartcam.recording._state import RecordedState
-from tests.fleet.fleetkit import NumberedCamera
+from tests.fleet.fleetkit import NumberedCamera, trigger_request
 from tests.recording.folderkit import (
     NAME,
     all_runs,
@@ -132,6 +130,11 @@ async def test_each_file_says_what_the_camera_was(
     # the seam may have cut one off from its trigger, not more
     assert len(runs(found)) - 1 <= len(triggered) <= len(runs(found))
     assert found.camera(NAME).interpret_as is not None
+    for path in rest:  # the state's time is not that of writing, or a replay began too early
+        state, behind, *_ = load_recording(path).all_items(NAME)
+        assert isinstance(state, RecordedState)
+        assert state.at is not None
+        assert state.at == (behind.received_at if isinstance(behind, Result) else behind.at)
 
 
 async def test_file_is_over_when_it_is_old_also_of_a_silent_camera(tmp_path: Path) -> None:
@@ -469,7 +472,7 @@ async def test_errors_of_programs_triggers_are_recorded(tmp_path: Path) -> None:
     async with NumberedCamera() as box, recording(tmp_path, box.url) as (_, agent):
         host = agent.hosts[NAME]
         await host.camera.stop()
-        request = TriggerRequest(Carrier(), None, 1, True)
+        request = trigger_request()
         with pytest.raises(NotRunningError):
             await host.camera.trigger_for(request, None, 1.0)
     errors = [one.error for one in load_recording(tmp_path / "rec").errors()]

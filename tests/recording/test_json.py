@@ -34,11 +34,11 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._mcap.form import KINDS, message_fields, message_of, nanoseconds
+from tests.recording.inside import KINDS, message_fields, message_of, nanoseconds
 from tests.recording.recordingkit import at
 
 if TYPE_CHECKING:
-    from smartcam.recording._mcap.form import Item
+    from tests.recording.inside import Item
 
 Pair = namedtuple("Pair", "left right")  # noqa: PYI024 - as somebody's plug-in has it
 

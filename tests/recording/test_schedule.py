@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -60,6 +61,16 @@ def test_plan_trigger_has_its_container_and_latency(tmp_path: Path) -> None:
     assert (app.unasked, app.waits) == ([], True)
     assert (made.active, made.running, made.dialect, made.transport) == (5, True, "handbook", "tcp")
     assert round(made.seconds, 6) == 2.5
+
+
+def test_plan_from_a_time_on_has_what_came_then_also_where_the_clock_was_set_back(
+    tmp_path: Path,
+) -> None:
+    items = happened("1 'a', 5 'b', 3 'c', 6 'd'")
+    recording = write(tmp_path / "run.mcap", [*session(URL, "RUNNING"), *items])
+    made = plan_replay(dataclasses.replace(recording, since=at(4)))
+    taken = [take.containers for take in made.applications[5].unasked]
+    assert taken == [[b"b"], [b"d"]]
 
 
 def test_plan_more_containers_of_one_trigger_stay_together(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.ros2 import Node, RosContext
-from smartcam.ros2._node.qos import PARAMETERS
 from tests.processes import free_place
+from tests.ros2.inside import PARAMETERS
 from tests.ros2.roskit import STRING, soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time

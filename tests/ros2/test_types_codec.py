@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smartcam.exceptions import RosMessageError
 from smartcam.ros2 import MessageType, RosTypes
-from smartcam.ros2._types.built_in import MESSAGES
+from tests.ros2.inside import MESSAGES
 from tests.ros2.typekit import add_test_msgs, drawn
 
 TYPES = RosTypes("jazzy")

@@ -13,10 +13,6 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from smartcam._meanings import FAIL_WORDS, NOT_WORDS, PASS_WORDS
-from smartcam.calibration._files.directory import MAX_NAME
-from smartcam.calibration._files.store import BACKUPS
-from smartcam.calibration._printing.page_layout import RULER
-from smartcam.calibration.wizards._services import JOURNALS
 from smartcam.emulator import EmulatedCamera
 from smartcam.web import EmulatorSite
 from smartcam.web import _emulator as emulator
@@ -142,13 +138,3 @@ async def test_curl_lines_are_answered() -> None:
             if not stream:
                 json.loads(out)
     assert lacking == []
-
-
-def test_wizards_bounds_are_those_of_the_code() -> None:
-    said = {
-        f"Names have up to {MAX_NAME} letters",
-        f"`NAME.json.1` to `.{BACKUPS}`",
-        f"`NAME.journal.1` to `.{JOURNALS}`",
-        f"printed {RULER:g} mm ruler",
-    }
-    assert {text for text in said if text not in WIZARD_PAGE} == set()

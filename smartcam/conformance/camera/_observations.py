@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import EndedError, RawClient
-from smartcam.conformance.camera._results import Differs, NotObserved, Undescribed
+from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId

@@ -23,7 +23,8 @@ MAX_SECONDS = 3600.0
 """Seconds that may be waited for one thing at most."""
 
 MAX_INPUT_DATA = 1 << 16
-"""Bytes of input data: about 64 kB, as a container (HAL 15, published for the other direction)."""
+"""Largest number of bytes of input data: about 64 kB, as a container (HAL 15, published for the
+other direction)."""
 
 
 class Allow(enum.Flag):

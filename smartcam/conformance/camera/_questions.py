@@ -19,13 +19,9 @@ from smartcam.conformance.camera._observations import (
 )
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import EndedError
-from smartcam.conformance.camera._results import (
-    Differs,
-    NotObserved,
-    Undescribed,
-    question,
-)
+from smartcam.conformance.camera._results import question
 from smartcam.conformance.camera._setting_checks import next_number
+from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId

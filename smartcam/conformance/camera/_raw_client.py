@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m
@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from typing import Self
 
 MAX_HEARD = 1 << 24
-"""Bytes of bodies that one client keeps: 256 of the largest results; more end the experiment."""
+"""Largest number of bytes of bodies that one client keeps: 256 of the largest results; more end the
+experiment."""
 
 MAX_TRAIL = 60
-"""Lines of what went over the wire that a report shows: the last ones."""
+"""Largest number of lines of what went over the wire that a report shows: the last ones."""
 
 FAREWELL = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import MAX_TRAIL, EndedError, RawClient
-from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import RawDialect
 from smartcam.doctor._inside import trials as probe_trials
 from smartcam.exceptions import ConfigurationError

@@ -26,7 +26,7 @@ SETTLING = 0.3
 """Seconds that the camera gets to hear the end of a client that has ended: loopback is faster."""
 
 MAX_LINES = 40
-"""Lines of the wire that a finding shows: the last ones."""
+"""Largest number of lines of the wire that a finding shows: the last ones."""
 
 
 class Said(NamedTuple):

@@ -33,7 +33,8 @@ UNSUPPORTED = 77
 """Exit code of a command that cannot do such a task: what automake's tests mean by "skipped"."""
 
 MAX_OUTPUT = 1 << 20
-"""Bytes of a command's output that are read; a client that prints more has failed."""
+"""Largest number of bytes of a command's output that are read; a client that prints more has
+failed."""
 
 SHOWN = 2000
 """Characters of a command's output that a report shows."""

@@ -25,7 +25,7 @@ EXTENSIONS = (".job", ".jobx")
 """The extensions of job files: the one of older, then the one of newer cameras (published)."""
 
 MAX_CELL_TEXT = 1024
-"""Characters of a cell's text; a bound of the emulator."""
+"""Largest number of characters of a cell's text; a bound of the emulator."""
 
 CellValue: TypeAlias = bool | int | float | str
 """A value that a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or

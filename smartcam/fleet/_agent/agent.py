@@ -68,15 +68,16 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_PROGRAMS_PER_ROLE = 4096
-"""Programs of each role that may be here at a time; a crowd of one role keeps no other out."""
+"""Largest number of programs of each role that may be here at a time; a crowd of one role keeps no
+other out."""
 
 PRESENCE_WITHIN = 10.0
 """Seconds behind its first call within which a program's presence must be seen: the call may have
 come before it. One without presence is forgotten then, as nobody would see that it is gone."""
 
 MAX_CALLS_PER_PROGRAM = 256
-"""Calls of one program that may be under way at a time, for each camera of the agent; questions
-and commands each."""
+"""Largest number of calls of one program that may be under way at a time, for each camera of the
+agent; questions and commands each."""
 
 MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
 """Questions of all programs of one role that may be under way at a time, for each camera."""

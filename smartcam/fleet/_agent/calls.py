@@ -37,7 +37,7 @@ T = TypeVar("T")
 Answer = tuple[dict[str, Any], list[bytes]]
 NOTHING: Answer = ({}, [])
 MAX_REPLY_BYTES = 1 << 20
-"""Bytes of results, or of states, that one reply brings at most."""
+"""Largest number of bytes of results, or of states, that one reply brings."""
 
 
 class ProgramCall(NamedTuple):

@@ -32,10 +32,10 @@ MAX_STORE_QUESTIONS = 4
 """Questions to stores of one agent that are under way at most; each has a thread."""
 
 MAX_STORED_ROWS = 1000
-"""Rows of a store in one answer."""
+"""Largest number of rows of a store in one answer."""
 
 MAX_ROWS_BYTES = 1 << 23
-"""Bytes of rows in one answer; beyond, the oldest are left out."""
+"""Largest number of bytes of rows in one answer; beyond, the oldest are left out."""
 
 ROW_BYTES = 300
 """Bytes of a row beside its value and its error, about."""

@@ -29,7 +29,7 @@ IN_A_TURN = 50
 """Cameras that are told, or read, before the event loop has another turn."""
 
 MAX_PATTERN_BYTES = 4096
-"""Bytes of a question at most."""
+"""Largest number of bytes of a question."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 MAX_CAMERAS_PER_AGENT = 10_000
-"""Cameras of one agent; each emulated one has a port of its own."""
+"""Largest number of cameras of one agent; each emulated one has a port of its own."""
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 _PATTERN = "/**"

@@ -41,13 +41,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_STREAMS_PER_ROLE = 256
-"""Streams of one camera that the programs of one role may have."""
+"""Largest number of streams of one camera that the programs of one role may have."""
 
 MAX_STREAMS_PER_PROGRAM = 16
-"""Streams of one camera that one program may have."""
+"""Largest number of streams of one camera that one program may have."""
 
 MAX_FRAME_CALLS_PER_PROGRAM = 16
-"""Calls for frames of one camera that one program may have under way: each may keep a frame."""
+"""Largest number of calls for frames of one camera that one program may have under way: each may
+keep a frame."""
 
 MAX_ENCODINGS = 16
 """Ways of encoding whose last frame is kept, for viewers that want the same."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 MAX_FRAME_BYTES = 1 << 28
-"""Bytes of a frame at most: 14,000 x 10,000 pixels of 16 bits."""
+"""Largest number of bytes of a frame: 14,000 x 10,000 pixels of 16 bits."""
 
 ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 """Encodings of frames; raw is as the camera gave them."""

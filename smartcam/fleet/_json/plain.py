@@ -51,10 +51,10 @@ THESIS = {**CAMERA_SERVICES, **CALIBRATIONS}
 """The services of the thesis' interface by name."""
 
 MAX_REQUEST_BYTES = 1 << 18
-"""Bytes of a request at most."""
+"""Largest number of bytes of a request."""
 
 MAX_CONCURRENT_CALLS = 256
-"""Commands to one camera that may be under way at a time, and questions."""
+"""Largest number of commands to one camera that may be under way at a time, and questions."""
 
 MAX_WAITING_REPEATS = 16
 """Questions that wait for the answer of one call at most."""
@@ -64,7 +64,7 @@ MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
 So it is with questions, for themselves: whoever may only ask pushes no command's answer out."""
 
 MAX_CAMERAS_ADDED = 100
-"""Cameras that Setup adds at most."""
+"""Largest number of cameras that Setup adds."""
 
 GRACE = 0.5
 """Seconds beyond a service's timeout after which it is given up, whatever it does."""

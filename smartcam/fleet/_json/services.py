@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MAX_RESULTS = 1000
-"""Results that one answer brings at most."""
+"""Largest number of results that one answer brings."""
 
 MAX_INPUT_BYTES = 1 << 16
 MAX_PICTURE_BYTES = 1 << 20
-"""Bytes of a frame in an answer at most."""
+"""Largest number of bytes of a frame in an answer."""
 
 MAX_ID_CHARACTERS = 200
 

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from smartcam.models import CameraEvent
 
 MAX_QUEUED_BYTES = 1 << 24
-"""Bytes of containers that wait for a topic with a delay; the oldest beyond are dropped."""
+"""Largest number of bytes of containers that wait for a topic with a delay; the oldest beyond are
+dropped."""
 
 Kind = Literal["results", "status", "events"]
 

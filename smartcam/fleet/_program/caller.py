@@ -56,7 +56,7 @@ ASK_ANEW = 5.0
 lost, and a camera that nobody triggers says nothing more."""
 
 MAX_AGENTS_REMEMBERED = 16
-"""Agents of a camera that are remembered."""
+"""Largest number of agents of a camera that are remembered."""
 
 INSIST_AFTER = 1.0
 """Seconds until something is said again that the agent has to know: it may have been lost."""

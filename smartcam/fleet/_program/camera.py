@@ -121,7 +121,7 @@ class FleetCamera(Camera[ValueT]):
         self._unreadable: ConfigurationError | None = None  # why that cannot be used
         self._met = False
         super().__init__(settings, observers=observers)
-        self._camera_name, self._program, self._shared = camera, program, shared
+        self._program, self._shared = program, shared
         self._wire = Counters()
         self._caller = Caller(
             settings.name,

@@ -32,7 +32,7 @@ ASK_AGAIN = 0.5
 """Seconds for the answer to where an agent's numbers stand; then it is asked again."""
 
 MAX_AGENTS_NUMBERED = 1000
-"""Agents whose bundles are known by their numbers."""
+"""Largest number of agents whose bundles are known by their numbers."""
 
 
 class _BusPlace(Handle):

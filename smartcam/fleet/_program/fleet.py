@@ -58,13 +58,15 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Cameras of a fleet that are met when it is opened; of a larger one each when it is used."""
+"""Largest number of cameras of a fleet that are met when it is opened; of a larger one each when it
+is used."""
 
 AT_ONCE = 100
 """Cameras that are met, or left, at a time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
-"""Cameras whose results are heard one by one; of more, and most of the fleet, all together."""
+"""Largest number of cameras whose results are heard one by one; of more, and most of the fleet, all
+together."""
 
 STATUS_TIMEOUT = 5.0
 """Seconds for the answers of all agents."""

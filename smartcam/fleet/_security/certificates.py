@@ -22,7 +22,7 @@ VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "route
 """Roles that a certificate's common name may be."""
 
 MAX_BYTES = 1 << 20
-"""Bytes of a file with certificates or a key; each certificate has about 1 kB."""
+"""Largest number of bytes of a file with certificates or a key; each certificate has about 1 kB."""
 
 WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 """Times before its end at which a certificate is warned of."""

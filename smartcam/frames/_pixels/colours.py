@@ -1,4 +1,4 @@
-"""From what a camera sends to red, green and blue, and from these to grey."""
+"""Convert a camera's samples to red, green and blue, and these to grey."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     _Conversion = Callable[[NDArray[Any]], NDArray[Any]]
 
 FRACTION_BITS: Final = 16
-"""Bits behind the binary point of the sums below, for samples of 8 bits."""
+"""Number of fractional bits of the fixed-point sums below, for samples of 8 bits."""
 
 DEEP_FRACTION_BITS: Final = 12
-"""Bits behind the binary point of the sums below, for samples of up to 16 bits: the sums have room
-in 32."""
+"""Number of fractional bits of the fixed-point sums below, for samples of up to 16 bits, so that
+the sums fit into 32 bits."""
 
 
 class Matrix(NamedTuple):
-    """The meaning of Y, U and V.
+    """The coefficients that define Y, U and V.
 
     Attributes:
         red: share of red in Y.

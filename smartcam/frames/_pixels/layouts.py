@@ -11,6 +11,7 @@ import numpy as np
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg
+from smartcam.frames._pixels.apart import PlanesApart
 from smartcam.frames._pixels.colours import MATRICES, Colours, yuv_to_rgb
 from smartcam.frames._pixels.compiled import pairs_to_rgb
 from smartcam.frames._pixels.unpacking import Packing, unpack
@@ -26,14 +27,14 @@ class RawPicture(NamedTuple):
 
     Attributes:
         format: name of the format, for errors.
-        data: bytes of the picture.
+        data: bytes of the picture; for the brightness alone also :class:`PlanesApart`.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next.
     """
 
     format: str
-    data: bytes | bytearray | memoryview
+    data: Any
     width: int
     height: int
     stride: int
@@ -289,7 +290,10 @@ class Planes(PixelLayout):
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
-        self.check(picture)
+        if isinstance(picture.data, PlanesApart):  # a decoder's: it has all planes
+            picture = picture._replace(data=picture.data.first)
+        else:
+            self.check(picture)
         _, _, width, height, stride = picture
         return _view(picture, f"<u{self.size_of}", (height, width), (stride, self.size_of))
 

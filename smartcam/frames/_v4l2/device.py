@@ -26,7 +26,7 @@ FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fo
 """The supported formats of V4L2."""
 
 MAX_ANSWERS: Final = 512
-"""Answers to one enumeration at most; a driver that goes on is broken."""
+"""Largest number of answers to one enumeration; a driver that goes on is broken."""
 
 MAX_RATE_OFF: Final = 0.01
 """Share by which a rate may differ from the wanted one: 29.97/s is 30/s to a camera."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
+from smartcam.frames._pixels.apart import PlanesApart
 from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, find_format, with_matrix
 from smartcam.frames._pixels.layouts import Planes, YuvPairs
@@ -122,11 +123,16 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     return with_matrix(base, f"{matrix} full" if full else matrix)
 
 
-def from_video(video: Any) -> Pixels:
+def from_video(video: Any, *, apart: bool = False) -> Pixels:
     """Return a decoded frame's pixels; where we have no such format, in one that holds all of it.
 
     A palette becomes its colours, planes of red, green and blue become samples, and Y, U and V
     whose sharing we do not have are repeated to one of each a pixel.
+
+    Args:
+        video: frame of FFmpeg.
+        apart: whether planes may stay where the decoder left them, as :class:`PlanesApart`, which
+            a :class:`Frame` takes for its data.
 
     Raises:
         FrameFormatError: we have no such format; the text names what was not to be lost.
@@ -146,10 +152,11 @@ def from_video(video: Any) -> Pixels:
     fits = isinstance(layout, Planes) and all(
         plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
     )
-    joined = b"".join(planes) if fits else b"".join(_tight(plane, found) for plane in planes)
-    if not fits:
-        stride = found.stride(video.width)
-    return Pixels(found, video.width, video.height, stride, joined)
+    if fits:
+        joined: Any = PlanesApart(planes) if apart else b"".join(planes)
+        return Pixels(found, video.width, video.height, stride, joined)
+    joined = b"".join(_tight(plane, found) for plane in planes)
+    return Pixels(found, video.width, video.height, found.stride(video.width), joined)
 
 
 def _repacked(video: Any) -> Any:
@@ -401,5 +408,8 @@ def _filled(frame: Frame, name: str) -> Any:
 
 
 def _fill(plane: Any, rows: Any) -> None:
+    if rows.flags.c_contiguous and rows.nbytes == plane.buffer_size:
+        plane.update(rows)  # one copy, where below each row is one
+        return
     whole = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
     whole[: rows.shape[0], : rows.shape[1]] = rows

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_REDIRECTS: Final = 5
 
 LARGEST_HEAD: Final = 64 << 10
-"""Bytes of the head of an answer, or of a body that is skipped."""
+"""Largest number of bytes of the head of an answer, or of a body that is skipped."""
 
 REDIRECTS: Final = range(300, 400)
 """Statuses with which FFmpeg follows a ``Location``."""

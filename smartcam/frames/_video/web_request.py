@@ -16,18 +16,26 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Mapping, Sequence
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Bytes of an answer's lines at most."""
+"""Largest number of bytes of an answer's lines."""
 
 MAX_REFUSALS: Final = 3
-"""Refusals for a password, such as by a nonce that is too old."""
+"""Largest number of refusals for a password, such as by a nonce that is too old."""
 
 MAX_LINE_BYTES: Final = 4096
-"""Bytes of a line before a chunk."""
+"""Largest number of bytes of a line before a chunk."""
 
 PIECE_BYTES: Final = 64 << 10
 """Bytes that are taken at a time."""
 
+INTERIM: Final = range(100, 200)
+"""Status of answers behind which the one that counts comes."""
+
 PORTS: Final = {"http": 80, "https": 443}
+
+_PICTURES: Final = re.compile(r"(?i)\s*(?:multipart/|video/(?:x-)?(?:m|motion-?)?jpe?g\b)")
+
+MAX_INTERIM_ANSWERS: Final = 8
+"""Answers that say that another one comes (1xx), at most."""
 
 _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
@@ -44,9 +52,9 @@ class WebAnswer(NamedTuple):
         return next(iter(self.headers.get(name, ())), "")
 
     @property
-    def is_multipart(self) -> bool:
-        """True if the answer is a stream of parts."""
-        return self.header("content-type").lower().lstrip().startswith("multipart/")
+    def is_pictures(self) -> bool:
+        """True if the answer is a stream of JPEGs, in parts or one behind the other."""
+        return _PICTURES.match(self.header("content-type")) is not None
 
 
 class WebStream:
@@ -144,10 +152,15 @@ class WebStream:
             *([f"Authorization: {shown}"] if shown else ()),
         ]
         self._writer.write("\r\n".join((*lines, "", "")).encode())
-        return await self._head()
+        self._rest = b""
+        answer = await self._head()
+        for _ in range(MAX_INTERIM_ANSWERS):
+            if answer.status not in INTERIM:
+                break
+            answer = await self._head()
+        return answer
 
     async def _head(self) -> WebAnswer:
-        self._rest = b""
         came = bytearray()
         looked = 0
         while (ends := _HEAD_ENDS.search(came, max(0, looked - 10))) is None:

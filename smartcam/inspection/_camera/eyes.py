@@ -38,7 +38,7 @@ TOOLS_TIMEOUT: Final = 60.0
 """Seconds that the tools of a program may take; then the result is not ok, and says so."""
 
 MAX_HUNG_THREADS: Final = 4
-"""Threads with tools that do not end; the last one is waited for."""
+"""Largest number of threads with tools that do not end; the last one is waited for."""
 
 THREAD_GRACE: Final = 1.0
 """Seconds that a tool gets to come to its end when the camera is closed."""

@@ -35,10 +35,10 @@ MAX_TURN: Final = math.radians(20.0)
 """Angle between the directions of a segment's points and its middle's, radians, at most."""
 
 MIN_POINTS: Final = 4
-"""Points of a segment at least."""
+"""Least number of points of a segment."""
 
 MAX_SEGMENTS: Final = 3000
-"""Segments that are made of a picture at most."""
+"""Largest number of segments that are made of a picture."""
 
 FITS: Final = 8
 """Steps in which segments are fitted to the picture's pixels."""

@@ -34,7 +34,7 @@ MIN_CONTRAST: Final = 8.0
 """Grey levels of 255 of a found edge at least, where nothing else is set."""
 
 MAX_FITS: Final = 12
-"""Places that are fitted at most, besides four for each part that is looked for."""
+"""Largest number of places that are fitted, besides four for each part that is looked for."""
 
 SCORE_MARGIN: Final = 0.1
 """Score by which a fit may raise the coarse one: what is below that of the parts that were found by

@@ -28,7 +28,7 @@ FIRST_BLURS_PX: Final = (3.0, 2.0)
 """Blurs of the first steps of a fit, in pixels: a wide step is drawn from farther away."""
 
 MAX_STEPS: Final = 12
-"""Steps of a fit at most."""
+"""Largest number of steps of a fit."""
 
 STILL_PX: Final = 2e-4
 """Pixels that no segment moves by any more when a fit has come to rest."""
@@ -55,7 +55,7 @@ MAX_MISFIT: Final = 0.3
 """Rms about a step beyond the noise, in parts of the edge's height, up to which it is an edge."""
 
 MIN_SEEN: Final = 6
-"""Segments that a pose is worked out from at least."""
+"""Least number of segments that a pose is worked out from."""
 
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
 """Standard deviation of an angle of which nothing is known, in radians."""

@@ -47,19 +47,20 @@ VERSION: Final = 1
 """Version of the files of models."""
 
 MAX_FILE_BYTES: Final = 1 << 21
-"""Bytes of a model's file at most."""
+"""Largest number of bytes of a model's file."""
 
 MAX_SEGMENTS: Final = 400
-"""Segments of a model at most, evenly chosen; more of them cost time and tell little more."""
+"""Largest number of segments of a model, evenly chosen; more of them cost time and tell little
+more."""
 
 MAX_REGION_PX: Final = 25_000_000
 """Pixels of a region that is taught, at most."""
 
 MIN_SEGMENTS: Final = 12
-"""Segments whose place is told to a fraction of a pixel that a part has at least."""
+"""Least number of segments whose place is told to a fraction of a pixel that a part has."""
 
 MIN_TOP_POINTS: Final = 16
-"""Points of a part at the smallest level of the pyramid at least."""
+"""Least number of points of a part at the smallest level of the pyramid."""
 
 BORDER_PX: Final = 3.0
 """Pixels from the region's border within which an edge is left out."""

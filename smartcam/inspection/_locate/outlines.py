@@ -39,13 +39,13 @@ SVG_SILENT: Final = frozenset({"defs", "desc", "metadata", "namedview", "style",
 """Elements of SVG that show nothing by themselves."""
 
 MAX_FILE_BYTES: Final = 1 << 24
-"""Bytes of an outline's file at most."""
+"""Largest number of bytes of an outline's file."""
 
 MAX_POINTS: Final = 200_000
 """Corners of an outline at most, curves included."""
 
 MAX_NESTED: Final = 30
-"""Groups of SVG in each other at most."""
+"""Largest number of groups of SVG in each other."""
 
 MAX_OUTLINE_PX: Final = 4_000_000
 """Pixels of the picture of an outline at most."""

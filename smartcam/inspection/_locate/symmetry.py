@@ -36,7 +36,7 @@ CENTRE_PX: Final = 8.0
 """Pixels between a turned segment and the one that it lies on at the first step, at most."""
 
 MIN_MET: Final = 8
-"""Segments that lie on another one when they are turned, at least."""
+"""Least number of segments that lie on another one when they are turned."""
 
 COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
 """Folds of which the middle is always looked for: a notch may move the reference off it."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_DRAWN: Final = 80
-"""Edges of a part that are drawn."""
+"""Largest number of edges of a part that are drawn."""
 
 STEPS: Final = np.array([0.5, 0.5, 1e-3])
 """Pixels, and radians, by which a pose is moved to see what its place in the plane does."""

@@ -58,10 +58,11 @@ MAX_WIDTH_PX = 250.0
 """Pixels that a strip may be wide."""
 
 MAX_EDGES = 12
-"""Edges of a strip that are fitted at most, the strongest ones."""
+"""Largest number of edges of a strip that are fitted, the strongest ones."""
 
 MAX_TOGETHER = 4
-"""Edges that are fitted together at most, where they are so near that their blurs overlap."""
+"""Largest number of edges that are fitted together, where they are so near that their blurs
+overlap."""
 
 NEAR_PX = 8.0
 """Pixels between two edges below which they are fitted together."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MAX_STARTS = 600
-"""Lines or circles through two or three edges that are tried at most."""
+"""Largest number of lines or circles through two or three edges that are tried."""
 
 GATE = 3.5
 """Standard deviations to a line or a circle from which on an edge is left out."""
@@ -38,7 +38,7 @@ MAX_ROUNDS = 10
 """Times that edges are left out and a fit is made again, at most; two or three are usual."""
 
 MAX_STEPS = 30
-"""Steps of a fit at most; three to five are usual."""
+"""Largest number of steps of a fit; three to five are usual."""
 
 MOST_LEFT_OUT = 0.5
 """Part of the edges that may be left out."""

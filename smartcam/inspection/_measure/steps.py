@@ -37,7 +37,7 @@ MAX_TILT = 0.7
 """Tangent of the angle to which a step may be turned out of its strip."""
 
 MAX_STEPS = 25
-"""Steps of a fit at most; most fits take four to eight."""
+"""Largest number of steps of a fit; most fits take four to eight."""
 
 STILL_PX = 1e-4
 """Pixels by which places move in the last step at most."""

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_CODES: Final = 255
-"""Codes in one result; zxing-cpp finds no more."""
+"""Largest number of codes in one result; zxing-cpp finds no more."""
 
 MAX_TEXT_BYTES: Final = 4000
-"""Bytes of a code's text; no code holds many more."""
+"""Largest number of bytes of a code's text; no code holds many more."""
 
 INPUT: Final = "input"
 """The word for the value of the input, as what a code has to hold."""

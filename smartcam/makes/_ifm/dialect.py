@@ -48,7 +48,7 @@ MAX_APPLICATION = 99
 """Largest number of an application: the commands that switch have two digits for it."""
 
 MAX_INPUT = 256
-"""Bytes of an input container."""
+"""Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
 """Codes of our own for the answers of a single character."""

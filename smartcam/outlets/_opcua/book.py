@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import VisionResult
 
 MAX_BOOK_CHARACTERS = 1 << 28
-"""Characters of the values that the results of a server keep, as JSON."""
+"""Largest number of characters of the values that the results of a server keep, as JSON."""
 
 MAX_HANDLES = 10_000
 """Handles that clients have not released; beyond it the oldest are forgotten."""

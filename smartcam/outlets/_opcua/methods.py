@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_TEXT = 1000
-"""Characters of an id or a text that a client gives."""
+"""Largest number of characters of an id or a text that a client gives."""
 
 MAX_LISTED = 100
-"""Results or recipes of one answer; a client asks for the rest by ``StartIndex``."""
+"""Largest number of results or recipes of one answer; a client asks for the rest by
+``StartIndex``."""
 
 CALL_SECONDS = 700.0
 """Seconds within which every call ends: beyond all that its camera may take."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.server import VisionServer
 
 MAX_STATES = 1_000
-"""Cameras whose state is kept."""
+"""Largest number of cameras whose state is kept."""
 
 
 class OpcUaOutlet(Outlet[OpcUaSettings]):

@@ -34,10 +34,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_REMEMBERED_JOBS = 1000
-"""Jobs whose results are still known as theirs when they come late from the spool."""
+"""Largest number of jobs whose results are still known as theirs when they come late from the
+spool."""
 
 MAX_PENDING = 1000
-"""Results that wait until it is known whether they are of the job under way."""
+"""Largest number of results that wait until it is known whether they are of the job under way."""
 
 RESULT_WAIT = 5.0
 """Seconds between the end of a trigger and its result from the spool."""

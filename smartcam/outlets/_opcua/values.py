@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Fields of a structure made from a layout; what is beyond stands in the JSON alone."""
+"""Largest number of fields of a structure made from a layout; what is beyond stands in the JSON
+alone."""
 
 MAX_RECORDS = 1000
-"""Records of a result that become structures; what is beyond stands in the JSON alone."""
+"""Largest number of records of a result that become structures; what is beyond stands in the JSON
+alone."""
 
 MAX_STRUCTURES = 2000
 """Structures of one server: one for each layout of a camera's application."""

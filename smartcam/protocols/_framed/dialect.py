@@ -122,12 +122,14 @@ class StatusBits:
 
 
 MAX_KNOWN = 256
-"""Messages kept of each kind; statuses and answers are few, and a peer could send any."""
+"""Largest number of messages kept of each kind; statuses and answers are few, and a peer could send
+any."""
 
 
 MAX_SURPLUS = 1 << 12
-"""Bytes that a body may be longer than documented, where that is a matter of a fixed length: newer
-firmware may append fields, which are a few words. More is a length that is wrong."""
+"""Largest number of bytes that a body may be longer than documented, where that is a matter of a
+fixed length: newer firmware may append fields, which are a few words. More is a length that is
+wrong."""
 
 
 class Codec:

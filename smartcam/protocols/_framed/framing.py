@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 DEFAULT_MAX_LENGTH = 1 << 20
-"""Bytes of payload accepted by default. The camera sends about 64 kB at most (HALCON script
-manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
+"""Largest number of bytes of payload accepted by default. The camera sends about 64 kB (HALCON
+script manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
 
 
 MIN_OWN_BUFFER_BYTES = 1 << 12
@@ -37,20 +37,22 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 
 
 FIRST_READ = 1 << 12
-"""Bytes that one read takes at most, at first. It doubles each time that a read took so many."""
+"""Largest number of bytes that one read takes, at first. It doubles each time that a read took so
+many."""
 
 MAX_READ_BYTES = 1 << 15
-"""Bytes that one read takes at most in the end; right after a large frame as many as that had. So
-many bytes of results fit into a subscriber's queue where each has 16 bytes or more: then one that
-keeps up loses nothing."""
+"""Largest number of bytes that one read takes in the end; right after a large frame as many as that
+had. So many bytes of results fit into a subscriber's queue where each has 16 bytes or more: then
+one that keeps up loses nothing."""
 
 
 MIN_READ_BYTES = 1 << 10
-"""Bytes that one read takes at most where the frames are many and small."""
+"""Least number of bytes that one read takes where the frames are many and small."""
 
 
 MAX_ALIKE_FRAMES = 16
-"""Frames that are cut at once where they begin with the same bytes, the length among them."""
+"""Largest number of frames that are cut at once where they begin with the same bytes, the length
+among them."""
 
 
 @dataclass(frozen=True, kw_only=True)

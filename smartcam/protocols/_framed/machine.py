@@ -8,7 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 from smartcam.exceptions import (
     FrameError,
@@ -49,23 +49,27 @@ the receive task takes in a turn, so that reading would have to pause after each
 
 
 MAX_FAMILIAR = 64
-"""Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
-each, and a peer could send any."""
+"""Largest number of messages of a kind that are known by their frames: of statuses and answers a
+camera has a handful each, and a peer could send any."""
 
 MAX_KNOWN_CHUNKS = 16
-"""Chunks that a camera's machine knows as a whole: a client has a handful of short requests."""
+"""Largest number of chunks that a camera's machine knows as a whole: a client has a handful of
+short requests."""
 
 MAX_KNOWN_CHUNK_BYTES = 64
-"""Bytes of the longest of these chunks: a Query, a sequence number and a Trigger have 40."""
+"""Largest number of bytes of the longest of these chunks: a Query, a sequence number and a Trigger
+have 40."""
 
 MAX_KNOWN_DELIVERIES = 64
-"""Deliveries that a client's machine looks at, to know the next one like them, in one state."""
+"""Largest number of deliveries that a client's machine looks at, to know the next one like them, in
+one state."""
 
 MAX_KNOWN_DELIVERY_BYTES = 1 << 12
-"""Bytes of the longest of these: the answers to a trigger, with a result of ordinary size."""
+"""Largest number of bytes of one of these: the answers to a trigger, with a result of ordinary
+size."""
 
 MAX_KNOWN_DELIVERY_FRAMES = 8
-"""Frames of the longest: a trigger's five, and more than one status around them."""
+"""Largest number of frames of one of these: a trigger's five, and more statuses around them."""
 
 
 _SESSION_REQUESTS = (
@@ -155,14 +159,14 @@ class _Delivery(NamedTuple):
     """A delivery of whole frames that each came before, with one result at most.
 
     Attributes:
-        head: its bytes in front of the result's data; all of them where it has no result.
-        begin: where the data begins.
-        tail: the bytes behind that data.
-        end: where the data ends.
+        head: bytes in front of the result's data; all bytes where it has no result.
+        begin: place where the data begins.
+        tail: bytes behind that data.
+        end: place where the data ends.
         owed: ids of the answers that were owed when it came, and of those owed twice.
-        left: the same behind it.
-        before: messages in front of the result; all of them where it has no result.
-        make: makes the result of its data.
+        left: ids of those that were owed behind it, and of those owed twice.
+        before: messages in front of the result; all messages where it has no result.
+        make: function that makes the result of its data.
         behind: messages behind the result.
         frames: number of its frames.
     """
@@ -183,11 +187,11 @@ class _Volley(NamedTuple):
     """Messages that were said together.
 
     Attributes:
-        messages: the same object is the same again.
-        frames: their frames.
-        size: bytes of all of them.
+        messages: messages; the same tuple is the same again.
+        frames: frames of these messages.
+        size: number of bytes of all frames.
         owed: ids of the answers that were owed before, and of those owed twice.
-        left: the same behind them.
+        left: ids of those that were owed behind them, and of those owed twice.
     """
 
     messages: tuple[Message, ...]
@@ -214,7 +218,13 @@ class Machine:
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
             that the answer to Connect does not fit are left out when it comes; where several are
             left, :meth:`adopt` decides.
+
+    Attributes:
+        transitions: the next state by state, sender and type of message; what is not in it is
+            illegal.
     """
+
+    transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
 
     def __init__(
         self,

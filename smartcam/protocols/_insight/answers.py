@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
 MAX_IMAGE = 1 << 26
-"""Bytes of an image that are accepted: 20 million pixels of three bytes, and then some."""
+"""Largest number of bytes of an image that are accepted: 20 million pixels of three bytes, and then
+some."""
 
 _BMP_MAGIC = b"BM"
 _BMP_SIZE_AT = slice(2, 6)  # of the file, UINT32 little endian

@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from smartcam.protocols._machine import Frame
 
 MAX_LOGIN = 255
-"""Characters of a user's name or password; the camera's own bound is not published."""
+"""Largest number of characters of a user's name or password; the camera's own bound is not
+published."""
 
 _VERDICTS: Mapping[int, Verdict] = {
     StatusCode.DONE: Verdict.DONE,

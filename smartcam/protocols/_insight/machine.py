@@ -52,7 +52,7 @@ ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 """Status of a camera that is online and takes event 8; no other state is told."""
 
 READ_SIZE = 1 << 15
-"""Bytes that one read takes at most."""
+"""Largest number of bytes that one read takes."""
 
 
 class Piece(enum.IntEnum):

@@ -46,8 +46,8 @@ INVALID_PASSWORD = "Invalid Password"  # noqa: S105 - the camera's words
 """The line that refuses a login (clients, derived)."""
 
 MAX_LINE = 4096
-"""Bytes of a line, its end not counted, that either side takes. The longest regular ones are values
-of cells; the camera's own bound is not published."""
+"""Largest number of bytes of a line, its end not counted, that either side takes. The longest
+regular ones are values of cells; the camera's own bound is not published."""
 
 LAST_COLUMN = "Z"
 """The last column of the spreadsheet; the first one is A (manual, published)."""
@@ -56,8 +56,8 @@ LAST_ROW = 399
 """The last row of the spreadsheet; the first one is 0 (manual, published)."""
 
 MAX_CELLS = 1024
-"""Cells that a range, or a result, may have; ranges are of this library: each cell is asked for on
-its own, which takes a round trip."""
+"""Largest number of cells that a range, or a result, may have; ranges are of this library: each
+cell is asked for on its own, which takes a round trip."""
 
 LAST_JOB_ID = 999
 """The largest id of a job; the first one is 0 (manual, published)."""

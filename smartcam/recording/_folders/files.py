@@ -138,7 +138,7 @@ class FolderFiles:
     @staticmethod
     def _add_gap(track: CameraTrack, file: RecordingFile, gap: Gap) -> None:
         file.add(gap.error(track.camera))
-        file.note(STATE_METADATA, track.state.facts(track.endian))
+        file.note(STATE_METADATA, track.state.facts(track.endian, gap.until))
 
     def _begin(self, track: CameraTrack, first: Any) -> None:
         """Begin a camera's next file, and end the one before, if any; ``first``: what it is for.
@@ -150,12 +150,13 @@ class FolderFiles:
         if now - self._looked > LOOK_INTERVAL:
             self._folder.look()
             self._looked = now
-        path = self._folder.next_path(track.camera, _time_of(first))
+        at = _time_of(first)
+        path = self._folder.next_path(track.camera, at)
         file = RecordingFile(opened(path, overwrite=False), self._compress, path)
         try:
             file.start()
             file.add(Description(track.facts))
-            file.note(STATE_METADATA, track.state.facts(track.endian))
+            file.note(STATE_METADATA, track.state.facts(track.endian, at))
             file.flush()
         except BaseException:
             file.close()

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 MIN_FREE_BYTES = 4 * CHUNK
-"""Bytes that must be free on a disk that was full before it is tried again."""
+"""Least number of bytes that must be free on a disk that was full before it is tried again."""
 
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that did not take something is tried again; the last for ever."""

@@ -59,21 +59,22 @@ GAP = "RecordingGap"
 """Class that a :class:`RecordedError` names where records were not written."""
 
 MAX_MESSAGE = 1 << 26
-"""Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
-room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
+"""Largest number of bytes of a message, written or read. A frame stands in one as bytes and as
+fields, so this has room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
 
 MAX_PICTURE_SIZE_BYTES = 1 << 27
-"""Bytes of a picture that is written: half of the largest record that is read."""
+"""Largest number of bytes of a picture that is written: half of the largest record that is read."""
 
 MAX_VALUES = 3_000_000
 """Commas and opening brackets of a message, written or read: each may become an object that takes
 a hundred times its room. A container of 1 MiB with a field a byte has two million."""
 
 MAX_CAMERAS = 10_000
-"""Cameras in a file: their facts are kept while it is read."""
+"""Largest number of cameras in a file: their facts are kept while it is read."""
 
 MAX_NAME = 1000
-"""Characters of a camera's name: a client takes 200, and HOST:PORT has fewer than 300."""
+"""Largest number of characters of a camera's name: a client takes 200, and HOST:PORT has fewer than
+300."""
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 

@@ -19,21 +19,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_RECORD = 1 << 28
-"""Bytes of one record of a file: ours have about 1 MiB, a damaged length says anything."""
+"""Largest number of bytes of one record of a file: ours have about 1 MiB, a damaged length says
+anything."""
 
 MAX_CHUNK = MAX_MESSAGE + (1 << 21)
-"""Bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so the largest has one
-message more; 2 kB of zstd can claim as much as this."""
+"""Largest number of bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so
+the largest has one message more; 2 kB of zstd can claim as much as this."""
 
 MAX_FACTS = 1 << 20
-"""Bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
+"""Largest number of bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
 
 MIN_RECORDS = 10_000
-"""Records that every file may have; a larger file as many as it has bytes. A recorder indexes each
-message with 16 bytes behind its chunk, and a chunk of 1 MiB has fewer than these."""
+"""Least number of records that every file may have; a larger file as many as it has bytes. A
+recorder indexes each message with 16 bytes behind its chunk, and a chunk of 1 MiB has fewer than
+these."""
 
 MIN_UNPACKED = 1 << 29
-"""Bytes that the chunks of every file may unpack to together: seconds of work."""
+"""Least number of bytes that the chunks of every file may unpack to together: seconds of work."""
 
 UNPACKED_PER_BYTE = 10_000
 """Bytes that a larger file may unpack to for each of its own. Containers of nothing but zeros come

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from smartcam.recording._recorder import Recorder
 
 MAX_MATCHED_BYTES: Final = 1 << 26
-"""Bytes of a camera's last pictures that are kept until the result that was made of one comes."""
+"""Largest number of bytes of a camera's last pictures that are kept until the result that was made
+of one comes."""
 
 LAST_PICTURE_TIMEOUT: Final = 2.0
 """Seconds that the picture of a result may come behind it, at most, where the recording ends."""

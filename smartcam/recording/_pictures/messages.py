@@ -26,7 +26,7 @@ MAX_SIDE_PX: Final = 1 << 20
 """Pixels along a side of a picture that is written, or read."""
 
 MAX_FIELDS: Final = 1000
-"""Fields of a message that is read; ours have fewer than 30."""
+"""Largest number of fields of a message that is read; ours have fewer than 30."""
 
 RAW: Final = "foxglove.RawImage"
 COMPRESSED: Final = "foxglove.CompressedImage"

@@ -45,7 +45,8 @@ MAX_TIME_BEHIND_FIRST = 0.1
 all the time that it waits for a trigger."""
 
 MAX_REPLAY = 1 << 30
-"""Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
+"""Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
+a second."""
 
 
 @dataclass(slots=True)
@@ -206,6 +207,8 @@ class _ReplayStep(NamedTuple):
     number: int = 0  # an application's id, or the endian field
     bits: Status = Status(0)  # of a status
     data: bytes = b""  # of a container
+    # what the record says, seconds since 1970, where ``at`` may be later: times never go back
+    told_at: float | None = None
 
 
 _PLAIN = {
@@ -223,7 +226,7 @@ def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
     return [
         step._replace(at=max(step.at, at))
         for step in steps
-        if step.at >= at or step.what not in single
+        if (step.at if step.told_at is None else step.told_at) >= at or step.what not in single
     ]
 
 
@@ -286,6 +289,7 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
             ) from exc
         if step is None:
             continue
+        step = step._replace(told_at=item.at.timestamp())
         size += len(step.data)
         if size > MAX_REPLAY:
             raise RecordingError(
@@ -369,7 +373,7 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
         at = step.at + lacks if step.what in _BY_AGENT else step.at
         if step.what is not _What.TRIGGER:
             at = last = max(at, last)
-        found.append(step._replace(at=at))
+        found.append(step._replace(at=at, told_at=step.at))
     return found
 
 

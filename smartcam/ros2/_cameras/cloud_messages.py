@@ -31,7 +31,7 @@ DISPARITY_STEP: Final = 1 / 16
 
 
 LARGEST_VALUE: Final = 65534.0
-"""Steps of a compressed depth from the farthest, which is 1, to the nearest."""
+"""Largest number of steps of a compressed depth from the farthest, which is 1, to the nearest."""
 
 MIN_DEPTH_RANGE: Final = 1.001
 """Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""

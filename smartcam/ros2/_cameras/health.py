@@ -22,7 +22,7 @@ STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Characters of an error in a message; what is longer is cut."""
+"""Largest number of characters of an error in a message; what is longer is cut."""
 
 OK, WARN, ERROR, STALE = range(4)
 """Levels, as ``diagnostic_msgs/msg/DiagnosticStatus`` has them."""

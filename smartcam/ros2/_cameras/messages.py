@@ -31,7 +31,7 @@ RESULT: Final = "smartcam_msgs/msg/Result"
 LOCALIZATION: Final = "smartcam_msgs/msg/Localization"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Characters of an error in a message."""
+"""Largest number of characters of an error in a message."""
 
 
 def error_text(error: BaseException) -> str:

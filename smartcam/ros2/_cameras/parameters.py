@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.camera import Camera
-    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.options import CameraNodeOptions
     from smartcam.ros2._cameras.status import CameraStatus
     from smartcam.settings import CameraSettings
 

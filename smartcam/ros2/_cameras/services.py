@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_RESULTS: Final = 1000
-"""Results that one answer brings."""
+"""Largest number of results that one answer brings."""
 
 MAX_INPUT_BYTES: Final = 1 << 16
 MAX_LAYOUT_CHARACTERS: Final = 10_000

@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from smartcam.camera import Camera
-    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.options import CameraNodeOptions
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_EVENTS = 64
-"""Events that wait; what counts is the state after them."""
+"""Largest number of events that wait; what counts is the state after them."""
 
 RISING: Mapping[str, str] = {
     "dropped": "results were dropped: a subscriber is too slow",

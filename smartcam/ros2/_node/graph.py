@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_ENTITIES = 100_000
-"""Nodes and ends of topics and services that are kept in mind; what comes beyond is not."""
+"""Largest number of nodes and ends of topics and services that are kept in mind; what comes beyond
+is not."""
 
 
 class RosGraph:

@@ -242,7 +242,9 @@ class Node(NamedNode):
         Raises:
             ConfigurationError: the name is not valid.
         """
-        return ParameterClient(self, resolve(name, self.namespace, self.name, "node"), timeout)
+        return ParameterClient(
+            self.client, resolve(name, self.namespace, self.name, "node"), timeout
+        )
 
     def _kept(self, end: End) -> End:
         self._ends.add(end)

@@ -18,10 +18,9 @@ from smartcam.ros2._node.qos import PARAMETERS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.interface import NodeOfRos, PublisherEnd
     from smartcam.ros2._node.parameter_values import Typed
     from smartcam.ros2._node.parameters import RosParameters
-    from smartcam.ros2._node.topics import RosPublisher
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -29,7 +28,7 @@ MAX_NAMES = 1024
 """Most names in a request; one with more is refused: list gives nothing, set gives the reason."""
 
 MAX_REASON_CHARACTERS = 1000
-"""Characters of the reason why parameters could not be set."""
+"""Largest number of characters of the reason why parameters could not be set."""
 
 NAMES_PER_TURN = 64
 """Names until other things have their turn."""
@@ -49,9 +48,9 @@ class ParameterServices:
         parameters: parameters to serve.
     """
 
-    def __init__(self, node: Node, parameters: RosParameters) -> None:
+    def __init__(self, node: NodeOfRos, parameters: RosParameters) -> None:
         self._node, self._parameters = node, parameters
-        self._events: RosPublisher | None = None
+        self._events: PublisherEnd | None = None
 
     def open(self) -> None:
         """Serve, and publish what there is."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._types.types import MessageType, RosTypes, ServiceType
 
 MAX_REASON_CHARACTERS: Final = 1000
-"""Characters of the reason in an answer; what is longer is cut."""
+"""Largest number of characters of the reason in an answer; what is longer is cut."""
 
 FLAGS: Final = ("success", "successful")
 """Names of fields that say whether a call was carried out."""

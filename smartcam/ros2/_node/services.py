@@ -36,13 +36,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_CONCURRENT_CALLS = 64
-"""Calls of a service that are carried out at the same time; one beyond is refused, or waits."""
+"""Largest number of calls of a service that are carried out at the same time; one beyond is
+refused, or waits."""
 
 MAX_WAITING_CALLS = 256
-"""Calls that wait for their turn, of a service whose answers cannot refuse one."""
+"""Largest number of calls that wait for their turn, of a service whose answers cannot refuse
+one."""
 
 MAX_REQUEST_BYTES = 1 << 24
-"""Bytes of a request."""
+"""Largest number of bytes of a request."""
 
 LOOK_AGAIN = 0.02
 """Seconds between two looks whether somebody serves."""

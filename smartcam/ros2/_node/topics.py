@@ -34,7 +34,7 @@ MAX_DIRECT_BYTES = 1 << 16
 """Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of a topic's messages that wait to be said, or to be read."""
+"""Largest number of bytes of a topic's messages that wait to be said, or to be read."""
 
 
 def said(message: object, fields: dict[str, Any]) -> object:

@@ -48,7 +48,7 @@ MAX_ERROR_TEXT = 500
 """Characters of an error's text: a container's bytes are in it, 64 of them at most."""
 
 MAX_PLACES = 256
-"""Places of a container at which one thing is tried, at most."""
+"""Largest number of places of a container at which one thing is tried."""
 
 TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
 """Bytes that may stand behind a container."""

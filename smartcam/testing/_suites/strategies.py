@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hypothesis.strategies import DataObject, SearchStrategy
 
 MAX_NOISE = 200
-"""Bytes of one piece of noise."""
+"""Largest number of bytes of one piece of noise."""
 
 
 def each_drawn(check: Callable[[DataObject], None]) -> None:

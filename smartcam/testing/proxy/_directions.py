@@ -26,8 +26,8 @@ CHUNK = 1 << 16
 """Bytes read at once."""
 
 MAX_HELD = 1 << 18
-"""Bytes that wait in one direction before the proxy reads no more: one chunk behind the limit and
-what rules insert come on top. It leaves room for what a rule may hold back."""
+"""Largest number of bytes that wait in one direction before the proxy reads no more: one chunk
+behind the limit and what rules insert come on top. It leaves room for what a rule may hold back."""
 
 WRITE_INTERVAL = 0.01
 """Seconds between two writes where the rate is limited."""

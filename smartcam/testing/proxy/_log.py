@@ -8,7 +8,7 @@ from typing import NamedTuple
 from smartcam.emulator._inside import Tally
 
 MAX_ENTRIES = 10_000
-"""Entries kept; the oldest go first. The counts go on."""
+"""Largest number of entries kept; the oldest go first. The counts go on."""
 
 
 class Entry(NamedTuple):

@@ -32,10 +32,11 @@ Direction = Literal["up", "down"]
 DIRECTIONS: tuple[Direction, Direction] = ("up", "down")
 
 MAX_COPY = 1 << 20
-"""Bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
+"""Largest number of bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
 
 MAX_HOLD = 1 << 16
-"""Bytes that one rule may hold back: fewer than the proxy keeps before it stops reading."""
+"""Largest number of bytes that one rule may hold back: fewer than the proxy keeps before it stops
+reading."""
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._rules import Rule
 
 MAX_SIZE = 1 << 16
-"""Bytes read of a datagram; none is longer."""
+"""Largest number of bytes read of a datagram; none is longer."""
 
 MAX_CLIENTS = 64
 """Client addresses that are known; the one that was not answered for longest makes room."""
@@ -39,7 +39,7 @@ ANSWERED_GRACE = 60.0
 """Seconds that a client keeps its place for certain after the target has answered it."""
 
 MAX_WAITING_DATAGRAMS = 1024
-"""Datagrams that rules hold back; more are lost and counted as ``full``."""
+"""Largest number of datagrams that rules hold back; more are lost and counted as ``full``."""
 
 
 class _Peer(Proxied):

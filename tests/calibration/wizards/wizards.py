@@ -18,8 +18,8 @@ from smartcam.calibration.wizards import (
     WizardSession,
     ask,
 )
-from smartcam.calibration.wizards._journal import Journal
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import Journal
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

@@ -15,7 +15,7 @@ START, END = 0x80, 0x40
 START_CODE: Final = b"\0\0\0\1"
 
 MAX_ACCESS_UNIT_BYTES: Final = 16 << 20
-"""Bytes of an access unit: one that is larger is damaged."""
+"""Largest number of bytes of an access unit: one that is larger is damaged."""
 
 
 class AccessUnit(NamedTuple):
@@ -119,16 +119,18 @@ class NalUnit(OpenUnit):
 
     @classmethod
     def leading(cls, access_unit: bytes) -> Iterator[bytes]:
-        """Yield the units before a frame's picture and the first of the picture, without codes."""
+        """Yield the units before a frame's picture, without codes, and the head of the picture."""
         place = access_unit.find(b"\0\0\1")
         while place >= 0:
-            after = access_unit.find(b"\0\0\1", place + 3)
-            unit = access_unit[place + 3 : after if after >= 0 else len(access_unit)].rstrip(b"\0")
-            kind = cls.kind_of(unit[0]) if len(unit) >= cls.HEAD else -1
-            if kind >= 0:
-                yield unit
-            if cls.is_picture(kind):
+            head = access_unit[place + 3 : place + 3 + cls.HEAD]
+            kind = cls.kind_of(head[0]) if len(head) == cls.HEAD else -1
+            if cls.is_picture(kind):  # its end is far away, and nobody asks for it
+                yield head
                 return
+            after = access_unit.find(b"\0\0\1", place + 3)
+            if kind >= 0:
+                end = after if after >= 0 else len(access_unit)
+                yield access_unit[place + 3 : end].rstrip(b"\0")
             place = after
 
     def ended(self) -> bool:

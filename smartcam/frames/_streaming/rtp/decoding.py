@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._codecs.threads import Codecs, StreamRuns, at_once
-from smartcam.frames._frame import Frame, Moment, changed
+from smartcam.frames._frame import Frame, Moment, amend
 from smartcam.frames._pixels.formats import find_format
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ class UnitDecoding:
         self._shown = True
         self._number += 1 + lost
         if not self._ended:
-            self._sink.frame(changed(picture, sequence=self._number, lost=lost))
+            self._sink.frame(amend(picture, sequence=self._number, lost=lost))
 
 
 class _UnitPace:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 64
-"""Packets that may wait for an earlier one that is missing."""
+"""Largest number of packets that may wait for an earlier one that is missing."""
 
 MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
 """Packets: a sequence number further off is a stream that began anew, if a second one follows."""

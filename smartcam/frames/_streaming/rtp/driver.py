@@ -185,7 +185,12 @@ class _RtpStream:
         self._decoding = UnitDecoding(DecodingPlan(plan.name, H264, plan.delay, size), sink)
         self._watching: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
-            pair, plan.payload, plan.repair, self._decoding.take, self._gone, plan.only
+            pair,
+            plan.payload,
+            plan.repair,
+            self._decoding.take,
+            self._gone,
+            (plan.only,) * bool(plan.only),
         )
 
     async def begin(self) -> None:

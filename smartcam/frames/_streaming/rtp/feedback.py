@@ -17,7 +17,7 @@ RECEIVER_TIMEOUT: Final = 10.0
 MAX_RECEIVERS: Final = 64
 
 MAX_KEPT_PACKETS: Final = 1024
-"""Packets that are kept to be sent again on request."""
+"""Largest number of packets that are kept to be sent again on request."""
 
 MAX_RESEND_AGE: Final = 0.2
 """Seconds after which a packet is not sent again: its picture would be late."""

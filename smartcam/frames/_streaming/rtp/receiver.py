@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 1024
-"""Packets that may wait for missing ones."""
+"""Largest number of packets that may wait for missing ones."""
 
 LOOK_INTERVAL: Final = 0.005
 """Seconds between two looks at what is missing."""
@@ -35,7 +35,8 @@ PAUSE: Final = 0.008
 else that is only seen when the next frame comes."""
 
 MAX_PACKETS_REQUESTED: Final = 256
-"""Packets requested at a time; if more are missing, a key frame is requested instead."""
+"""Largest number of packets requested at a time; if more are missing, a key frame is requested
+instead."""
 
 REORDER_GRACE: Final = 0.02
 """Seconds that a packet is waited for where the sender sends none again."""
@@ -116,7 +117,7 @@ class StreamReceiver:
         repair: seconds that a missing packet is waited for, and asked for again.
         done: takes the encoded frames that came whole.
         gone: takes that the sender said goodbye.
-        only: address of the host whose packets count; "": any.
+        only: addresses of the hosts whose packets count; none: any.
         kind: kind of the payloads; None: H.264.
         agreed: whether the stream was asked for, so that another one of the same host takes its
             place at once, and packets that are missing are waited for without asking.
@@ -133,7 +134,7 @@ class StreamReceiver:
         repair: float,
         done: Callable[[list[AccessUnit]], None],
         gone: Callable[[str], None],
-        only: str = "",
+        only: tuple[str, ...] = (),
         kind: UnitKind | None = None,
         *,
         agreed: bool = False,
@@ -267,7 +268,7 @@ class StreamReceiver:
         )
 
     def _may_speak(self, sender: tuple[Any, ...]) -> bool:
-        return not self._only or str(sender[0]).partition("%")[0] == self._only
+        return not self._only or str(sender[0]).partition("%")[0] in self._only
 
     def _read(self) -> None:
         """Hand on what is whole, and have a look later where something is missing."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 MAX_DATAGRAMS_PER_TURN: Final = 64
-"""Datagrams that are read before other tasks of the event loop have a turn."""
+"""Largest number of datagrams that are read before other tasks of the event loop have a turn."""
 
 RECEIVE_BUFFER: Final = 4 << 20
 SEND_BUFFER: Final = 128 << 10
@@ -27,7 +27,7 @@ SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
 """asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
 
 MAX_TRIES: Final = 32
-"""Tries to find two free ports side by side."""
+"""Largest number of tries to find two free ports side by side."""
 
 
 class Endpoint(NamedTuple):

@@ -15,7 +15,7 @@ CATCH_UP_TIME: Final = 0.5
 frame is skipped where anything of an earlier one still waits."""
 
 MAX_WAITING_BYTES: Final = 4 << 20
-"""Bytes that may wait behind a key frame."""
+"""Largest number of bytes that may wait behind a key frame."""
 
 STALL_TIMEOUT: Final = 10.0
 """Seconds in which nothing is taken; then a connection is cut off."""
@@ -27,7 +27,7 @@ DATAGRAMS: Final = 1 << 20
 """Bytes of datagrams that the system may hold: a key frame's, at once."""
 
 MAX_TRIES: Final = 32
-"""Tries to find two ports, an even one and the next."""
+"""Largest number of tries to find two ports, an even one and the next."""
 
 
 class PacketDelivery(Protocol):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 MAX_CHALLENGES: Final = 8
-"""Challenges of one answer that are looked at."""
+"""Largest number of challenges of one answer that are looked at."""
 
 _HASHES: Final = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
 """Hashes by the names that challenges have for them; the last one is the best."""

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Conversation, Step
 
 MAX_CUTS = 64
-"""Places at which one delivery is cut in two, at most."""
+"""Largest number of places at which one delivery is cut in two."""
 
 MAX_ERROR_TEXT = 500
 """Characters of an error's text: a peer's bytes are in it, 64 of them at most."""
