@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -31,7 +30,8 @@ def told(error: ErrorT) -> ErrorT:
     A raised error refers to the frames of its caller, and by them to the client: kept by the
     client's own task, it would keep a client alive that nobody has any more.
     """
-    made = copy.copy(error)
+    made = type(error)(*error.args)  # as copy() does, in a tenth of the steps
+    vars(made).update(vars(error))
     made.__cause__ = error.__cause__
     return made
 

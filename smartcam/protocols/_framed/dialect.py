@@ -449,6 +449,10 @@ class FramedDialect(Dialect):
     @property
     def capabilities(self) -> Capabilities:
         """Abilities of a camera in this dialect."""
+        return self._capabilities
+
+    @cached_property
+    def _capabilities(self) -> Capabilities:
         return Capabilities(
             dialect=self.name,
             status_by_itself=self.status_by_itself,
