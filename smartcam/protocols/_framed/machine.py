@@ -455,11 +455,10 @@ class Machine:
                 f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant = self._constant.get(kind)
+        constant, frame = self._constant.get(kind), None
         if constant is None:
-            constant, frame = self._made_of(message)
-        else:
-            frame = None
+            known = self._said.get(id(message))
+            constant, frame = self._made_of(message) if known is None else known[1]
         data, message_id, owed = constant
         if answered is not None:
             owed = message_id if answered else None
@@ -513,13 +512,10 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _made_of(self, message: Message) -> _Made:
-        """Return the frame of a message with a body; a camera often says the same object again.
+        """Return the frame of a message with a body; a camera's machine keeps it by the object.
 
         Of those with data, such as results, only the last one's frame is kept.
         """
-        known = self._said.get(id(message))
-        if known is not None:
-            return known[1]
         dialect = self.dialect
         message_id = dialect.message_id(message)
         frame = dialect.to_frame(message)
