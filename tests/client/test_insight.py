@@ -712,7 +712,11 @@ async def test_garbage_ends_the_link_with_its_text() -> None:
         client.say("77")
         lost = await anext(events)
         assert isinstance(lost, Disconnected)
-        assert lost.reason == "'77' came, nothing was asked"
+        # whoever looks at events has the camera asked for its status, perhaps at this moment
+        assert lost.reason in {
+            "'77' came, nothing was asked",
+            "'77' came, 0 (offline) or 1 (online) was expected",
+        }
 
 
 async def test_close_leaves_the_camera_as_it_is() -> None:

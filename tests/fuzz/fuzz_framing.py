@@ -27,7 +27,7 @@ MAX_READ = 128
 
 def check(data: bytes) -> None:
     """Cut a stream into frames by chunks and compare with what :func:`expected` finds in it."""
-    with small_reads(FIRST_READ=16, MAX_READ_BYTES=MAX_READ):
+    with small_reads(FIRST_READ_BYTES=16, MAX_READ_BYTES=MAX_READ):
         check_framer(data)
 
 

@@ -51,7 +51,7 @@ def small_buffers() -> Iterator[None]:
     with mock.patch.multiple(
         framing,
         MIN_OWN_BUFFER_BYTES=LARGE,
-        FIRST_READ=FIRST_READ,
+        FIRST_READ_BYTES=FIRST_READ,
         MAX_READ_BYTES=MAX_READ,
         MAX_ALIKE_FRAMES=ALIKE,
     ):
