@@ -159,9 +159,7 @@ class Log(Sequence[LogEntry]):
         """Bytes that the entries hold, counted as if all had been read."""
         return self._size
 
-    def keep(
-        self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None
-    ) -> None:
+    def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
         """Put a frame that went over the wire as it is behind the others; as :meth:`append`."""
         self._unread.append((time, peer, sender, frame, fault, None))
         weight = _ENTRY + _PER_BYTE * len(frame[1])
