@@ -479,11 +479,19 @@ async def test_cancelled_caller_of_an_outcome_is_cancelled_once(first: str, bell
 def test_caller_that_ends_the_program_behind_its_result_ends_it(
     error: type[BaseException], loop: str
 ) -> None:
+    left: list[asyncio.Task[None]] = []
+
     async def main() -> None:
-        async with asyncio.timeout(20), by_hand(reconnect=None) as (_, camera):
-            await camera.trigger()
-            raise error
+        async with by_hand(reconnect=None) as (_, camera):
+
+            async def leave() -> None:
+                await camera.trigger()
+                raise error
+
+            left.append(asyncio.create_task(leave()))
+            await asyncio.sleep(5)  # the loop ends in it
 
     factory = pytest.importorskip("uvloop").new_event_loop if loop == "uvloop" else None
     with asyncio.Runner(loop_factory=factory) as runner, pytest.raises(error):
         runner.run(main())
+    assert isinstance(left[0].exception(), error)
