@@ -134,7 +134,8 @@ class Supervisor:
             self._run(), name=f"smartcam[{self._settings.address.host}].supervisor"
         )
         self._task.add_done_callback(self._end)
-        error = await self._opened
+        await asyncio.wait({self._opened})
+        error = self._opened.result()
         if error is not None:
             raise error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import smartcam
 from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
 from smartcam._client import link
-from smartcam._client.doorbell import Doorbell
+from smartcam._client.doorbell import Doorbell, Outcome
 from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
@@ -384,3 +385,114 @@ async def test_task_keeps_its_context() -> None:
     asyncio.get_running_loop().call_soon(bell.ring)
     assert await task == "the task"
     assert who.get() == "nobody"
+
+
+# What a caller sleeps on, whose outcome the receive task sets.
+
+
+async def receive(bell: Doorbell, deliver: Callable[[], object]) -> None:
+    while True:
+        await bell
+        deliver()
+
+
+@pytest.fixture
+async def bell() -> Doorbell:
+    return Doorbell(asyncio.get_running_loop())
+
+
+async def ask(outcome: Outcome[str], heard: list[str]) -> str:
+    found = await outcome
+    heard.append(found)
+    return found
+
+
+async def delivered(bell: Doorbell, do: Callable[[], object], heard: list[str]) -> list[str]:
+    """Have the receive task do something in a delivery; return what was heard right behind it."""
+    receiving = asyncio.create_task(receive(bell, do))
+    await asyncio.sleep(0)
+    seen: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
+
+    def come() -> None:
+        bell.deliver()
+        seen.set_result(list(heard))
+
+    asyncio.get_running_loop().call_soon(come)
+    found = await seen
+    receiving.cancel()
+    return found
+
+
+async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: Outcome[str] = bell.outcome()
+    caller = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+    assert await delivered(bell, lambda: outcome.set_result("here"), heard) == ["here"]
+    assert await caller == "here"
+
+
+async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: Outcome[str] = bell.outcome()
+    caller = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+    await delivered(bell, lambda: outcome.set_exception(ZeroDivisionError()), heard)
+    with pytest.raises(ZeroDivisionError):
+        await caller
+    with pytest.raises(asyncio.InvalidStateError):
+        outcome.set_result("too late")
+
+
+async def test_outcome_that_comes_otherwise_wakes_by_the_loop(bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: Outcome[str] = bell.outcome()
+    caller = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+    outcome.set_result("here")
+    assert heard == []
+    assert await caller == "here"
+    assert await ask(outcome, heard) == "here"  # one that is there is not waited for
+
+
+@pytest.mark.parametrize("first", ["cancel", "result"])
+async def test_cancelled_caller_of_an_outcome_is_cancelled_once(first: str, bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: Outcome[str] = bell.outcome()
+    caller = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+
+    def both() -> None:
+        if first == "result":
+            outcome.set_result("here")
+        caller.cancel()
+        if first == "cancel":
+            assert outcome.cancelled()
+
+    await delivered(bell, both, heard)
+    with pytest.raises(asyncio.CancelledError):
+        await caller
+    assert heard == []
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+def test_caller_that_ends_the_program_behind_its_result_ends_it(
+    error: type[BaseException], loop: str
+) -> None:
+    left: list[asyncio.Task[None]] = []
+
+    async def main() -> None:
+        async with by_hand(reconnect=None) as (_, camera):
+
+            async def leave() -> None:
+                await camera.trigger()
+                raise error
+
+            left.append(asyncio.create_task(leave()))
+            await asyncio.sleep(5)  # the loop ends in it
+
+    factory = pytest.importorskip("uvloop").new_event_loop if loop == "uvloop" else None
+    with asyncio.Runner(loop_factory=factory) as runner, pytest.raises(error):
+        runner.run(main())
+    assert isinstance(left[0].exception(), error)

@@ -1,4 +1,4 @@
-"""Other times and sizes for the reading of frames."""
+"""Other times, sizes and machines for the reading of frames."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from smartcam.protocols._framed import frame_age, framing
+from smartcam.protocols._framed.machine import Machine
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -25,3 +26,22 @@ def small_reads(**sizes: Any) -> AbstractContextManager[object]:
         framing, MIN_OWN_BUFFER_BYTES=32, **sizes
     )
     return patched
+
+
+class JudgingMachine(Machine):
+    """A machine that reads and writes each frame by itself."""
+
+    def _take_up(self, dialect: Any) -> None:
+        super()._take_up(dialect)
+        self._plain = False
+
+
+class ShortMachine(Machine):
+    """A machine that counts the deliveries that it takes as a whole."""
+
+    taken = 0
+
+    def _receive_known(self) -> bool:
+        taken = super()._receive_known()
+        ShortMachine.taken += taken
+        return taken

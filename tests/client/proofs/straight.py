@@ -55,7 +55,7 @@ from tests.client.camera_by_hand import (
 )
 from tests.client.inside import Chunk, Correlation, EvidenceByStatus, PendingTrigger, Results
 from tests.client.proofs.interleaved_client import LOOP, time_stands_still
-from tests.protocols.machine_kinds import JudgingMachine, ShortMachine
+from tests.protocols.frame_times import JudgingMachine, ShortMachine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.client.proofs.straight import DifferenceError, ShortDispatch, compare
-from tests.protocols.machine_kinds import ShortMachine
+from tests.protocols.frame_times import ShortMachine
 
 EVENTS, SEED = 2000, 1
 
