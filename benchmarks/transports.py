@@ -112,7 +112,9 @@ def run(plan: Plan) -> Iterator[Comparison]:
             for name in (OURS, TUNED_PEER)
         )
         note = "of both ends, in turn"
-        yield Comparison("transports", "CPU of RTP", ours, theirs, goal=Goal("at most", 1.0), note=note)
+        yield Comparison(
+            "transports", "CPU of RTP", ours, theirs, goal=Goal("at most", 1.0), note=note
+        )
 
 
 def _awaited(way: Callable[[float], Awaitable[Way]]) -> Callable[[float], Way]:

@@ -98,7 +98,7 @@ class Frame:
     trigger: FrameTrigger | None = None
 
     def __reduce__(self) -> tuple[Callable[[], Frame], tuple[()]]:
-        """Return what makes a copy, also in another process: with the bytes, whoever has them."""
+        """Return a function that makes a copy, with bytes of its own, also in another process."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return partial(type(self), **(values | {"data": bytes(self.data)})), ()
 

@@ -50,7 +50,7 @@ class PixelFormat:
     layout: PixelLayout = field(kw_only=True, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[Callable[[str], PixelFormat], tuple[str]]:
-        """Return what another process has it by: its name."""
+        """Return the function that finds the format in another process, and its name."""
         return find_format, (self.name,)
 
     @property
