@@ -27,7 +27,7 @@ import numpy as np
 
 import smartcam
 import smartcam.fleet
-from benchmarks.measure import Comparison, Series
+from benchmarks.measure import Comparison, Goal, Series
 from benchmarks.peers import peer
 from benchmarks.peers.gstreamer_pictures import has_gstreamer
 from benchmarks.peers.rospy_pictures import PYTHON, ROS, can
@@ -46,6 +46,10 @@ SIZE = (640, 480)
 RATE = 30
 SECONDS = 4.0
 URL = f"synthetic://?size={SIZE[0]}x{SIZE[1]}&fps={RATE}"
+OURS = "RTP, H.264"
+TUNED_PEER = "GStreamer, RTP, x264enc tuned"
+"""The two ways whose CPU is compared."""
+
 ASKED = 10.0
 """Requests a second."""
 
@@ -86,22 +90,31 @@ def run(plan: Plan) -> Iterator[Comparison]:
         "bus, raw": _awaited(lambda one: _bus(one, encoding="raw")),
         "bus, JPEG q15": _awaited(lambda one: _bus(one, encoding="jpeg", quality=15)),
         "one on request, JPEG q15": _awaited(_asked),
-        "RTP, H.264": _awaited(_rtp),
+        OURS: _awaited(_rtp),
     }
     if has_gstreamer():
         ways["GStreamer, RTP, x264enc as it comes"] = lambda one: _gstreamer(one, "")
-        ways["GStreamer, RTP, x264enc tuned"] = lambda one: _gstreamer(one, TUNED)
+        ways[TUNED_PEER] = lambda one: _gstreamer(one, TUNED)
     if can(ROS):
         ways["rospy, raw"] = lambda one: _rospy(one, "raw")
     if can(f"{ROS}, cv2"):
         ways["rospy, JPEG q15"] = lambda one: _rospy(one, "jpeg")
     found: dict[str, list[Way]] = {name: [] for name in ways}
-    for _ in range(plan.rounds):
-        for name, way in ways.items():
+    for number in range(plan.rounds):
+        for name, way in list(ways.items())[:: -1 if number % 2 else 1]:
             found[name].append(way(seconds))
     for name, rounds in found.items():
         series = Series("latency", "ms", [one.median for one in rounds])
         yield Comparison("transports", name, series, how="alone", note=str(rounds[-1]))
+    if TUNED_PEER in found:
+        ours, theirs = (
+            Series(name, "% of a core", [one.cpu for one in found[name]])
+            for name in (OURS, TUNED_PEER)
+        )
+        note = "of both ends, in turn"
+        yield Comparison(
+            "transports", "CPU of RTP", ours, theirs, goal=Goal("at most", 1.0), note=note
+        )
 
 
 def _awaited(way: Callable[[float], Awaitable[Way]]) -> Callable[[float], Way]:

@@ -7,6 +7,7 @@ import enum
 import operator
 import time
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from smartcam.frames._pixels.apart import JoinedOnUse
@@ -95,6 +96,11 @@ class Frame:
     remark: str = ""
     chunks: Mapping[str, FeatureValue] = field(default_factory=dict)
     trigger: FrameTrigger | None = None
+
+    def __reduce__(self) -> tuple[Callable[[], Frame], tuple[()]]:
+        """Return a function that makes a copy, with bytes of its own, also in another process."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return partial(type(self), **(values | {"data": bytes(self.data)})), ()
 
     @property
     def age(self) -> float:

@@ -117,8 +117,8 @@ def _jpeg(picture: NDArray[np.uint8]) -> bytes:
     return data
 
 
-_FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes]]] = {
-    "Mono8": lambda picture: picture.tobytes(),
+_FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes | memoryview]]] = {
+    "Mono8": lambda picture: picture.data.toreadonly().cast("B"),
     "YUV422_8": _pairs,
     "RGB8": lambda picture: np.repeat(picture[..., None], 3, axis=2).tobytes(),
     "Coord3D_C16": lambda picture: (picture.astype("<u2") * 16).tobytes(),

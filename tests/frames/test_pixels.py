@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 import sys
 from dataclasses import replace
@@ -19,6 +21,7 @@ from smartcam.frames._inside import Planes, YuvPairs
 from smartcam.frames._pixels import compiled
 from smartcam.frames._pixels.colours import MATRICES as COLOUR_MATRICES
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
+from tests.frames.pictures import frame_of, known_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -395,3 +398,14 @@ def test_compressed_bytes_are_given_as_they_are() -> None:
 def test_planes_of_a_format_without_are_told() -> None:
     with pytest.raises(FrameFormatError, match="a format of Y, U and V"):
         find_format("Mono8").planes(bytes(4), 2, 2, 2)
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_a_frame_is_copied_into_other_processes_whoever_has_its_bytes(kind: type) -> None:
+    frame = frame_of(np.arange(12, dtype=np.uint8).reshape(3, 4), "Mono8")
+    frame = replace(frame, data=kind(frame.data), chunks={"ChunkGain": 1.5})
+    sent = pickle.loads(pickle.dumps(frame))  # noqa: S301 - our own
+    for one in (sent, copy.copy(frame), copy.deepcopy(frame)):
+        assert np.array_equal(one.grey(), frame.grey())
+        assert known_of(one) == known_of(frame)
+        assert (one.format.name, one.chunks) == ("Mono8", {"ChunkGain": 1.5})

@@ -21,6 +21,8 @@ from smartcam.frames._pixels.layouts import (
 from smartcam.frames._pixels.unpacking import PACKINGS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -46,6 +48,10 @@ class PixelFormat:
     code: int = 0
     depth: int = 8
     layout: PixelLayout = field(kw_only=True, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[Callable[[str], PixelFormat], tuple[str]]:
+        """Return the function that finds the format in another process, and its name."""
+        return find_format, (self.name,)
 
     @property
     def compressed(self) -> bool:

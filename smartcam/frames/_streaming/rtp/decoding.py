@@ -14,8 +14,6 @@ from smartcam.frames._frame import Frame, Moment, amend
 from smartcam.frames._pixels.formats import find_format
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from smartcam.frames._codecs.h264 import H264Decoder
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._streaming.rtp.assembling import AccessUnit
@@ -162,26 +160,24 @@ class UnitDecoding:
             self._units.clear()
             source.want_picture()
         if self._idle and self._units and self._run.short and not self._ended:
-            with self._told():
+            try:
                 at_once(self._decode_next())
+            except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+                self._fail(exc)
         if self._units:
             self._came.set()
 
-    @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
-        """Report any error to the sink."""
-        try:
-            yield
-        except FrameSourceError as error:
-            self.over(error)
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+    def _fail(self, exc: Exception) -> None:
+        """Tell the sink of an error, of whatever kind."""
+        if not isinstance(exc, FrameSourceError):
             failed = FrameSourceError(f"{self._name}: {exc!r}")
             failed.__cause__ = exc
-            self.over(failed)
+            exc = failed
+        self.over(exc)
 
     async def _decode(self) -> None:
         """Decode queued frames, which could not be decoded at once."""
-        with self._told():
+        try:
             while not self._ended:
                 if not self._units:
                     self._came.clear()
@@ -191,6 +187,8 @@ class UnitDecoding:
                 if self._units:
                     await self._decode_next()
                     await asyncio.sleep(0)  # pictures that came together must not block the loop
+        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            self._fail(exc)
 
     async def _decode_next(self) -> None:
         unit, device_time = self._units.popleft()
