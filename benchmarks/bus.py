@@ -4,7 +4,9 @@ The agent is a process of its own, and so is the camera: the canned one of the b
 ``trigger``, which is not counted. Counted is the CPU time of agent and program together, the
 engine's threads included. Direct is the same camera, at the wire, in the same run. The yardsticks
 do nothing but send and wait: Zenoh without asyncio or smartcam, and a pair of asyncio protocols
-over TCP; with a question and an answer as long as a trigger's, and with results in batches.
+over TCP; with a question and an answer as long as a trigger's, and with results in batches. So do
+what a program would use in place of the fleet: a query of Zenoh's, and a message of MQTT and its
+answer, each between two event loops in processes of their own; the broker's CPU time counts.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from benchmarks.measure import (
 )
 from benchmarks.peers import peer, wire
 from benchmarks.peers.agent import fleet_file
+from benchmarks.peers.answering import broker
 from benchmarks.peers.control import Control
 from benchmarks.peers.echo import RESULTS, Zenoh, asking
 from benchmarks.yardsticks import BareClient
@@ -54,6 +57,7 @@ LAYOUT = (
 )
 DIRECT, FLEET, INSIDE = "direct", "fleet", "fleet, in-process bus"
 ZENOH, TCP = "zenoh", "asyncio TCP"
+QUERY, MQTT = "zenoh query from asyncio", "MQTT request and reply"
 BATCHES, ITEMS = "batch=True", "item by item"
 HOW = ("together", "apart")
 RATE = 20_000
@@ -63,6 +67,7 @@ LIMIT = 60.0
 CPU = "CPU time of agent and program together, the engine's threads included"
 BARE = "a question and an answer as long as a trigger's, or batches; both sides together"
 WALL = "the one in the middle on the wall clock, above direct"
+ASKED = "a question and an answer as long as a trigger's; all processes, without a camera's work"
 LOST = f"{STREAM:,} of them from one agent to one program; none is lost, or the run fails"
 
 
@@ -80,8 +85,13 @@ def run(plan: Plan) -> Iterable[Comparison]:
             name: Control(stack.enter_context(peer("echo", kind)))
             for name, kind in ((ZENOH, "zenoh"), (TCP, "tcp"))
         }
+        others = {QUERY: stack.enter_context(_asked_by_query())}
+        if (asked := stack.enter_context(_asked_by_messages())) is not None:
+            others[MQTT] = asked
+        else:
+            print("bus: MQTT is left out: no mosquitto, or no aiomqtt", file=sys.stderr)
         for how in HOW:
-            yield from asyncio.run(_triggers(plan, how, cameras[how], agents[how], echoes))
+            yield from asyncio.run(_triggers(plan, how, cameras[how], agents[how], echoes, others))
         yield from asyncio.run(_stream(plan, cameras["free"], agents["free"], echoes))
 
 
@@ -89,6 +99,52 @@ def run(plan: Plan) -> Iterable[Comparison]:
 def _agent(cameras: dict[str, int]) -> Iterator[Control]:
     with peer("agent", *(f"{name}={port}" for name, port in cameras.items())) as control:
         yield Control(control)
+
+
+class Asked:
+    """A pair of processes that ask and answer over a bus of others.
+
+    Args:
+        asker: the one that asks on request.
+        clocks: what tells the CPU time of every process that takes part.
+    """
+
+    def __init__(self, asker: Control, *clocks: Callable[[], float]) -> None:
+        self._asker = asker
+        self.clocks = clocks
+
+    def ask(self, count: int) -> None:
+        """Have so many questions asked, one after the other."""
+        self._asker.do(count)
+
+
+def _clock(control: Control) -> Callable[[], float]:
+    return lambda: control.usage().cpu
+
+
+@contextlib.contextmanager
+def _asked_by_query() -> Iterator[Asked]:
+    with peer("answering", "query") as answering:
+        answers = Control(answering)
+        (port,) = answers.usage().ports
+        with peer("answering", "query", str(port)) as asking:
+            asks = Control(asking)
+            yield Asked(asks, _clock(asks), _clock(answers))
+
+
+@contextlib.contextmanager
+def _asked_by_messages() -> Iterator[Asked | None]:
+    with broker() as between:
+        if between is None:
+            yield None
+            return
+        port = str(between.port)
+        with (
+            peer("answering", "mqtt", port) as answering,
+            peer("answering", "mqtt", port, "ask") as asking,
+        ):
+            answers, asks = Control(answering), Control(asking)
+            yield Asked(asks, _clock(asks), _clock(answers), between.cpu)
 
 
 class Meter:
@@ -99,7 +155,7 @@ class Meter:
 
     Attributes:
         rounds: what each round of a side took: microseconds of CPU time an operation here and in
-            the other process, and what its work returned.
+            the other processes, and what its work returned.
     """
 
     def __init__(self, count: int) -> None:
@@ -107,17 +163,23 @@ class Meter:
         self.rounds: dict[str, list[tuple[Cost, Cost, float]]] = {}
 
     def side(
-        self, name: str, work: Callable[[], Awaitable[float]], other: Control | None = None
+        self, name: str, work: Callable[[], Awaitable[float]], *others: Callable[[], float]
     ) -> Callable[[], Awaitable[Cost]]:
-        """Return a side whose cost is the CPU time of this process and the other."""
+        """Return a side whose cost is the CPU time of this process and the others.
+
+        Args:
+            name: name of the side.
+            work: what is done in a round.
+            *others: what tells the CPU time of each other process, seconds.
+        """
         rounds = self.rounds.setdefault(name, [])
 
         async def measure() -> Cost:
-            begin = 0.0 if other is None else other.usage().cpu
+            begin = sum(other() for other in others)
             here = time.process_time()
             found = await work()
             here = cpu_microseconds(here, self._count)
-            there = 0.0 if other is None else (other.usage().cpu - begin) / self._count * 1e6
+            there = (sum(other() for other in others) - begin) / self._count * 1e6
             rounds.append((here, there, found))
             return here + there
 
@@ -144,7 +206,12 @@ def _zenoh(echo: Control) -> Zenoh:
 
 
 async def _triggers(
-    plan: Plan, how: str, port: int, agent: Control, echoes: dict[str, Control]
+    plan: Plan,
+    how: str,
+    port: int,
+    agent: Control,
+    echoes: dict[str, Control],
+    others: dict[str, Asked],
 ) -> list[Comparison]:
     count = plan.operations(TRIGGERS, least=5)
     meter = Meter(count)
@@ -172,6 +239,10 @@ async def _triggers(
             await tcp.ask(question, wire.RESULT)
         return 0.0
 
+    async def asked(other: Asked) -> float:
+        other.ask(count)
+        return 0.0
+
     options: Any = {"interpret_as": "localizations"}
     async with (
         smartcam.connect(f"bvs://127.0.0.1:{port}?dialect=handbook", **options) as direct,
@@ -180,11 +251,15 @@ async def _triggers(
     ):
         cameras = {DIRECT: direct, FLEET: shared, INSIDE: inside[how]}
         sides = {
-            name: meter.side(name, partial(triggers, camera), agent if name == FLEET else None)
+            name: meter.side(
+                name, partial(triggers, camera), *([_clock(agent)] if name == FLEET else [])
+            )
             for name, camera in cameras.items()
         }
-        sides[ZENOH] = meter.side(ZENOH, zenoh_side, echoes[ZENOH])
-        sides[TCP] = meter.side(TCP, tcp_side, echoes[TCP])
+        sides[ZENOH] = meter.side(ZENOH, zenoh_side, _clock(echoes[ZENOH]))
+        sides[TCP] = meter.side(TCP, tcp_side, _clock(echoes[TCP]))
+        for name, other in others.items():
+            sides[name] = meter.side(name, partial(asked, other), *other.clocks)
         series = await take_turns_awaiting(plan, sides)
         for camera in cameras.values():
             counted = camera.statistics()
@@ -197,7 +272,12 @@ async def _triggers(
         name: Series(name, "ms", [1e-3 * one for one in meter.series(name, "found", "us").values])
         for name in (FLEET, DIRECT)
     }
+    goals = {QUERY: Goal("at most", 1.2), MQTT: Goal("at most", 1)}
     return [
+        *(
+            Comparison("bus", case, series[FLEET], series[name], goal=goals[name], note=ASKED)
+            for name in others
+        ),
         Comparison("bus", case, series[FLEET], series[DIRECT], goal=cpu, note=CPU),
         Comparison("bus", case, series[FLEET], series[ZENOH], note=BARE),
         Comparison("bus", case, series[FLEET], series[TCP]),
@@ -243,13 +323,13 @@ async def _stream(
         smartcam.connect(f"fleet://127.0.0.1:{agent.usage().ports[0]}/free", **options) as shared,
     ):
         sides = {
-            ZENOH: meter.side(ZENOH, zenoh_side, echoes[ZENOH]),
-            TCP: meter.side(TCP, tcp_side, echoes[TCP]),
+            ZENOH: meter.side(ZENOH, zenoh_side, _clock(echoes[ZENOH])),
+            TCP: meter.side(TCP, tcp_side, _clock(echoes[TCP])),
         }
         for name in (BATCHES, ITEMS):
-            for place, camera, other in ((DIRECT, direct, None), (FLEET, shared, agent)):
+            for place, camera, clocks in ((DIRECT, direct, []), (FLEET, shared, [_clock(agent)])):
                 called = f"{place}, {name}"
-                sides[called] = meter.side(called, partial(results, camera, name), other)
+                sides[called] = meter.side(called, partial(results, camera, name), *clocks)
         series = await take_turns_awaiting(plan, sides)
         counted = shared.statistics()
         assert counted.streamed == 2 * count * (plan.rounds + 1), counted

@@ -40,6 +40,7 @@ __all__ = ["run"]
 
 SIZE = (1280, 1024)
 TRIGGERS = 40
+TRIGGERS_WITHOUT_WORK = 400
 SECONDS = 5.0
 
 CELL = """
@@ -154,7 +155,7 @@ async def _compared(plan: Plan, camera: SoftwareCamera[Any]) -> AsyncIterator[Co
     alone: list[float] = []
     for _ in range(plan.rounds):
         await camera.switch_application(1)
-        above.append(await _triggers(camera, count))
+        above.append(await _triggers(camera, plan.operations(TRIGGERS_WITHOUT_WORK, least=5)))
         await camera.switch_application(2)
         reading.append(await _triggers(camera, count))
         alone.append(await _zxing(picture, count))

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.measure import Comparison, Cost, Goal, Plan, Series
 from benchmarks.peers import peer
-from smartcam.fleet import FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetServer, MemoryBus
 from smartcam.fleet._inside import FleetOutlets
 from smartcam.outlets import Outlet, OutletEntry, OutletSettings
 from smartcam.registry import OUTLETS

@@ -149,7 +149,7 @@ async def _rtp(seconds: float) -> Way:
         far.reader(timeout=LIMIT) as reader,
         frames.RtpSender(source, f"127.0.0.1:{port}") as sender,
     ):
-        way = await _read(reader, seconds)
+        way = await _read(reader, seconds, sized=False)
         sent = sender.statistics()
         return Way(way.latencies, [sent.bytes // max(1, sent.frames)], way.cpu)
 
@@ -173,14 +173,16 @@ async def _shared() -> AsyncIterator[Any]:
                 yield camera
 
 
-async def _read(reader: frames.FrameReader, seconds: float) -> Way:
+async def _read(reader: frames.FrameReader, seconds: float, *, sized: bool = True) -> Way:
+    """Read the brightness; ``sized`` counts the bytes of each frame, as they came, too."""
     latencies: list[float] = []
     sizes: list[int] = []
     async with frames.Codecs(threads=1) as codecs:
         await anext(reader)
         begin, cpu = time.monotonic(), _cpu()
         async for frame in reader:
-            sizes.append(len(frame.data))
+            if sized:
+                sizes.append(len(frame.data))
             shown = await codecs.decode(frame) if frame.format.compressed else frame
             _note(latencies, shown.grey())
             if latencies and time.monotonic() > begin + seconds:

@@ -90,8 +90,8 @@ class Occupant(Protocol):
 
 @dataclass(slots=True)
 class _TakenPlace:
-    peer: str  # its address, without a port
-    since: float  # when it came, or last had a session
+    peer: str  # address of the peer, without a port
+    since: float  # time at which it came, or last had a session
     within: float  # seconds that it has from then on
     what: str  # is missing then
     deadline: float
@@ -264,7 +264,7 @@ class Acceptor(Generic[G]):
         self._adopting: set[asyncio.Task[Any]] = set()
         self._moving = 0  # connections that wait for a descriptor that becomes free
         self._scarce = False  # the last try has failed
-        self._timer: asyncio.TimerHandle | None = None  # of the next deadline
+        self._timer: asyncio.TimerHandle | None = None  # timer of the next deadline
         self.loop: asyncio.AbstractEventLoop | None = None  # while it is open
 
     # ------------------------------------------------------------------ the port

@@ -103,7 +103,7 @@ def numbers(value: Any, what: str, who: str) -> Any:
 
 
 def as_array(value: Any, what: str) -> Any:
-    """Return an array of whatever it is that came.
+    """Return an array of of whatever kind that came.
 
     Raises:
         ConfigurationError: the value is no array.

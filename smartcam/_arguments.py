@@ -5,7 +5,7 @@ may compare, hash and print as it likes. A value that cannot work is a
 :exc:`~smartcam.ConfigurationError` that says which argument it is, what was expected, and what
 came. Nothing is searched, sent or waited for.
 
-``who`` names whose argument it is, such as a camera; "" where the argument's name says it all.
+``who`` names whose argument it is, such as a camera; "" if the argument's name says it all.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ MAX_SECONDS = 1e9
 """Seconds that a time may have at most, about 31 years: more would overflow a loop's timer."""
 
 MAX_TEXT_LENGTH = 10_000
-"""Characters that a text may have at most, where no smaller bound is given."""
+"""Largest number of characters that a text may have, where no smaller bound is given."""
 
 MAX_DATA_BYTES = 1 << 30
-"""Bytes that a byte string may have at most; the largest payload that a client may accept."""
+"""Largest number of bytes that a byte string may have; the largest payload that a client may
+accept."""
 
 MAX_SHOWN_LENGTH = 80
-"""Characters of a wrong value that an error's text shows at most."""
+"""Largest number of characters of a wrong value that an error's text shows."""
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 """Largest application id that any dialect has a field for, 32 bits."""

@@ -1,4 +1,4 @@
-"""Import what the extras bring, where it is first used."""
+"""Import packages of the extras when they are first used."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BROKEN_OPENCV = "5.0.0"
 
 
 class Package(NamedTuple):
-    """A package that an extra brings: its name for users, the extra, and what mostly needs it."""
+    """A package of an extra: its name for users, the extra, and its usual purpose."""
 
     called: str
     extra: str
@@ -38,6 +38,7 @@ PACKAGES: Final = {
     "lz4": Package("lz4", "record", "recordings need"),
     "paho": Package("paho-mqtt", "mqtt", "outlets over MQTT need"),
     "prometheus_client": Package("prometheus-client", "operations", "metrics need"),
+    "regex": Package("regex", "inspection", "patterns of texts need"),
     "rosbags": Package("rosbags", "ros2", "messages of ROS need"),
     "ruamel": Package("ruamel.yaml", "inspection", "teaching needs"),
     "scipy": Package("SciPy", "calibration", "calibration needs"),
@@ -50,22 +51,23 @@ PACKAGES: Final = {
     "zstandard": Package("zstandard", "record", "recordings need"),
 }
 
-_LOADED: Final[dict[str, Any]] = {}  # whole; sys.modules has those that another thread is at, too
+# fully imported; sys.modules also has those that another thread is still importing
+_LOADED: Final[dict[str, Any]] = {}
 
 
 def load(name: str, use: str = "") -> Any:
-    """Return a module that an extra brings; untyped, which is why it is any.
+    """Return a module of an extra, as ``Any``, since it is untyped.
 
     Args:
         name: dotted name of the module.
-        use: what needs it, with its verb, for the error; "" for what mostly does.
+        use: purpose with its verb, for the error; "" for the usual one.
 
     Raises:
         MissingExtraError: the package is not installed, or it is OpenCV 5.0.0.
     """
     there = sys.modules.get(name)
     if there is not None and there is _LOADED.get(name):
-        return there  # import_module looks for longer than a small picture takes
+        return there  # import_module takes longer to look it up than a small picture takes
     try:
         module = importlib.import_module(name)
     except ImportError as exc:
@@ -83,7 +85,7 @@ def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
     Args:
         name: dotted name of the module.
         use: as for :func:`load`.
-        which: what the package must be, where not every version will do.
+        which: required version, if not every version will do.
     """
     called, extra, usual = PACKAGES[name.partition(".")[0]]
     wanted = f"an {called} {which}" if which else called
@@ -93,14 +95,14 @@ def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
 
 @contextlib.contextmanager
 def from_part(extra: str, use: str) -> Iterator[None]:
-    """Import what another distribution of smartcam brings, which may not be installed.
+    """Import from another distribution of smartcam, which may not be installed.
 
     Args:
         extra: the extra that brings the distribution.
-        use: what needs it, with its verb, for the error.
+        use: purpose with its verb, for the error.
 
     Raises:
-        MissingExtraError: a module of smartcam is not there.
+        MissingExtraError: a module of smartcam is not installed.
     """
     try:
         yield

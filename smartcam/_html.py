@@ -1,4 +1,4 @@
-"""Values as tables, for notebooks: what ``_repr_html_`` of the public values gives."""
+"""Format values as tables for notebooks, for ``_repr_html_`` of the public values."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Result
 
 MAX_ROWS = 100
-"""Rows that are shown; the number of those left out is told."""
+"""Largest number of rows that are shown; a line gives the number of the others."""
 
 
 def localizations_html(parts: Sequence[Localization]) -> str:
-    """Return a table of parts: millimetres and degrees."""
+    """Return a table of parts, in millimetres and degrees."""
     return _table(("part", "quality", "x mm", "y mm", "z mm", "angle deg"), map(_part, parts))
 
 
 def result_html(result: Result) -> str:
-    """Return a result's fields, with the parts as a table where its value is some."""
+    """Return a result's fields, with its parts as a table, if its value has parts."""
     value: Any = result.value
     shown = _is_parts(value)
     fields = {
@@ -54,7 +54,7 @@ def _is_records(value: Any) -> bool:
 
 
 def records_html(value: Any) -> str:
-    """Return a table of a record of a layout, or of several, with the units in its head."""
+    """Return a table of a record of a layout, or of several, with the units in its header."""
     records: Sequence[Any] = value if isinstance(value, list) else [value]
     kind: Any = type(records[0])
     units = kind._units  # noqa: SLF001 - of records, as their fields

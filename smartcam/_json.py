@@ -5,6 +5,7 @@ What is not of the types that a client makes goes through :func:`smartcam.models
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import sys
@@ -28,6 +29,12 @@ _EPOCH = datetime.fromtimestamp(0, UTC)
 _PLAIN = frozenset({str, int, float, bool, type(None)})
 _FLOAT = frozenset({float})
 _INTEGERS = frozenset({int})
+_FORMS = {"i": "%d", "u": "%d", "f": "%r", "S": "%s"}
+"""Forms of the values in a table's columns, by the columns' kinds."""
+
+MAX_FLOAT_BYTES = 8
+"""Bytes of a float that numpy gives as one of Python's."""
+
 _COLUMNS = frozenset("iufbS")
 """Kinds of a table's columns whose values numpy gives as Python's."""
 
@@ -97,14 +104,61 @@ def _container_text(value: object) -> str:
             return text
     elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
         return f"{{{','.join([f'{_quoted(str(name))}:{one}' for name, one in value.items()])}}}"
+    elif _is_table(value):
+        text = _table_text(value)
+        if text is not None:
+            return text
     try:
         return _encode_finite(plain(value))
     except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not
         return _encode(jsonable(value))
 
 
+def _is_table(value: object) -> bool:
+    # another thread may be importing numpy just now
+    return type(value) is getattr(sys.modules.get("numpy"), "ndarray", None)
+
+
+def _table_text(table: Any) -> str | None:
+    """Return the text of a table's rows; None where it is to be made in another way."""
+    row = _row_form(table.dtype)
+    if table.ndim != 1 or row is None:
+        return None
+    form, texts, numbers = row
+    rows: list[tuple[Any, ...]] = table.tolist()
+    if numbers and not math.isfinite(sum([one[place] for one in rows for place in numbers])):
+        return None  # a sum is not finite where one of them is not
+    if texts:
+        rows = [
+            tuple(
+                _quoted(_text_or_hex(field)) if place in texts else field
+                for place, field in enumerate(one)
+            )
+            for one in rows
+        ]
+    return f"[{','.join([form % one for one in rows])}]"
+
+
+@functools.lru_cache(maxsize=256)
+def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
+    """Return the form of a row, the places of its texts and of its floats; None for other ones."""
+    kinds = [dtype.fields[name][0] for name in dtype.names or ()]
+    if not kinds or any(
+        one.kind not in _FORMS or (one.kind == "f" and one.itemsize > MAX_FLOAT_BYTES)
+        for one in kinds
+    ):
+        return None
+    fields = zip(dtype.names, kinds, strict=True)
+    form = ",".join(
+        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[one.kind]}" for name, one in fields]
+    )
+    texts = frozenset(place for place, one in enumerate(kinds) if one.kind == "S")
+    floats = tuple(place for place, one in enumerate(kinds) if one.kind == "f")
+    return f"{{{form}}}", texts, floats
+
+
 def _parts_text(value: list[object]) -> str | None:
-    """Return the text of localizations; None where it is to be made in another way."""
+    """Return the text of localizations; None if it is to be made in another way."""
     texts: list[str] = []
     header: object = None
     header_text = ""
@@ -143,8 +197,7 @@ def plain(value: Any) -> Any:
         if _PLAIN.issuperset(map(type, fields.values())):
             return fields
         return {name: plain(one) for name, one in fields.items()}
-    # another thread may be importing numpy just now
-    if kind is getattr(sys.modules.get("numpy"), "ndarray", None):
+    if _is_table(value):
         rows = _rows(value)
         if rows is not None:
             return rows
@@ -152,7 +205,7 @@ def plain(value: Any) -> Any:
 
 
 def _rows(table: Any) -> Any:
-    """Return a table's rows; None where they are not simple."""
+    """Return a table's rows; None if they are not simple."""
     names, fields = table.dtype.names, table.dtype.fields
     kinds = [fields[name][0].kind for name in names or ()]
     if table.ndim != 1 or not kinds or not _COLUMNS.issuperset(kinds):

@@ -24,7 +24,7 @@ def try_lock(descriptor: int) -> bool | None:
     """Lock an open file, whose place does not change.
 
     Returns:
-        Whether it is ours now, not another one's; None where the file system knows no locks.
+        Whether it is ours now, not another one's; None if the file system knows no locks.
     """
     try:
         if sys.platform == "win32":

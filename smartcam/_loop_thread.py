@@ -130,7 +130,7 @@ class _ThreadCall:
         """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
 
         Args:
-            timeout: seconds; None where what is called has deadlines of its own.
+            timeout: seconds; None if what is called has deadlines of its own.
         """
         try:
             self._mailbox.post(self._begin)
@@ -286,7 +286,7 @@ class LoopThread:
 
         Args:
             function: function that returns the coroutine.
-            timeout: seconds; None where the coroutine has deadlines of its own.
+            timeout: seconds; None if the coroutine has deadlines of its own.
 
         Raises:
             ConfigurationError: the thread does not run.

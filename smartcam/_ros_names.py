@@ -10,7 +10,7 @@ import re
 from smartcam.exceptions import ConfigurationError
 
 MAX_NAME_CHARACTERS = 200
-"""Characters of a name."""
+"""Largest number of characters of a name."""
 
 _WORD = r"(?!.*__)[A-Za-z_][A-Za-z0-9_]*"
 _NODE = re.compile(_WORD)

@@ -21,7 +21,8 @@ MAX_KNOWN_WORDS = 10_000
 """Known words that are compared; a word that a file or a camera says may be one of many more."""
 
 MAX_PARTS = 8
-"""Parts of a word that are compared each for itself; what follows them counts as unexplained."""
+"""Largest number of parts of a word that are compared each for itself; what follows them counts as
+unexplained."""
 
 MAX_CANDIDATES = 20
 """Known words, alike by their letters, whose edits are counted."""
@@ -30,7 +31,8 @@ LETTERS_PER_EDIT = 3
 """Letters of a word for each edit that it may be away: a typo in three letters, two in six."""
 
 MIN_PREFIX_LETTERS = 3
-"""Letters of a part that may stand for a longer one which begins with it, as ``int`` does."""
+"""Least number of letters of a part that may stand for a longer one which begins with it, as
+``int`` does."""
 
 MIN_EXPLAINED_SHARE = 0.6
 """Share of a word's letters that the parts of a known one have to explain."""
@@ -46,7 +48,7 @@ MAX_NAMED_WORDS = 30
 
 
 def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | None = None) -> str:
-    """Return the end of an error text, with the known word that is closest; empty where none is.
+    """Return the end of an error text, with the known word that is closest; empty if none is.
 
     ``meant``: known words by what others call them, such as ``real32`` for ``float``.
     """
@@ -55,7 +57,7 @@ def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | Non
 
 
 def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | None:
-    """Return the known word that was probably meant, None where none is close.
+    """Return the known word that was probably meant, None if none is close.
 
     ``least``: score, up to 1, below which a known word is not close.
 
@@ -130,7 +132,7 @@ def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
 
 
 def _parts(word: str) -> list[str]:
-    """Return the parts of a word in small letters: ``maxQueue_bytes`` has three."""
+    """Return the parts of a word in lower case: ``maxQueue_bytes`` has three."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", word)
     return [part.lower() for part in re.split(r"[\W_]+", spaced) if part]
 

@@ -33,7 +33,7 @@ MAX_DELAY: Final = 3600.0
 
 MAX_QUEUED_RESULTS: Final = 10_000
 DEFAULT_QUEUED_RESULTS: Final = 100
-"""Results that wait for a delay to pass at most, where the request gives no number."""
+"""Largest number of results that wait for a delay to pass, where the request gives no number."""
 
 _KEYWORDS: Final = {"localizations": "localizations", "50bytestrings": "strings50"}
 
@@ -106,8 +106,8 @@ class ThesisFace(Protocol):
     Attributes:
         name: the camera's name.
         address: where the camera itself is.
-        application: the id of the active application; None where that is not known.
-        reading: how its results are read; None where nobody knows what they hold.
+        application: the id of the active application; None if that is not known.
+        reading: how its results are read; None if nobody knows what they hold.
         stopped: whether SmartcameraStop has closed the camera for these services.
     """
 
@@ -130,7 +130,7 @@ class ThesisFace(Protocol):
     def reading(self) -> Interpretation | None: ...
 
     def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError where results cannot be read by ``spec``."""
+        """Raise ConfigurationError if results cannot be read by ``spec``."""
 
     def read_as(self, spec: str | None) -> None:
         """Read results by ``spec`` from now on; None: as the settings say."""
@@ -140,7 +140,7 @@ class ThesisFace(Protocol):
         ...
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError where there can be no such topic."""
+        """Raise ConfigurationError if there can be no such topic."""
 
     def publish_status(self, topic: str) -> dict[str, Any]:
         """Publish the status on this topic, and no longer on the one before."""
@@ -316,7 +316,7 @@ def _with_poses(reading: Interpretation, application: int | None) -> Any:
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:
-    """Return the interpreter of an application; None where the thesis' own fields are read."""
+    """Return the interpreter of an application; None if the thesis' own fields are read."""
     one = spec.get(application) if isinstance(spec, dict) else spec
     return None if isinstance(one, str) else one
 

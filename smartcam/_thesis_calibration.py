@@ -28,7 +28,7 @@ STEP_TIMEOUT: Final = 150.0
 """Seconds for a step where the request says none: a calculation has 120, a picture 60."""
 
 MAX_INPUTS: Final = 100
-"""Answers of one kind that a request may have; a step asks for some dozen."""
+"""Largest number of answers of one kind that a request may have; a step asks for some dozen."""
 
 MAX_COORDINATE: Final = 1e9
 """Coordinate of a pose that is transformed, in the calibration's unit, either way from 0."""
@@ -90,7 +90,7 @@ class RequestHeader(BaseModel):
 
     @property
     def utc(self) -> float | None:
-        """The time in seconds since 1970; None where the header says none.
+        """The time in seconds since 1970; None if the header says none.
 
         Raises:
             ConfigurationError: the stamp is no time.
@@ -123,7 +123,7 @@ class CalibrationFace(Protocol):
 
     Attributes:
         name: the camera's name.
-        calibrations: calibrations of the camera; None where nobody has said in which folder.
+        calibrations: calibrations of the camera; None if nobody has said in which folder.
         camera: the camera, as it is reached for one call of so many seconds.
     """
 
@@ -222,8 +222,8 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
     """Return the specification that a camera's localizations are read by, and their unit.
 
     Args:
-        reading: how the results of the camera are read; None where nobody knows what they hold.
-        application: the active application; None where that is not known.
+        reading: how the results of the camera are read; None if nobody knows what they hold.
+        application: the active application; None if that is not known.
     """
     own = None if reading is None else reading.interpreter(application)
     if own is None or without_poses(own) is not None:

@@ -57,7 +57,7 @@ def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
 def keep_backup(path: Path, count: int) -> None:
     """Keep a file as ``NAME.1``, the one before as ``NAME.2``, up to ``count``; it stays there.
 
-    Nothing is done where it is not there.
+    Nothing is done where it does not exist.
 
     Raises:
         FolderInUseError, OSError: as :func:`replace_file`.

@@ -68,9 +68,14 @@ listens there.
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
+ROOM_TIMEOUT = 0.001
+"""Seconds that the engine waits for room before it drops a message that may be dropped. It waits
+once: until something goes out to the same end, it drops further ones of that priority at once."""
+
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes that wait for the event loop, as many of patient things, or for the thread that says what
-is long; what comes beyond is dropped, and results are asked for again later."""
+"""Largest number of bytes that wait for the event loop, as many of patient things, or for the
+thread that says what is long; what comes beyond is dropped, and results are asked for again
+later."""
 
 QUERY_BYTES = 256
 """Bytes that a query counts beside its payload."""
@@ -79,7 +84,7 @@ REPLY_THREADS = 4
 """Threads that answer queries; a client that does not read its answer blocks one of them."""
 
 MAX_WAITING_QUERIES = 4096
-"""Queries that may wait for an answering thread; further ones get no answer."""
+"""Largest number of queries that may wait for an answering thread; further ones get no answer."""
 
 TURN = 64
 """Callbacks that run in one turn of the event loop."""
@@ -101,7 +106,7 @@ ROUTER_TIMEOUT = 3.0
 NOT_ZENOH = "nothing there speaks Zenoh"
 
 MAX_DECLARED_AT_ONCE = 32
-"""Declarations made in one turn of the event loop at most."""
+"""Largest number of declarations made in one turn of the event loop."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
 
@@ -148,7 +153,9 @@ class BusLink:
             "scouting/delay": 0,
             "transport/shared_memory/enabled": False,
             "transport/link/tx/lease": int(1e3 * LEASE_TIME),
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": int(
+                1e6 * ROOM_TIMEOUT
+            ),
             "routing/interests/timeout": int(1e3 * MAX_LISTING_TIME),
             # of each later try, too: of one that began while a cable was cut the system repeats
             # the packets ever more seldom, so who stays with it for long is back that much later
@@ -266,7 +273,7 @@ class ZenohSession:
         self._link, self._more, self._what = link, dict(more or {}), what
         self._zenoh = engine()
         self._session: Any = None
-        self._declared: dict[ZenohDeclared, None] = {}  # in their order
+        self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
@@ -278,7 +285,7 @@ class ZenohSession:
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         self._reopening = False
-        self._look: asyncio.TimerHandle | None = None  # for connections that linger
+        self._look: asyncio.TimerHandle | None = None  # timer for connections that linger
 
     # ------------------------------------------------------------------ life
 
@@ -598,7 +605,7 @@ class _LoopBell:
 
     @classmethod
     def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
-        """Return a bell; None where the system or the loop has nothing for it."""
+        """Return a bell; None if the system or the loop has nothing for it."""
         if sys.platform != "linux":
             return None
         with contextlib.suppress(NotImplementedError, OSError):
@@ -712,9 +719,38 @@ def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     session.close()
 
 
-def direct(call: Callable[[Any], None]) -> Any:
-    """Have a callback called in the engine's own thread: by default each has a thread."""
-    return engine().handlers.Callback(call, indirect=False)
+class _EngineThread(threading.local):
+    """A thread of the engine that calls back into Python."""
+
+    known: bool = False
+
+
+_thread = _EngineThread()
+
+
+def keep_thread() -> None:
+    """Have Python keep its state of this thread of the engine; for the first line of a callback.
+
+    The binding enters Python anew for each callback, and what Python then makes and frees for a
+    thread that is not its own costs a third of a message. A thread that has entered once more than
+    it leaves keeps that until it ends; the engine has a few threads, which end with the process.
+    """
+    if not _thread.known:
+        _thread.known = True
+        ctypes.pythonapi.PyGILState_Ensure()
+
+
+def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
+    """Have a callback called in the engine's own thread: by default each has a thread.
+
+    ``ended`` is called when nothing more comes.
+    """
+
+    def called(it: Any) -> None:
+        keep_thread()
+        call(it)
+
+    return engine().handlers.Callback(called, ended, indirect=False)
 
 
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:

@@ -1,4 +1,4 @@
-"""The delays between attempts to reach a lost camera again, as a value."""
+"""Define the delays between attempts to reach a lost camera again."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 __all__ = ["Backoff"]
 
 MAX_FACTOR = sys.float_info.max
-"""Largest factor between two delays: the longest delay follows the first at once."""
+"""Largest factor between two delays: with it, the longest delay follows the first at once."""
 
 
 def is_transient(error: BaseException) -> bool:
     """Return True if another try may succeed.
 
-    What happens to links does pass: nothing listens, no way to the host, a name that does not
-    resolve while the name server is away, silence, a peer that breaks the protocol. An error in
-    what the user gave or in a plug-in does not, nor a camera that refuses the session: a wrong
+    Faults of links are transient: nothing listens, no route to the host, a name that does not
+    resolve while the name server is away, silence, a peer that breaks the protocol. Errors in the
+    user's options or in a plug-in are not, nor is a camera that refuses the session: a wrong
     password stays wrong, and many tries may lock the account.
     """
     refused = isinstance(error.__cause__, CommandRejectedError)
@@ -51,12 +51,13 @@ class Backoff:
 
     Attributes:
         initial: the first delay, seconds. A link that was cut is often back at once.
-        factor: how much longer each delay is than the one before, until ``maximum``.
+        factor: ratio of each delay to the one before, until ``maximum``.
         maximum: the longest delay, seconds. A rebooting camera is away for about 30 s.
         jitter: share of each delay that is left to chance, so that many clients do not come all at
             the same instant: 0 (none) to 1.
-        attempts: tries until it is given up; None for never.
-        transient: says of an error whether trying again may help; where not, it is given up.
+        attempts: number of tries before giving up; None for no limit.
+        transient: function that returns whether another try may help after an error; otherwise the
+            client gives up.
 
     Raises:
         ConfigurationError: a value cannot work.
@@ -84,21 +85,22 @@ class Backoff:
         if self.attempts is not None:
             checked["attempts"] = check_integer(self.attempts, "attempts", 1, who=who)
         for name, value in checked.items():
-            object.__setattr__(self, name, value)  # the plain value, of a class that is frozen
+            object.__setattr__(self, name, value)  # plain value, since the class is frozen
 
     def delays(
         self, *, short_lived: int = 0, chance: random.Random | None = None
     ) -> Iterator[float]:
-        """Give the delay before each try, seconds; ends after ``attempts``.
+        """Yield the delay before each try, seconds; end after ``attempts``.
 
         Args:
-            short_lived: sessions in a row that were lost soon: the delays begin so many steps
-                later, or a link that breaks as soon as it is made would be made without a pause.
-            chance: where the jitter comes from; seed it for the same delays again.
+            short_lived: number of sessions in a row that were lost soon. The delays begin that many
+                steps later; otherwise a link that breaks at once would be opened again without a
+                pause.
+            chance: random source of the jitter; seed it to get the same delays again.
         """
         check_integer(short_lived, "short_lived", 0, who="Backoff")
         if chance is None:
-            from random import Random  # which takes longer than all of this module
+            from random import Random  # imported late, since it takes longer than this whole module
 
             chance = Random()  # noqa: S311 - spreads load, keeps no secret
         delay, tried = self.initial, 0

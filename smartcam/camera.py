@@ -66,7 +66,7 @@ DEFAULT_MAX_QUEUE_BYTES = 1 << 26
 it bounds nothing but larger ones; what is made of them may take several times as much."""
 
 MAX_INTERPRETATIONS = 32
-"""Texts given as ``interpret_as`` whose interpreters a client keeps."""
+"""Largest number of texts given as ``interpret_as`` whose interpreters a client keeps."""
 
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
@@ -90,7 +90,8 @@ MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
 """Largest number of a run that a request has room for, 32 bits."""
 
 MAX_RESULTS_PER_TRIGGER = 10_000
-"""Results of one trigger that may be asked for: a camera has a few "send results" tools."""
+"""Largest number of results of one trigger that may be asked for: a camera has a few "send results"
+tools."""
 
 
 class FrameRequest(NamedTuple):
@@ -111,7 +112,7 @@ class StreamRequest(NamedTuple):
     Attributes:
         encoding: name of the encoding.
         quality: quality of JPEGs; None for that of the agent.
-        bitrate: bits a second; None for no limit.
+        bitrate: bits per second; None for no limit.
         latency: seconds; None for no limit.
         decode: whether encoded frames are decoded here.
         timeout: seconds that an iteration waits; None for no limit.
@@ -142,7 +143,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         self.settings: CameraSettings = settings
         self._observers = Observers(observers)
         self._observed = bool(self._observers)
-        self._interpretations: dict[str, Interpretation] = {}  # by their text
+        # interpretations by the text that was given for them
+        self._interpretations: dict[str, Interpretation] = {}
         self._counters = ClientCounters()
         self._listeners = self._make_listeners()
         self._default_spec: object = settings.interpret_as
@@ -171,7 +173,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     def _over(self) -> tuple[SmartCamError | None] | None:
-        """Return the reason why the camera's streams ended, None where more items may come."""
+        """Return the reason why the camera's streams ended, None if more items may come."""
 
     @abc.abstractmethod
     async def _trigger(
@@ -804,12 +806,12 @@ class Camera(abc.ABC, Generic[ValueT]):
                 without loss. They stay so until somebody asks for pixels. ``h264`` is decoded here,
                 and only whole pictures are given.
             quality: quality of JPEG, 1 to 100.
-            bitrate: bits a second that JPEGs are held to, by quality first and frame rate then
+            bitrate: bits per second that JPEGs are held to, by quality first and frame rate then
                 (each frame's ``rate`` says how); of H.264 what its encoder keeps to.
             latency: seconds from a JPEG's capture to its arrival that are held the same way.
             decode: False: of H.264 the encoded frames. Who skips one has no picture until the next
                 key frame.
-            timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+            timeout: seconds that an iteration waits for a frame; None: without limit.
 
         Raises:
             UnsupportedError: the camera has none.
@@ -1045,7 +1047,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             timeout: seconds for the answer.
 
         Returns:
-            The answer's body, None where none is waited for: returned once written.
+            The answer's body, None if none is waited for: returned once written.
 
         Raises:
             LocalProtocolError: Connect and Disconnect (sessions are the client's own).

@@ -100,27 +100,27 @@ __all__ = [
     "WrongApplicationError",
 ]
 
-MAX_EXCERPT = 64
-"""Bytes of a peer's data that an error text or a log line shows at most."""
+MAX_EXCERPT_BYTES = 64
+"""Largest number of bytes of a peer's data that an error text or a log line shows."""
 
 
-MAX_TEXT = 10_000
-"""Characters of an error's text: a net under texts that quote what somebody gave, each of which
-shows a part of it only."""
+MAX_TEXT_CHARACTERS = 10_000
+"""Largest number of characters of an error's text: a net under texts that quote what somebody gave,
+each of which shows a part of it only."""
 
 _LEFT_OUT = " ... "
 
 
 def hex_excerpt(data: bytes | bytearray | memoryview) -> str:
     """Return ``data`` as hex, cut after 64 bytes."""
-    shown = bytes(data[:MAX_EXCERPT]).hex(" ")
-    return f"{shown} ... ({len(data)} bytes)" if len(data) > MAX_EXCERPT else shown
+    shown = bytes(data[:MAX_EXCERPT_BYTES]).hex(" ")
+    return f"{shown} ... ({len(data)} bytes)" if len(data) > MAX_EXCERPT_BYTES else shown
 
 
 def _cut(text: object) -> object:
-    if not isinstance(text, str) or str.__len__(text) <= MAX_TEXT:
+    if not isinstance(text, str) or str.__len__(text) <= MAX_TEXT_CHARACTERS:
         return text
-    half = MAX_TEXT // 2 - len(_LEFT_OUT) // 2 - 1
+    half = MAX_TEXT_CHARACTERS // 2 - len(_LEFT_OUT) // 2 - 1
     plain = str.__str__(text)
     return f"{plain[:half]}{_LEFT_OUT}{plain[-half:]}"
 
@@ -131,7 +131,7 @@ class SmartCamError(Exception):
     Attributes of the subclasses are keyword arguments with defaults, which is what lets
     ``pickle`` rebuild them from the text and then restore the attributes.
 
-    A text has :data:`MAX_TEXT` characters at most; what is longer is cut in its middle.
+    A text has :data:`MAX_TEXT_CHARACTERS` characters at most; what is longer is cut in its middle.
     """
 
     def __init__(self, *args: object) -> None:
@@ -453,7 +453,7 @@ class RemoteProtocolError(ProtocolError):
     ) -> None:
         super().__init__(message)
         self.offset = offset
-        self.data: bytes = bytes(data[:MAX_EXCERPT])
+        self.data: bytes = bytes(data[:MAX_EXCERPT_BYTES])
 
 
 class FrameError(RemoteProtocolError):
@@ -468,7 +468,7 @@ class InterpretationError(SmartCamError, ValueError):
     """A result container does not fit what the user said about it; the link stays up.
 
     Attributes:
-        field: name of the field, or "" where the whole container is meant.
+        field: name of the field, or "" if the whole container is meant.
         offset: byte offset in the container's data.
         expected: what was expected there.
         got: what came.

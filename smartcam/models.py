@@ -132,10 +132,10 @@ def as_status(word: int) -> Status:
 
 
 MAX_RAW_BYTES_IN_REPR = 16
-"""Bytes of a container that a result's repr shows."""
+"""Largest number of bytes of a container that a result's repr shows."""
 
 MAX_CHARACTERS_IN_REPR = 300
-"""Characters of a value that a result's repr shows."""
+"""Largest number of characters of a value that a result's repr shows."""
 
 
 def _cut(value: object) -> str:
@@ -256,9 +256,12 @@ class _EstimatedPose(Pose):
         known: PoseSigma | None = self.__dict__.get("sigma")
         return known
 
+    def _asdict(self) -> dict[str, Any]:
+        """Return the fields by name, with the errors: JSON has them, too."""
+        return {**super()._asdict(), "sigma": self.sigma}
+
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={one!r}" for name, one in self._asdict().items())
-        return f"Pose({values}, sigma={self.sigma!r})"
+        return f"Pose({', '.join(f'{name}={one!r}' for name, one in self._asdict().items())})"
 
 
 class Localization(NamedTuple):
@@ -318,7 +321,7 @@ class Result(NamedTuple, Generic[ValueT]):
         triggered_at: when the trigger was sent, UTC; None for a result nobody had triggered.
         received_at: when its last byte arrived, UTC.
         latency: seconds from trigger to arrival (monotonic clock); None like ``triggered_at``.
-        raw: the container's bytes behind the application id.
+        raw: the container's bytes after the application id.
         value: what the interpreter made of them.
     """
 

@@ -13,10 +13,12 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.exceptions import SmartCamError
-    from smartcam.frames import Frame
+    from smartcam.frames import Frame as Picture
     from smartcam.models import CameraEvent, Result
+    from smartcam.protocols import Dialect, Frame
+    from smartcam.protocols.messages import Sender
 
-__all__ = ["Observer", "TraceEntry"]
+__all__ = ["Observer", "RawFrame", "TraceEntry"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -33,7 +35,7 @@ class TraceEntry(NamedTuple):
             unfinished frame when the link ended.
         message_id: id on the wire, None for broken bytes and where there are no such ids.
         message: name of the message, or the error's text for broken bytes.
-        fields: decoded body, None where it cannot be decoded.
+        fields: decoded body, None if it cannot be decoded.
         hex: the bytes.
     """
 
@@ -46,6 +48,46 @@ class TraceEntry(NamedTuple):
     hex: str
 
 
+class RawFrame:
+    """One frame as it went over the wire, which nobody has decoded yet.
+
+    Args:
+        at: time, UTC.
+        camera: name of the camera.
+        dialect: dialect that the frame is decoded in.
+        sender: side that sent the frame.
+        frame: the frame; bytes that make none are an entry already.
+    """
+
+    __slots__ = ("at", "camera", "dialect", "frame", "sender")
+
+    def __init__(
+        self,
+        at: datetime,
+        camera: str,
+        dialect: Dialect,
+        sender: Sender,
+        frame: Frame | TraceEntry,
+    ) -> None:
+        self.at, self.camera = at, camera
+        self.dialect, self.sender, self.frame = dialect, sender, frame
+
+    @property
+    def size(self) -> int:
+        """Bytes of the frame's body."""
+        frame = self.frame
+        return len(frame.hex) // 2 if isinstance(frame, TraceEntry) else len(frame.payload)
+
+    def entry(self) -> TraceEntry:
+        """Return the frame decoded; in any thread."""
+        frame = self.frame
+        if isinstance(frame, TraceEntry):
+            return frame
+        message_id, message, fields, data = self.dialect.spell(self.sender, frame)
+        direction = ">" if self.sender.value == "client" else "<"
+        return TraceEntry(self.at, self.camera, direction, message_id, message, fields, data.hex())
+
+
 class Observer:
     """Sees what a client sees; override what is of interest.
 
@@ -56,8 +98,16 @@ class Observer:
     def on_frame(self, entry: TraceEntry) -> None:
         """See a frame that went over the wire, or bytes that make no frame.
 
-        Frames are decoded for this only where an observer overrides it.
+        Frames are decoded for this only where an observer overrides it, and not ``on_raw_frame``.
         """
+
+    def on_raw_frame(self, frame: RawFrame) -> None:
+        """See a frame as ``on_frame`` does, before it is decoded.
+
+        An observer that overrides it gets every frame here, and ``on_frame`` is not called unless
+        a subclass overrides that again. ``frame.entry()`` decodes it, which another thread may do.
+        """
+        self.on_frame(frame.entry())
 
     def on_state(self, event: CameraEvent) -> None:
         """See what happened to the camera: the items of ``camera.events()``, in the same order.
@@ -86,7 +136,7 @@ class Observer:
         for result in results:
             self.on_result(result)
 
-    def on_picture(self, result: Result, frame: Frame) -> None:
+    def on_picture(self, result: Result, frame: Picture) -> None:
         """See the picture that a result was made of, right before the result.
 
         Cameras that have it call this: software cameras.
@@ -99,7 +149,7 @@ class Observer:
             camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
                link, a reconnect that failed.
-            triggered_at: when ``trigger()`` was called, UTC; None where the error ended no trigger.
+            triggered_at: when ``trigger()`` was called, UTC; None if the error ended no trigger.
         """
 
 
@@ -121,7 +171,7 @@ class Observers:
             if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
                 raise wrong_argument("observers", "objects of classes of Observer", one)
         self._on_state = self._overriding("on_state")
-        self._on_result = tuple(self._looking_at_results())
+        self._on_result = tuple(self._looking_at("on_results", "on_result"))
         self._on_picture = self._overriding("on_picture")
         self.see_states: bool = bool(self._on_state)
         self.see_results: bool = bool(self._on_result)
@@ -131,14 +181,20 @@ class Observers:
         return bool(self._all)
 
     @property
-    def trace(self) -> Callable[[TraceEntry], None] | None:
-        """Function to call with every frame; None where no observer looks at frames."""
-        hooks = self._overriding("on_frame")
+    def trace(self) -> Callable[[RawFrame], None] | None:
+        """Function to call with every frame; None if no observer looks at frames."""
+        hooks = tuple(self._looking_at("on_raw_frame", "on_frame"))
         if not hooks:
             return None
 
-        def on_frame(entry: TraceEntry) -> None:
-            for hook in hooks:
+        def on_frame(frame: RawFrame) -> None:
+            entry: TraceEntry | None = None
+            for hook, raw in hooks:
+                if raw:
+                    self._call(hook, frame)
+                    continue
+                if entry is None:
+                    entry = frame.entry()
                 self._call(hook, entry)
 
         return on_frame
@@ -162,7 +218,7 @@ class Observers:
         for hook, _ in self._on_result:
             self._call(hook, results)
 
-    def picture(self, result: Result, frame: Frame) -> None:
+    def picture(self, result: Result, frame: Picture) -> None:
         """Tell all of the picture that a result was made of."""
         for hook in self._on_picture:
             self._call(hook, result, frame)
@@ -179,13 +235,18 @@ class Observers:
         hooks = [_own_hook(one, name) for one in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
-    def _looking_at_results(self) -> Iterator[tuple[Callable[..., None], bool]]:
-        """Yield the hook of each observer that looks at results, and whether it takes several."""
+    def _looking_at(self, first: str, other: str) -> Iterator[tuple[Callable[..., None], bool]]:
+        """Yield the hook of each observer that has one of two, and whether it is the first one.
+
+        Of both counts the one that is overridden last; the first one, where a class has both.
+        """
         for one in self._all:
-            together, each = _own_hook(one, "on_results"), _own_hook(one, "on_result")
-            hook = together or each
-            if hook is not None:
-                yield hook, together is not None
+            hook, second = _own_hook(one, first), _own_hook(one, other)
+            if hook is None or (second is not None and _depth(one, other) < _depth(one, first)):
+                if second is not None:
+                    yield second, False
+            else:
+                yield hook, True
 
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -197,6 +258,14 @@ class Observers:
 
 
 def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:
-    """Return a hook of an observer that is its own; None where it does nothing."""
+    """Return a hook of an observer that is its own; None if it does nothing."""
     hook: Callable[..., None] | None = getattr(observer, name, None)
     return None if getattr(hook, "__func__", None) is getattr(Observer, name) else hook
+
+
+def _depth(observer: Observer, name: str) -> int:
+    """Return the place of a hook in the order of an observer's classes; -1 for its own object."""
+    if name in getattr(observer, "__dict__", ()):
+        return -1
+    classes = type(observer).__mro__
+    return next((at for at, one in enumerate(classes) if name in vars(one)), len(classes))

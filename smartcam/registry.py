@@ -171,7 +171,7 @@ def _points(group: str) -> Iterator[EntryPoint]:
 
 
 def _said(found: Distribution) -> str | None:
-    """Return the text of a distribution's entry points, None where it cannot be told like this."""
+    """Return the text of a distribution's entry points, None if it cannot be told like this."""
     try:
         return found.read_text("entry_points.txt") or ""
     except Exception:  # noqa: BLE001 - anything may stand in other people's files
@@ -192,7 +192,7 @@ def _key(found: Distribution) -> str:
 
 
 def _name_of(found: Distribution) -> str:
-    """Return a distribution's name; "" where its metadata cannot be read."""
+    """Return a distribution's name; "" if its metadata cannot be read."""
     try:
         name: str | None = found.metadata["Name"]
     except Exception:  # noqa: BLE001 - anything may stand in other people's files

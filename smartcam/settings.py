@@ -54,8 +54,8 @@ class Address(NamedTuple):
         port: port of the camera.
         dialect: pinned dialect, None to find it out.
         quirks: pinned deviations from the dialect.
-        parameters: what else the URL says, as the protocol understands it: names and values. They
-            include ``user`` and ``password`` where the protocol has a login.
+        parameters: other parts of the URL by name, which the protocol interprets. They include
+            ``user`` and ``password`` if the protocol has a login.
         path: part of the URL behind the host: a camera's name in a fleet.
     """
 
@@ -123,7 +123,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         parts = urlsplit(full)
         port = parts.port if parts.port is not None else protocol.default_port
     except ValueError as exc:
-        if shown != url and "'" in str(exc):  # it quotes the URL, and so the password
+        if shown != url and "'" in str(exc):  # its text quotes the URL, and so the password
             raise ConfigurationError(
                 f"camera address {shown!r} is no URL; in a password each of / ? # [ ] stands as "
                 "%2F %3F %23 %5B %5D"
@@ -258,13 +258,13 @@ def known_protocols() -> Iterator[Protocol]:
         except PluginError:
             if info.origin == "built-in":
                 raise
-            continue  # a broken plug-in costs only its own name
-        if hasattr(protocol, "schemes"):  # so does one that gives something else
+            continue  # a broken plug-in is only left out
+        if hasattr(protocol, "schemes"):  # so is one that provides something else
             yield protocol
 
 
 class OtherOptions(TypedDict, total=False):
-    """The options that ``connect()`` takes, but for what says how to read results."""
+    """The options of ``connect()``, except for those that say how to read results."""
 
     name: str
     application: int | str | None

@@ -88,7 +88,7 @@ class Queue(Generic[T]):
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
         self._bytes = 0  # of all parcels, of which some may be of items that are gone
         self._missed = 0
-        self.since: float = -math.inf  # when it subscribed, on the clock of what it is offered
+        self.since: float = -math.inf  # time of the subscription, on the clock of the items
         self._evicted = 0  # those dropped that were queued before: only these have numbers
 
     @property
@@ -356,11 +356,11 @@ class Subscribers(Generic[T]):
     __slots__ = ("_in_order", "horizon", "references")
 
     def __init__(self) -> None:
-        # what is offered now is as old as this; who subscribed later is passed over
+        # age of the items offered now; later subscribers do not get them
         self.horizon: float = math.inf
-        # empty where nobody is subscribed: looked at for every message
+        # empty if nobody is subscribed: looked at for every message
         self.references: dict[weakref.ref[Queue[T]], None] = {}
-        # the same to go through while some leave; None where it has to be made anew
+        # copy to iterate over while some leave; None if it must be made again
         self._in_order: list[weakref.ref[Queue[T]]] | None = None
 
     def add(self, queue: Queue[T]) -> None:

@@ -8,9 +8,17 @@ from typing import Any
 from smartcam.models import Status
 from smartcam.protocols import BVS, FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
-from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
+
+THESIS, B16, BID = (BVS.dialects[name] for name in ("thesis", "b16", "bid"))
+
+MESSAGES = HANDBOOK.table
+"""Every message of the dialects with a magic number."""
+
+CODES = BID.codes
+"""The result codes that the documents have."""
+
+TRANSITIONS = Machine.transitions
 
 CODE, NO_ID, BIG_ENDIAN_NUMBER = (
     B16.with_quirks([name]) for name in ("code", "no_id", "big_endian_number")

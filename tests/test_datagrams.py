@@ -6,7 +6,7 @@ import asyncio
 import sys
 from typing import Any
 
-from smartcam._datagrams import LARGEST_DATAGRAM, read_no_more_than_needed
+from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed
 from smartcam.emulator import Application, EmulatedCamera
 from tests.client.clientkit import emulated
 from tests.emulator.camera_wire import UdpClient, greet
@@ -40,7 +40,7 @@ async def test_endpoint_reads_the_largest_datagram_whole() -> None:
     loop = asyncio.get_running_loop()
     transport, keeper = await loop.create_datagram_endpoint(Keeper, local_addr=("127.0.0.1", 0))
     try:
-        assert getattr(transport, "max_size", LARGEST_DATAGRAM) == LARGEST_DATAGRAM
+        assert getattr(transport, "max_size", MAX_DATAGRAM_BYTES) == MAX_DATAGRAM_BYTES
         address = transport.get_extra_info("sockname")
         for size in (LARGEST, 1, LARGEST):
             transport.sendto(b"\7" * size, address)
@@ -65,7 +65,7 @@ async def test_clients_link_reads_a_result_that_fills_a_datagram() -> None:
     async with emulated(box=box) as (_, _, camera):
         assert (await camera.trigger()).raw == text.encode()
         transport: Any = inside(camera)._connection.require_link()._transport
-        assert getattr(transport, "max_size", LARGEST_DATAGRAM) == LARGEST_DATAGRAM
+        assert getattr(transport, "max_size", MAX_DATAGRAM_BYTES) == MAX_DATAGRAM_BYTES
 
 
 async def test_emulator_reads_input_that_fills_a_datagram() -> None:
@@ -75,4 +75,4 @@ async def test_emulator_reads_input_that_fills_a_datagram() -> None:
         client.send(b"PSVB" + size.to_bytes(4, "little") + bytes([INPUT_ID, 0, 0, 0]) + bytes(size))
         await emulator.wait_received(INPUT_ID)
         listener: Any = emulator._listener
-        assert getattr(listener._transport, "max_size", LARGEST_DATAGRAM) == LARGEST_DATAGRAM
+        assert getattr(listener._transport, "max_size", MAX_DATAGRAM_BYTES) == MAX_DATAGRAM_BYTES

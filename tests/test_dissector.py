@@ -21,10 +21,10 @@ from smartcam._dissector import lua_source, lua_tables
 from smartcam.emulator import EmulatedCamera
 from smartcam.protocols import BVS, FramedDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import HANDBOOK
 from smartcam.protocols.messages import Sender
 from tests import ROOT
+from tests.machines import B16, BID, THESIS
 from tests.protocols.test_vectors import VECTORS
 from tests.wireshark import PORT, Capture, Shown, needs_tshark, show, tshark
 from tests.wireshark import lua as lua  # a fixture

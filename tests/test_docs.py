@@ -28,11 +28,10 @@ from smartcam.camera import Camera
 from smartcam.emulator import InSightQuirks, Quirks, faults
 from smartcam.models import Status
 from smartcam.protocols import BVS, FramedDialect, State
-from smartcam.protocols._bvs import B16, BID, CODES
-from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._inside import HANDBOOK
 from smartcam.settings import CameraSettings, known_protocols
 from tests import ROOT
+from tests.machines import B16, BID, CODES, TRANSITIONS
 from tests.processes import MAINS, Process
 
 pytestmark = pytest.mark.long

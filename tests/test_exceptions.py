@@ -139,12 +139,12 @@ def test_error_with_a_text_only_has_default_attributes(kind: type[Exception]) ->
 def test_text_of_an_error_has_a_bound() -> None:
     error = e.ConfigurationError("begin " + "x" * 1_000_000 + " end")
     text = str(error)
-    assert len(text) <= e.MAX_TEXT
+    assert len(text) <= e.MAX_TEXT_CHARACTERS
     assert text.startswith("begin x")
     assert " ... " in text
     assert text.endswith("x end")
     assert str(pickle.loads(pickle.dumps(error))) == text  # noqa: S301 - ours
-    short = "x" * e.MAX_TEXT
+    short = "x" * e.MAX_TEXT_CHARACTERS
     assert str(e.SmartCamError(short)) == short
 
 

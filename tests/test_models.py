@@ -422,7 +422,8 @@ def test_pose_with_sigma_is_the_same_pose() -> None:
     assert pose == POSE
     assert hash(pose) == hash(POSE)
     assert isinstance(pose, Pose)
-    assert jsonable(pose) == POSE_JSON
+    assert jsonable(POSE) == POSE_JSON
+    assert jsonable(pose) == POSE_JSON | {"sigma": sigma._asdict()}
     assert pickle.loads(pickle.dumps(pose)).sigma == sigma  # noqa: S301 - our own
     assert "sigma=PoseSigma(x=0.0001, y=0.0002, theta=0.001" in repr(pose)
     moved = pose._replace(position=Position(0.3, 0.2))

@@ -11,10 +11,14 @@ import pytest
 
 import smartcam
 from smartcam import Connected, Observer, Result, SmartCamError
-from smartcam.observers import Observers, TraceEntry
+from smartcam.observers import Observers, RawFrame, TraceEntry
+from smartcam.protocols import BVS, Frame
+from smartcam.protocols.messages import Sender
 
 AT = datetime(2024, 5, 1, tzinfo=UTC)
-FRAME = TraceEntry(AT, "press 4", ">", 0x40, "Trigger", {}, "00")
+DIALECT = BVS.dialects["handbook"]
+RAW = RawFrame(AT, "press 4", DIALECT, Sender.CLIENT, Frame(0x40, b""))
+FRAME = RAW.entry()
 EVENT = Connected(camera="press 4", at=AT, url="bvs://127.0.0.1:1")
 RESULT = Result("press 4", 7, None, 1, None, AT, None, b"", b"")
 ERROR = SmartCamError("no result")
@@ -70,7 +74,7 @@ class Blind(Observer):
 def _frame(observers: Observers) -> None:
     trace = observers.trace
     assert trace is not None
-    trace(FRAME)
+    trace(RAW)
 
 
 HOOKS: dict[str, tuple[Callable[[Observers], None], tuple[Any, ...]]] = {
@@ -139,7 +143,7 @@ def test_frames_go_only_to_observers_that_look() -> None:
     looking: list[Observer] = [Blind(), Everything("one", calls), Blind()]
     trace = Observers(looking).trace
     assert trace is not None
-    trace(FRAME)
+    trace(RAW)
     assert calls == [("one", "frame", FRAME)]
 
 
@@ -148,6 +152,31 @@ def test_frames_go_to_an_observer_that_inherits_the_hook() -> None:
         pass
 
     assert Observers([Heir("heir", [])]).trace is not None
+
+
+class Raw(Everything):
+    """Takes frames before they are decoded, and would note it if it were given one decoded."""
+
+    def on_raw_frame(self, frame: RawFrame) -> None:
+        self.calls.append((self.name, "raw", frame))
+
+
+def test_frame_goes_undecoded_to_who_takes_it_so_and_decoded_to_others() -> None:
+    calls: list[tuple[Any, ...]] = []
+    trace = Observers([Raw("one", calls), Everything("two", calls), Blind()]).trace
+    assert trace is not None
+    trace(RAW)
+    assert calls == [("one", "raw", RAW), ("two", "frame", FRAME)]
+    assert (FRAME.direction, FRAME.message, FRAME.message_id) == (">", "Trigger", 0x40)
+
+
+def test_raw_frame_that_is_not_taken_goes_to_the_other_hook() -> None:
+    calls: list[tuple[Any, ...]] = []
+    Everything("one", calls).on_raw_frame(RAW)
+    broken = TraceEntry(AT, "press 4", "!", None, "no frame", None, "0011")
+    Everything("one", calls).on_raw_frame(RawFrame(AT, "press 4", DIALECT, Sender.CAMERA, broken))
+    assert calls == [("one", "frame", FRAME), ("one", "frame", broken)]
+    assert RawFrame(AT, "press 4", DIALECT, Sender.CAMERA, broken).size == 2
 
 
 def test_results_and_events_are_asked_for_where_somebody_looks() -> None:

@@ -139,7 +139,7 @@ UNITS = {"Milliseconds": "MS", "Microseconds": "US", "Nanoseconds": "NS"}
 """Ends of the names of constants that count times in another unit, by the unit."""
 
 UNNAMED_TIMES = {
-    *("_cli", "calibration.wizards", "conformance", "fleet", "ros1", "ros2", "web"),
+    *("_cli", "conformance", "fleet", "ros1", "ros2", "web"),
 }
 """Rooms in which some times still have names that do not say so; a room that is mended goes."""
 
@@ -188,6 +188,41 @@ def test_names_of_times_say_that_they_are_times() -> None:
     wrong = [one for one in named_constants() if not one.says_its_unit]
     assert [f"{one.module}.{one.name}: {one.text}" for one in wrong if not one.room] == []
     assert {one.room for one in wrong} - {""} == UNNAMED_TIMES
+
+
+COUNTED = re.compile(
+    r"(Largest|Least) number of (bytes|characters)\b|[^.]*\bat most this many (bytes|characters)\b"
+)
+"""Texts that count something whose name belongs into the constant's own."""
+
+COUNTING_WORDS = {"bytes": {"BYTES"}, "characters": {"CHARACTERS", "LENGTH"}}
+"""Words of which one stands in the name of each constant that bounds bytes or characters."""
+
+MANY_THINGS = {"smartcam.ros2._node.parameters", "smartcam.layout._text", "smartcam.protocols"}
+"""Modules with a constant that bounds several things, or whose public name has no unit."""
+
+
+def test_names_of_bounds_say_what_they_count() -> None:
+    wrong = []
+    for one in named_constants():
+        if (found := COUNTED.match(one.text)) and not one.module.startswith(tuple(MANY_THINGS)):
+            words = COUNTING_WORDS[found[2] or found[3]]
+            if words.isdisjoint(one.name.split("_")):
+                wrong.append(f"{one.module}.{one.name}: {one.text}")
+    assert not wrong, "\n".join(wrong)
+
+
+VERBLESS = re.compile(r"[A-Z]\w+ [^.:;]* at (most|least)([.:;,]|$)")
+BOUNDING = re.compile(r"\b(has|have|is|are|may|must|can|needs?|takes?|holds?|keeps?|reach(es)?)\b")
+
+
+def test_bounds_are_explained_by_sentences() -> None:
+    found = [
+        one
+        for one in constants()
+        if VERBLESS.match(one.text) and not BOUNDING.search(VERBLESS.match(one.text)[0])  # type: ignore[index]
+    ]
+    assert not found, "\n".join(map(str, found))
 
 
 OPENING = re.compile(r"(What|Who|Whose|Whether|Where|Which|How|When|Why|It)\b")

@@ -1,7 +1,8 @@
 """What a server that is measured itself says about itself, on request.
 
 Its process listens to one control port on 127.0.0.1, which it prints. Each line that comes there is
-answered with one line of JSON: :class:`Usage`.
+answered with one line of JSON: :class:`Usage`. Where the server has work to do on request, ``do``
+with a number in front of it has it done first.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
 __all__ = ["Control", "Usage", "allow_files", "resident", "serve_control"]
+
+
+DO = b"do "
 
 
 class Usage(NamedTuple):
@@ -56,11 +60,17 @@ def allow_files(wanted: int) -> int:
     return limit
 
 
-async def serve_control(ports: Sequence[int], before: float) -> None:
-    """Print the control port and answer for ever."""
+async def serve_control(
+    ports: Sequence[int],
+    before: float,
+    work: Callable[[int], Awaitable[None]] | None = None,
+) -> None:
+    """Print the control port and answer for ever; ``work`` does what ``do`` asks for."""
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while await reader.readline():
+        while line := await reader.readline():
+            if work is not None and line.startswith(DO):
+                await work(int(line.removeprefix(DO)))
             usage = Usage(time.process_time(), before, resident(), list(ports))
             writer.write(json.dumps(usage).encode() + b"\n")
 
@@ -81,5 +91,12 @@ class Control:
 
     def usage(self) -> Usage:
         """Return what it has used up to now."""
-        self._lines.write(b"usage\n")
+        return self._ask(b"usage\n")
+
+    def do(self, count: int) -> Usage:
+        """Have so much work done; return what was used up to its end."""
+        return self._ask(b"%s%d\n" % (DO, count))
+
+    def _ask(self, line: bytes) -> Usage:
+        self._lines.write(line)
         return Usage(*json.loads(self._lines.readline()))

@@ -18,7 +18,7 @@ from benchmarks.peers.control import resident, serve_control
 from benchmarks.yardsticks import BUFFER, Bare
 from smartcam._zenoh import RUNTIME, with_ports
 
-__all__ = ["BATCH", "RESULTS", "Zenoh", "asking"]
+__all__ = ["BATCH", "REPLY", "RESULTS", "Zenoh", "asking", "zenoh_session"]
 
 LENGTH = 200
 REPLY = wire.result(bytes(600))
@@ -36,6 +36,30 @@ def asking(batches: int) -> bytes:
     return batches.to_bytes(8, "little") + bytes(LENGTH - 8)
 
 
+def zenoh_session(listen: str = "", connect: str = "") -> Any:
+    """Return a session with the fleet's engine settings.
+
+    Args:
+        listen: endpoint to listen on.
+        connect: endpoint to connect to instead.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
+    import zenoh
+
+    config = zenoh.Config()
+    for path, value in {
+        "mode": "router" if listen else "client",
+        "listen/endpoints": [listen] if listen else [],
+        "connect/endpoints": [connect] if connect else [],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
+
+
 class Zenoh:
     """A bare session, with the fleet's engine settings: what comes is told in the engine's thread.
 
@@ -45,22 +69,10 @@ class Zenoh:
     """
 
     def __init__(self, listen: str = "", connect: str = "") -> None:
-        os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
+        self._session = zenoh_session(listen, connect)
         import zenoh
 
         self._zenoh = zenoh
-        config = zenoh.Config()
-        for path, value in {
-            "mode": "router" if listen else "client",
-            "listen/endpoints": [listen] if listen else [],
-            "connect/endpoints": [connect] if connect else [],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "scouting/delay": 0,
-            "transport/shared_memory/enabled": False,
-        }.items():
-            config.insert_json5(path, json.dumps(value))
-        self._session = zenoh.open(config)
         own, other = (ANSWER, ASK) if listen else (ASK, ANSWER)
         self._publisher: Any = self._declare(own, express=True)
         self._batches: Any = self._declare(own, express=False)

@@ -216,9 +216,9 @@ def _only_frames(url: str) -> bool:
 
 @contextlib.asynccontextmanager
 async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
-    """Open the source of frames that ``--pictures`` names; None where it names no source.
+    """Open the source of frames that ``--pictures`` names; None if it names no source.
 
-    Raises ConfigurationError: the URL is wrong; FrameSourceError: it is not there.
+    Raises ConfigurationError: the URL is wrong; FrameSourceError: it does not exist.
     """
     if pictures is None or not is_source(pictures):
         yield None

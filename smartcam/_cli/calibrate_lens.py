@@ -30,8 +30,8 @@ MIN_NEW_VIEW_SHARE: Final = 0.05
 
 MAX_VIEWS: Final = 200
 
-MAX_DESCRIPTION: Final = 65_536
-"""Bytes of a target's description."""
+MAX_DESCRIPTION_BYTES: Final = 65_536
+"""Largest number of bytes of a target's description."""
 
 
 @dataclass(slots=True)
@@ -158,7 +158,7 @@ def read_target(path: str) -> Target:
 
     try:
         with Path(path).open("rb") as stream:
-            data: object = json.loads(stream.read(MAX_DESCRIPTION))
+            data: object = json.loads(stream.read(MAX_DESCRIPTION_BYTES))
     except OSError as exc:
         raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
     except (ValueError, RecursionError) as exc:
@@ -214,10 +214,10 @@ def _files(pictures: Sequence[str]) -> Iterator[Path]:
 
 def _view_of_file(path: Path, target: Target) -> TargetView:
     from smartcam.calibration import find_target
-    from smartcam.calibration._inside import MAX_PICTURE, decode_picture
+    from smartcam.calibration._inside import MAX_PICTURE_BYTES, decode_picture
 
     with naming(str(path)), path.open("rb") as stream:
-        data = stream.read(MAX_PICTURE + 1)
+        data = stream.read(MAX_PICTURE_BYTES + 1)
     return find_target(decode_picture(data, path.name), target, name=path.name)
 
 

@@ -1,4 +1,4 @@
-"""Having a shell complete the commands: a line in the file that it reads when it starts."""
+"""Make a shell complete the commands, by a line in its startup file."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ LINES: Mapping[str, str] = {
     "zsh": _EVAL,
     "fish": "command -q {program}; and {variable}=fish_source {program} | source",
 }
-"""A line of each shell that has it complete a program which is there."""
+"""A line for each shell that makes it complete an installed program."""
 
 
 def install(shell: str) -> str:
-    """Write the lines into the shell's file where they are not there, and return what was done.
+    """Add the missing lines to the shell's file, and return what was done.
 
     Args:
         shell: name of the shell; "": that of the variable SHELL.
@@ -58,7 +58,7 @@ def _line(shell: str, program: str) -> str:
 
 
 def _file_of(shell: str) -> Path:
-    """Return the file that a shell reads when somebody opens it."""
+    """Return the startup file of an interactive shell."""
     home = Path.home()
     if shell == "fish":
         config = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config")
@@ -68,7 +68,7 @@ def _file_of(shell: str) -> Path:
 
 
 def _append(path: Path, lines: list[str]) -> int:
-    """Append the lines that a file lacks; return how many these are."""
+    """Append the lines that a file lacks; return their number."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     there = text.splitlines()
     lacking = [line for line in lines if line not in there]

@@ -136,7 +136,7 @@ def _decode_frames(
 
 
 def _next_frame(framer: Framer, dialect: FramedDialect) -> Frame | None:
-    """Return the next frame; None where there is none, or only a part of one."""
+    """Return the next frame; None if there is none, or only a part of one."""
     try:
         return framer.next_frame()
     except FrameError as exc:

@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 USE: Final = "inspection needs"
 
 SIZE_PX: Final = (640, 400)
-"""Width and height of a picture."""
+"""Width and height of a picture, pixels."""
 
 PART_PX: Final = (320, 180)
-"""Width and height of the part."""
+"""Width and height of the part, pixels."""
 
 OVERSAMPLING: Final = 3
-"""Samples of a pixel along each side."""
+"""Number of samples per pixel along each side."""
 
 LOGO: Final = (-40, 20, 160, 50)
-"""The print, in the part's frame of reference: x, y, width, height."""
+"""The print, in the part's frame of reference: x, y, width, height, pixels."""
 
 CELL: Final = f"""\
 cameras:
@@ -64,13 +64,13 @@ class DrawnPart(NamedTuple):
 
     Attributes:
         name: name of its picture.
-        fault: what is wrong with it; "" for nothing.
-        x: place of its middle, pixels.
-        y: place of its middle, pixels.
-        degrees: turn, clockwise.
+        fault: fault of the part; "" for none.
+        x: column of its middle, pixels.
+        y: row of its middle, pixels.
+        degrees: angle of the part, clockwise.
         code: text of its code.
         print: text of its print.
-        hole: False: the hole is missing.
+        hole: whether the part has its hole.
         noise: standard deviation of the noise, grey levels.
     """
 

@@ -43,7 +43,7 @@ MARKS_FILE, CELL_FILE = "marks.yaml", "cell.yaml"
 """Cell files before and after the calibration."""
 
 MAX_PARTS: Final = 8
-"""Parts that are laid onto the table at once."""
+"""Largest number of parts that are laid onto the table at once."""
 
 DOWN: Final = (0.0, 0.0, -1.0)
 """Direction of the robot's tool when it touches."""

@@ -43,13 +43,13 @@ class Pick(NamedTuple):
     """The outcome of picking one part."""
 
     part: str
-    x: float  # where the robot went, metres in the robot's frame
-    y: float  # the same
-    z: float  # the same
+    x: float  # place that the robot went to, metres in the robot's frame: x
+    y: float  # y
+    z: float  # z
     error: float  # distance from there to the part, metres
     predicted: float  # rms of the error to expect there, metres
-    turned: float  # by how much the gripper's heading was off, radians
-    taken: bool  # whether it was near enough
+    turned: float  # error of the gripper's heading, radians
+    taken: bool  # whether the gripper was near enough
 
 
 class SimulatedRobot:

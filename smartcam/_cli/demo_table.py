@@ -265,11 +265,11 @@ FRAMES.register(SCHEME, TableDriver)
 class Placed(NamedTuple):
     """The outcome of picking a part and putting it onto the pallet."""
 
-    x: float  # where the robot went, metres in the robot's frame
-    y: float  # the same
+    x: float  # place that the robot went to, metres in the robot's frame: x
+    y: float  # y
     error: float  # distance from there to the part, metres
-    turned: float  # by how much the gripper's heading was off, radians
-    taken: bool  # whether it was near enough
+    turned: float  # error of the gripper's heading, radians
+    taken: bool  # whether the gripper was near enough
     off_place: float  # distance of the part from its place on the pallet, metres; NaN: none there
 
 

@@ -60,7 +60,7 @@ SIDE_RATIO: Final = (2.2, 3.8)
 """Longer side of a block in the picture over the shorter one, from least to most."""
 
 MIN_FULLNESS: Final = 0.8
-"""Share of its rectangle that a block fills at least."""
+"""A block fills at least this share of its rectangle."""
 
 RIM: Final = 2
 """Pixels at a region's rim whose depth is a mixture."""
@@ -80,9 +80,9 @@ class BlockPose(NamedTuple):
 
     x: float
     y: float
-    angle: float  # of its length, from x towards y
-    height: float  # of its top
-    sigma: float = 0.0  # of the height, as the depth tells it
+    angle: float  # direction of the block's length, from x towards y
+    height: float  # height of the block's upper side
+    sigma: float = 0.0  # sigma of the height, by the depth
 
 
 class Compared(NamedTuple):
@@ -145,10 +145,10 @@ async def tower(
 class Seen(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
-    blocks: list[BlockPose]  # that lie on the table
-    reached: list[BlockPose]  # those of them that it can grip
+    blocks: list[BlockPose]  # blocks that lie on the table
+    reached: list[BlockPose]  # blocks of these that the gripper can grip
     block: BlockPose  # the one that it takes
-    top: BlockPose  # of the tower
+    top: BlockPose  # block on top of the tower
 
 
 def _look(table: TowerTable, colours: ColourRange) -> Seen:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.doctor import Finding
 
 MAX_BROKEN = 4
-"""Lines of broken bytes below a finding."""
+"""Largest number of lines of broken bytes below a finding."""
 
 
 @click.command(

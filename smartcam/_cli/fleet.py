@@ -1,4 +1,4 @@
-"""``smartcam fleet``: all cameras of a fleet, or those of a pattern."""
+"""``smartcam fleet``: commands for all cameras of a fleet, or for those that match a pattern."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _READING = ("--interpret-as", "--y-down", "--calibration", "--units")
     'the extra "fleet", but for a file.',
 )
 def fleet() -> None:
-    """Have the commands of a fleet."""
+    """Register the commands of a fleet."""
 
 
 fleet.add_command(certificates)
@@ -230,7 +230,7 @@ def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
 
 
 async def _ask_outlets(url: str, options: Options) -> None:
-    """Show the accounts that a fleet's agents tell."""
+    """Show the counts of outlets that a fleet's agents report."""
     async with _opened(url, options) as opened:
         found = await opened.outlets(timeout=options.step(5.0))
     if options.as_json:
@@ -282,7 +282,7 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
     from smartcam.web import FleetSite
 
     units = options.unit_names
-    with contextlib.suppress(TimeoutError):  # --seconds are over
+    with contextlib.suppress(TimeoutError):  # the time of --seconds is over
         async with (
             asyncio.timeout(options.seconds),
             contextlib.AsyncExitStack() as stack,
@@ -296,7 +296,7 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
 
 @contextlib.asynccontextmanager
 async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
-    """Have the fleet open, once an agent of it is there."""
+    """Open the fleet, once it has an agent."""
     told = False
     for delay in Backoff(maximum=2.0).delays():
         opened = _opened(url, options)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.web import ColourSite
 
 LINGER: Final = 3.0
-"""Seconds that the device streams on without a page that asks."""
+"""Seconds for which the device goes on streaming after the last request of a page."""
 
 
 @click.command(
@@ -60,7 +60,7 @@ async def _serve(site: ColourSite, options: Options) -> None:
 
 
 def _range(text: str | None) -> ColourRange | None:
-    """Return a range of its JSON; ConfigurationError: it is not valid."""
+    """Return a range from JSON; raise ConfigurationError if it is not valid."""
     with from_part("depth", "smartcam frames colours needs"):
         from smartcam.depth import ColourRange
 

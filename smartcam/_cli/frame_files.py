@@ -1,4 +1,4 @@
-"""A frame as the bytes of a file, by the file's suffix; nothing is lost that nobody named."""
+"""Encode a frame as a file by its suffix, without a loss that the user did not ask for."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MIN_NUMBER_DIGITS: Final = 4
-"""Digits of the number in the name of one file of several, at least."""
+"""Least number of digits of the number in the name of one file of several."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Encoding:
     Attributes:
         suffix: a key of :data:`SUFFIXES`.
         quality: quality of a JPEG, 1 to 100.
-        grey: the brightness alone.
+        grey: whether only the brightness is kept.
         eight: True for the upper 8 bits of deeper pixels.
     """
 
@@ -37,10 +37,10 @@ class Encoding:
     eight: bool = False
 
     def encode(self, frame: Frame) -> bytes:
-        """Return a file's bytes; it takes milliseconds, and belongs into a thread.
+        """Return a file's bytes; this takes milliseconds, so call it in a thread.
 
         Raises:
-            ConfigurationError: bits would be lost, which nobody asked for.
+            ConfigurationError: bits would be lost, which the user did not ask for.
             FrameFormatError: the frame's bytes are wrong.
             MissingExtraError: a codec is not installed.
         """
@@ -48,7 +48,7 @@ class Encoding:
 
 
 def numbered(file: str, count: int) -> list[str]:
-    """Return the names of so many files: ``x-0001.png``; of a single one its own."""
+    """Return the names of ``count`` files: ``x-0001.png``; a single file keeps its name."""
     if count == 1:
         return [file]
     path, digits = Path(file), max(MIN_NUMBER_DIGITS, len(str(count)))
@@ -124,4 +124,4 @@ SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
     ".png": _png,
     ".raw": _raw,
 }
-"""The function that makes a file, by the suffix of its name in small letters."""
+"""The function that makes a file, by the suffix of its name in lower case."""

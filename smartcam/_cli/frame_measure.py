@@ -131,7 +131,7 @@ class _Taken:
         self.stamps.offer(frame, now)
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures; None where too few frames came to tell."""
+        """Return the figures; None if too few frames came to tell."""
         span = self._last.captured - self._first.captured
         return {
             "frames": self._delivered,

@@ -22,7 +22,7 @@ RTSP_USER = "smartcam"
 """Name of the RTSP user where a password is set."""
 
 MAX_NAME_LETTERS = 60
-"""Letters of a source's name in a URL, before its number."""
+"""Largest number of letters of a source's name in a URL, before its number."""
 
 LOOK_INTERVAL = 0.1
 """Seconds between two looks for a source that is not open yet."""

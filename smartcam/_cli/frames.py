@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FoundSource, Frame, FrameSource
 
 MAX_GRABBED = 100_000
-"""Files that one command writes at most."""
+"""Largest number of files that one command writes."""
 
 
 @click.group(
@@ -93,7 +93,7 @@ async def list_(scheme: str | None, options: Options) -> None:
 
 
 async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
-    """Return the sources that a scheme's driver finds, None where the driver has no search.
+    """Return the sources that a scheme's driver finds, None if the driver has no search.
 
     The error of a broken driver is returned, and costs only the line of its scheme.
     """

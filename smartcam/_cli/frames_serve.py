@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from smartcam.web import FramesSite
 
 MAX_SHOWN = 4
-"""Sources side by side on a page."""
+"""Largest number of sources side by side on a page."""
 
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
 """Errors that stay: another try to open the source would fail as well."""

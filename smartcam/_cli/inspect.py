@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 )
-"""Suffixes of the files in a folder that count as pictures, in small letters."""
+"""Suffixes of the files in a folder that count as pictures, in lower case."""
 
 PAGE: Final = "index.html"
 

@@ -1,4 +1,4 @@
-"""``smartcam live``: a page of a camera, which is awaited where it is not there."""
+"""``smartcam live``: a page of a camera, also before the camera answers."""
 
 from __future__ import annotations
 

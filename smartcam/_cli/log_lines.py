@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
 
 MAX_WAITING = 10_000
-"""Lines that may wait to be written."""
+"""Largest number of lines that may wait to be written."""
 
-MAX_TEXT = 1 << 16
-"""Characters of a message, or of an exception's text; what is longer is cut."""
+MAX_TEXT_CHARACTERS = 1 << 16
+"""Largest number of characters of a message, or of an exception's text; what is longer is cut."""
 
 FAREWELL = 1.0
 """Seconds that the last lines may take at the end."""
@@ -55,14 +55,14 @@ class JsonLines(logging.Formatter):
             "time": _time(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": message[:MAX_TEXT],
+            "message": message[:MAX_TEXT_CHARACTERS],
             "agent": self._agent() or None,
             "camera": self._camera(record),
         }
         if record.exc_info and record.exc_info[0] is not None:
-            fields["exception"] = self.formatException(record.exc_info)[-MAX_TEXT:]
+            fields["exception"] = self.formatException(record.exc_info)[-MAX_TEXT_CHARACTERS:]
         elif record.exc_text:
-            fields["exception"] = record.exc_text[-MAX_TEXT:]
+            fields["exception"] = record.exc_text[-MAX_TEXT_CHARACTERS:]
         return json.dumps(fields)
 
     def _camera(self, record: logging.LogRecord) -> str | None:

@@ -206,7 +206,7 @@ class Options:
         return default if self.timeout is None else self.timeout
 
     def check_y_down(self, calibration: AnyCalibration, what: str) -> None:
-        """Raise ConfigurationError where ``--y-down`` is not as it was when a calibration was made.
+        """Raise ConfigurationError if ``--y-down`` is not as it was when a calibration was made.
 
         ``what``: the option that names the calibration.
         """
@@ -301,7 +301,7 @@ class Options:
 
     @contextmanager
     def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
-        """Give what writes the trace file, None where none is wanted.
+        """Give what writes the trace file, None if none is wanted.
 
         Raises UnsupportedError: the camera at ``url`` is one of a fleet; ConfigurationError: the
         file cannot be written.

@@ -140,7 +140,7 @@ class _Plan(NamedTuple):
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # whose pictures are recorded as well
     judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
-    read_images: bool  # after each trigger, the camera's picture
+    read_images: bool  # whether the camera's picture is read after each trigger
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
@@ -251,7 +251,7 @@ def _jobs(
     jobs.append(_count(results, recorders[0], plan.judged, count if images is None else None))
     if plan.every is not None:
         step = options.step(DEFAULT_TRIGGER_TIMEOUT)
-        jobs.append(_trigger(camera, plan.every, step, images, count))
+        jobs.append(_trigger(camera, plan.every, step, images, count, plan.judged))
     if plan.source is not None:
         jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
     return jobs
@@ -329,11 +329,15 @@ async def _trigger(
     timeout: float,
     images: Recorder | None,
     count: int | None,
+    judged: JudgedPictures | None,
 ) -> None:
     """Send triggers; what goes wrong with one is recorded, as long as the first ones went well.
 
     ``images``: the recorder that also gets the picture of each result, of ``count`` of them.
+    ``judged``: finds the picture of each result once there are pictures, which is waited for.
     """
+    if judged is not None:
+        await judged.wait_streaming()
     loop = asyncio.get_running_loop()
     when, worked = loop.time(), False
     while True:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.systemd")
 
-MAX_STATUS = 500
-"""Characters of a status: one line in ``systemctl status``."""
+MAX_STATUS_CHARACTERS = 500
+"""Largest number of characters of a status: one line in ``systemctl status``."""
 
 MAX_UNSENT = 32
 STATUS_PERIOD = 5.0
@@ -44,7 +44,7 @@ class Notifier:
         self.wanted: bool = self._address is not None
         self.watchdog: float | None = _watchdog(given)
         self._socket: socket.socket | None = None
-        self._unsent: list[bytes] = []  # what must not be lost, while the socket is full
+        self._unsent: list[bytes] = []  # messages that must not be lost, while the socket is full
         self._failed = False
         self._status = ""
 
@@ -79,7 +79,7 @@ class Notifier:
             self._socket = None
 
     def _status_line(self, status: str) -> str:
-        self._status = " ".join(status.split())[:MAX_STATUS]
+        self._status = " ".join(status.split())[:MAX_STATUS_CHARACTERS]
         return f"STATUS={self._status}"
 
     def _send(self, *lines: str, keep: bool = False) -> None:
@@ -144,7 +144,7 @@ def _address(given: str) -> str | None:
 
 
 def _watchdog(given: Mapping[str, str]) -> float | None:
-    """Return the seconds of systemd's watchdog, None where it is not for this process."""
+    """Return the seconds of systemd's watchdog, None if it is not for this process."""
     text, process = given.get("WATCHDOG_USEC", ""), given.get("WATCHDOG_PID", "")
     if not text or (process and process != str(os.getpid())):
         return None

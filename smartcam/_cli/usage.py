@@ -80,7 +80,7 @@ class ListedGroup(JsonErrors, click.Group):
 
 
 MAX_SUMMARY_CHARACTERS = 400
-"""Characters of a command's first sentence that a list shows."""
+"""Largest number of characters of a command's first sentence that a list shows."""
 
 
 def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -46,7 +46,7 @@ class Try:
         outcome: text that says how the attempt ended.
         received: number of bytes received.
         hung_up: True if the other side ended the link without a byte.
-        error: reason why there is no session, None where there is one.
+        error: reason why there is no session, None if there is one.
         on_step: function that is called with each new step.
     """
 
@@ -106,9 +106,10 @@ class Try:
 class Reason(NamedTuple):
     """A reason for which there may be no session. Its texts are filled in by :func:`words`."""
 
-    fits: Callable[[Try], bool]  # whether it is this one, by what an attempt saw
-    text: str  # what is wrong
-    cure: str  # what to do
+    # function that says, by what an attempt saw, whether this is the cause
+    fits: Callable[[Try], bool]
+    text: str  # text of the problem
+    cure: str  # text of the cure
 
 
 _NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)

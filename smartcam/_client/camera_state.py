@@ -23,8 +23,8 @@ class Wanted(NamedTuple):
     """The application and run state that the camera was asked for.
 
     Attributes:
-        application: the application that was named, None where none was.
-        running: the run state that was asked for, None where none was.
+        application: the application that was named, None if none was.
+        running: the run state that was asked for, None if none was.
     """
 
     application: int | None
@@ -87,7 +87,7 @@ class CameraState:
                 of its answer.
 
         Returns:
-            The status before, None where this session had none.
+            The status before, None if this session had none.
         """
         status = report.status
         # int(status) costs three times as much, with each status that comes

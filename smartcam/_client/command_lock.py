@@ -1,8 +1,8 @@
 """Run one command at a time, and go back after a temporary switch.
 
-Going back to the application before is a job of the session's task group: it is finished even
-when the caller was cancelled, it is bounded, and every later command waits for it. One that a lost
-link prevented is done first thing in the next session; so is restoring what was wanted.
+Going back to the application before is a job of the session's task group: it is finished even when
+the caller was cancelled, it is bounded, and every later command waits for it. A switch back that a
+lost link prevented is done first in the next session; so is restoring the wanted state.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ class CommandLock:
     _switch_timeout: float  # bound of each switch, seconds
 
     def __post_init__(self) -> None:
-        self._jobs: asyncio.TaskGroup | None = None  # of the session, None between two
-        self._owed: Before | None = None  # to go back to in the next session
+        # tasks of the session; None between two sessions
+        self._jobs: asyncio.TaskGroup | None = None
+        self._owed: Before | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
         self._in_line = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
@@ -84,12 +85,12 @@ class CommandLock:
 
     @contextlib.asynccontextmanager
     async def session(self, *, restore: bool) -> AsyncGenerator[asyncio.TaskGroup]:
-        """Have a session while the body runs; end when the jobs of the session have ended.
+        """Keep a session while the body runs, and until the jobs of the session have ended.
 
         Gives the group of the session's tasks.
 
         Args:
-            restore: have the application and the run state again that were wanted.
+            restore: whether to restore the wanted application and run state.
         """
         async with asyncio.TaskGroup() as jobs:
             self._jobs = jobs
@@ -104,7 +105,7 @@ class CommandLock:
                 self._jobs = None
 
     async def vacated(self) -> None:
-        """Wait until every command of the session that is over has noticed; bounded."""
+        """Wait until every command of the ended session has noticed that; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._switch_timeout), self._lock:
                 pass
@@ -112,7 +113,7 @@ class CommandLock:
     # ------------------------------------------------------------------ for commands
 
     def hold(self, timeout: float) -> Hold:
-        """Hold the turn with ``async with``; it gives the deadline, the wait for it included.
+        """Hold the turn with ``async with``; it gives the deadline, which includes the wait.
 
         Raises:
             ResponseTimeoutError: others had it for ``timeout`` seconds.
@@ -124,10 +125,11 @@ class CommandLock:
     async def hold_in(self, application: int, timeout: float) -> AsyncGenerator[float]:
         """Hold the turn with ``application`` running; gives the deadline.
 
-        Afterwards the application before is back; after an error or a cancellation that goes on
-        behind the caller's back.
+        Afterwards the former application is back; after an error or a cancellation this goes on in
+        the background.
         """
-        self._connection.deadline(timeout)  # a wrong one is refused before anything is switched
+        # an unknown application is refused before anything is switched
+        self._connection.deadline(timeout)
         async with self.hold(self._switch_timeout) as switch_deadline:
             before = await self.enter(application, switch_deadline)
             try:
@@ -144,7 +146,7 @@ class CommandLock:
         return deadline
 
     def turn(self, deadline: float, timeout: float) -> Coroutine[Any, Any, object]:
-        """Have the turn when the coroutine that this returns is done; then :meth:`give_back`.
+        """Return a coroutine that waits for the turn; after it call :meth:`give_back`.
 
         Raises:
             LinkError: there is no session.
@@ -155,7 +157,7 @@ class CommandLock:
             return self._take_in_line(deadline, timeout)
         if self._failed is not None or self._commands.unconfirmed:
             return self._take_in_line(deadline, timeout)
-        return lock.acquire()  # it is free: nothing is waited for
+        return lock.acquire()  # the lock is free: no wait
 
     def give_back(self) -> None:
         """Give the turn to the next in line."""
@@ -174,7 +176,7 @@ class CommandLock:
         finally:
             self._in_line -= 1
         try:
-            self._connection.require_link()  # it may have been lost meanwhile
+            self._connection.require_link()  # the link may have been lost meanwhile
             self._raise_failed()
             if self._commands.unconfirmed:
                 await self._commands.catch_up(deadline)
@@ -183,7 +185,7 @@ class CommandLock:
             raise
 
     async def enter(self, application: int, deadline: float) -> Before:
-        """Have ``application`` running; the turn is held. Goes back where that fails."""
+        """Start ``application`` while the turn is held; go back if that fails."""
         commands = self._commands
         commands.check_id(application)
         active = await commands.query_loaded(deadline)
@@ -196,9 +198,9 @@ class CommandLock:
         return before
 
     def leave(self, before: Before) -> asyncio.Task[None] | None:
-        """Go back as soon as the turn is free; in the next session, and None, where there is none.
+        """Go back once the turn is free; without a session return None, and go back in the next.
 
-        Where several ways back are owed, the one to the outermost block's application counts.
+        If several switches back are due, the one to the outermost block's application counts.
         """
         if self._jobs is None or self._waits.end is not None:
             self._owe(before)
@@ -228,7 +230,7 @@ class CommandLock:
         """Load the active application again, which empties the camera's queue of input data.
 
         Args:
-            needed: function that tells, once the turn is there, whether this is still to be done.
+            needed: function that returns, once the turn is held, whether this must still be done.
             timeout: seconds to wait for it.
 
         Raises:
@@ -250,7 +252,7 @@ class CommandLock:
         self._raise_failed()
 
     async def _load_again(self, needed: Callable[[], bool]) -> None:
-        """Load the active application again, and have it run if it ran; never raises."""
+        """Load the active application again, and start it if it ran; never raises."""
         commands, wanted = self._commands, self._state.wanted
         async with self._lock:
             if not needed():
@@ -270,14 +272,14 @@ class CommandLock:
     async def settle(self) -> None:
         """Wait until every job that goes back is done.
 
-        Each is bounded by the switch timeout once it has the turn; who had it before may take
-        longer, so the caller has a deadline of its own.
+        Each is bounded by the switch timeout once it has the turn; the earlier holder may take
+        longer, so the caller has its own deadline.
         """
         while self._leaving:
             await asyncio.wait(self._leaving)
 
     def _owe(self, before: Before) -> None:
-        """Keep what the next session is to go back to."""
+        """Keep the state that the next session must restore."""
         self._owed = before
         self._state.want(before.wanted)
 
@@ -297,9 +299,9 @@ class CommandLock:
                 self._state.want(before.wanted)
 
     async def _restore(self) -> None:
-        """Have the application that was named, and the run state that was asked for; never raises.
+        """Restore the named application and the wanted run state; never raises.
 
-        Where the link is lost again the next session does it.
+        If the link is lost again, the next session does it.
         """
         await self._adopted()
         wanted = self._state.wanted
@@ -314,17 +316,17 @@ class CommandLock:
                 self._state.want(wanted)
 
     async def _adopted(self) -> None:
-        """Wait until the session of a job is adopted: an eager task begins in front of that."""
+        """Wait until the session of a job is adopted: an eager task begins earlier."""
         if self._waits.end is not None:
             await asyncio.sleep(0)
 
     def _is_loss(self, error: SmartCamError) -> bool:
-        """Return True if the link is lost, which an answer that did not come causes, too."""
+        """Return True if the link is lost, which a missing answer causes, too."""
         link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 
     async def _have(self, application: int | None, running: bool | None) -> None:
-        """Bring about an application and a run state with the fewest commands; None: leave it."""
+        """Reach an application and run state with the fewest commands; None leaves it unchanged."""
         commands, status = self._commands, self._status
         deadline = self._connection.deadline(self._switch_timeout)
         active = await commands.query_loaded(deadline)
@@ -336,7 +338,7 @@ class CommandLock:
             await commands.stop(deadline)
 
     async def _acquire(self) -> None:
-        """Take the lock, but behind every job that goes back.
+        """Take the lock after every job that goes back.
 
         The command that had the turn before may have left such a job behind while this command was
         in line.

@@ -157,7 +157,7 @@ class Commands:
         await self._status.until(is_ready, deadline, "Running and not BUSY")
 
     async def switch(self, application: int | str, deadline: float, *, start: bool) -> None:
-        """Stop if need be, switch, wait until not BUSY, start if wanted.
+        """Stop if needed, switch, wait until not BUSY, start if wanted.
 
         Args:
             application: id of the application, or the name of its file.

@@ -157,7 +157,8 @@ class EvidenceByAnswer(TriggerEvidence):
         super().__init__()
         self.reached = self.proven = False
         self._queried = False
-        self._waited: bool | None = None  # as the first status behind the Query's answer says
+        # whether the camera waits for a trigger, by the first status after the Query's answer
+        self._waited: bool | None = None
 
     def on_query_answer(self) -> None:
         """Note that the next status was asked for in front of the trigger, or is as fresh."""
@@ -185,7 +186,7 @@ class SentTrigger:
 
     Attributes:
         wanted: how many results it is to have.
-        number: sequence number set for it, None where its layout has none.
+        number: sequence number set for it, None if its layout has none.
         evidence: what the camera has said of it.
         came: how many of its results came.
         early: containers that came before the camera showed that it had taken it.
@@ -253,10 +254,12 @@ class Correlation:
         self.doubted: bool = False
         self._complete = False  # every status is told, in order
         self.satisfied: bool = False
-        self._last: TriggerEvidence | None = None  # of the last trigger, until it has its results
+        # evidence of the last trigger, until it has its results
+        self._last: TriggerEvidence | None = None
         self.owed: list[_Owed] = []
-        self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
-        self._last_number: int | None = None  # of the last trigger that had its results
+        # debts by the triggers' numbers; their results are late whenever they come
+        self._given_up: dict[int, Debt] = {}
+        self._last_number: int | None = None  # number of the last trigger that had its results
         self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
         self._given: int | None = None
 
@@ -369,7 +372,7 @@ class Correlation:
         """Note where an inspection begins: Waiting for Trigger drops while running.
 
         Args:
-            previous: the status before, None where there was none in this session.
+            previous: the status before, None if there was none in this session.
             status: the new one.
 
         Returns:
@@ -402,8 +405,8 @@ class Correlation:
         """Return the trigger that a container of the right application belongs to.
 
         Args:
-            number: sequence number of the container, None where the container has none or no
-                trigger of ours waits.
+            number: sequence number of the container, None if the container has none or no trigger
+                of ours waits.
         """
         pending = self.pending
         if pending is not None and not pending.ended:

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 FEWEST_GATHERED = 6
 """Events of a chunk that are worth to be looked through: two results, each between statuses."""
 
-MAX_NOTICE = 4096
-"""Characters of a camera's remark that are kept."""
+MAX_NOTICE_CHARACTERS = 4096
+"""Largest number of characters of a camera's remark that are kept."""
 
 _LOGGED = (
     (
@@ -84,7 +84,7 @@ class Dispatch:
 
     @property
     def layout(self) -> Layout | None:
-        """Layout that results are read with; None where there is none, or several."""
+        """Layout that results are read with; None if there is none, or several."""
         return self._results.interpretation.layout
 
     def begin_session(self, dialect: Dialect, *, ordered: bool) -> None:
@@ -179,7 +179,7 @@ class Dispatch:
     def _on_notice(self, notice: m.Notice, now: float, at: datetime) -> None:
         self._counters.note_notice()
         level = logging.WARNING if notice.kind == "error" else logging.INFO
-        kind, code, text = notice.kind, notice.code, notice.text[:MAX_NOTICE]
+        kind, code, text = notice.kind, notice.code, notice.text[:MAX_NOTICE_CHARACTERS]
         form = "! the camera says: %s %d: %.200s"
         self._remarks.log(f"notice {kind}", level, form, kind, code, text, now=now)
         event = NoticeReceived(camera=self._name, at=at, kind=kind, code=code, text=text)

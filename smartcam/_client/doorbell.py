@@ -1,14 +1,14 @@
 """Wake the receive task without a turn of the event loop.
 
 A future wakes its task by way of the event loop: a handle, another turn, another system call. For
-each delivery of bytes that costs more than all that is done with them. Who rings here from a
-callback of the loop, as a transport does, has the task go on at once. It is a task nevertheless:
-what it raises ends it, and never reaches who rang.
+each delivery of bytes that costs more than processing them. A caller that rings this doorbell from
+a callback of the loop, as a transport does, makes the task go on at once. It is still a task: an
+exception in it ends the task, and never reaches the caller.
 
-:class:`Doorbell` rests on what the event loop's own tasks and futures agree on
-(``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` rests
-on a future alone: it takes its place where the environment variable ``SMARTCAM_DOORBELL`` is
-``plain``, should a Python or an event loop come that does not agree on this.
+:class:`Doorbell` uses the protocol between asyncio's tasks and futures
+(``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` uses
+only a future: it is chosen by the environment variable ``SMARTCAM_DOORBELL=plain``, for a Python or
+an event loop that does not have this protocol.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 class Doorbell:
-    """One task may ``await`` it, again and again; :meth:`ring` has it go on.
+    """One task may ``await`` it repeatedly; :meth:`ring` makes the task go on.
 
     Args:
-        loop: the loop of both.
+        loop: event loop of the task and of the callers.
 
     Cancellation: safe; the task is woken by the loop.
     """
@@ -36,11 +36,12 @@ class Doorbell:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._asyncio_future_blocking = False
-        self._wake: Callable[[Doorbell], None] | None = None  # None: nobody waits
+        # function that wakes the waiting task; None if nobody waits
+        self._wake: Callable[[Doorbell], None] | None = None
         self._context: contextvars.Context | None = None
 
     def ring(self) -> None:
-        """Have the task go on: at once, or in the loop's next turn where another task rings."""
+        """Make the task go on: at once, or if another task rings, in the loop's next turn."""
         wake, context = self._wake, self._context
         if wake is None or context is None:
             return
@@ -63,25 +64,25 @@ class Doorbell:
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
     ) -> None:
-        """Note that the task sleeps now; ``wake`` has it go on."""
+        """Note that the task sleeps now; ``wake`` makes it go on."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
-        """Wake the task to be cancelled, which is told then."""
+        """Wake the task, which is then cancelled."""
         wake, self._wake = self._wake, None
         if wake is not None:
             self._loop.call_soon(wake, self, context=self._context)
         return False
 
     def result(self) -> None:
-        """Return nothing: no value comes with the ring."""
+        """Return nothing: a ring carries no value."""
 
 
 class PlainDoorbell:
-    """A doorbell on a future: a ring has the task go on in the loop's next turn.
+    """A doorbell with a future: a ring makes the task go on in the loop's next turn.
 
     Args:
-        loop: the loop of both.
+        loop: event loop of the task and of the callers.
 
     Cancellation: safe.
     """
@@ -90,10 +91,11 @@ class PlainDoorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._ringing: asyncio.Future[None] | None = None  # None: nobody waits
+        # future of the waiting task; None if nobody waits
+        self._ringing: asyncio.Future[None] | None = None
 
     def ring(self) -> None:
-        """Have the task go on."""
+        """Make the task go on."""
         if self._ringing is not None and not self._ringing.done():
             self._ringing.set_result(None)
 
@@ -106,6 +108,6 @@ class PlainDoorbell:
 
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:
-    """Return the doorbell that the environment variable ``SMARTCAM_DOORBELL`` asks for."""
+    """Return a doorbell of the kind that ``SMARTCAM_DOORBELL`` selects."""
     plain = os.environ.get("SMARTCAM_DOORBELL") == "plain"
     return PlainDoorbell(loop) if plain else Doorbell(loop)

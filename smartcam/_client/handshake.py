@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from smartcam.layout import Layout
-    from smartcam.observers import TraceEntry
+    from smartcam.observers import RawFrame
     from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
 
@@ -61,9 +61,10 @@ BUSY_PAUSE = 0.05
 """Seconds until a camera that was too busy to name its application is asked again."""
 
 
-MAX_EARLY = 1 << 20
-"""Bytes that may come while a session is made, beside one frame of ``max_length``. Making one takes
-a few round trips, and the fastest camera sends a fraction of it meanwhile."""
+MAX_EARLY_BYTES = 1 << 20
+"""Largest number of bytes that may come while a session is made, beside one frame of
+``max_length``. Making one takes a few round trips, and the fastest camera sends a fraction of it
+meanwhile."""
 
 
 class Session(NamedTuple):
@@ -99,7 +100,7 @@ class _Collector:
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
-    answers: int = 0  # to Query, whatever they say
+    answers: int = 0  # number of answers to Query, whatever their contents
     application: int | None = None
 
     async def take(self) -> None:
@@ -192,7 +193,7 @@ async def attempt(
     progress: Try,
     name: str,
     max_length: int,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     disconnect_first: bool = True,
     liveness_timeout: float | None = None,
 ) -> Session:
@@ -224,7 +225,7 @@ async def attempt(
         trace=trace,
         liveness_timeout=liveness_timeout,
     )
-    collector = _Collector(link, MAX_EARLY + max_length)
+    collector = _Collector(link, MAX_EARLY_BYTES + max_length)
     try:
         link.send_all([Disconnect(), Connect()] if disconnect_first else [Connect()])
         progress.reach(CONNECTING)
@@ -303,7 +304,7 @@ def names_of(dialects: Sequence[Dialect]) -> str:
 
 async def establish(
     settings: CameraSettings,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     layout: Layout | None = None,
 ) -> Session:
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.

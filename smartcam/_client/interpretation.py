@@ -137,7 +137,7 @@ class Interpretation:
 
     @property
     def layout(self) -> Layout | None:
-        """Layout of every container; None where there is none, or one for each application."""
+        """Layout of every container; None if there is none, or one for each application."""
         return None if self._one is None else self._one.interpreter.layout
 
     @property
@@ -163,7 +163,7 @@ class Interpretation:
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
-        """Return a container's sequence number, None where it has none or does not fit."""
+        """Return a container's sequence number, None if it has none or does not fit."""
         way = self._way(container.application)
         if way is None or way.interpreter.layout is None:
             return None
@@ -245,8 +245,8 @@ class Interpretation:
     ) -> tuple[Sequence[Any], int] | None:
         """Return the values of several containers that came together, and their empty slots.
 
-        None where they are to be interpreted one by one: the interpreter wants a Reader, a
-        sequence number is to be read, or one of them does not fit.
+        None if they are to be interpreted one by one: the interpreter wants a Reader, a sequence
+        number is to be read, or one of them does not fit.
         """
         way = self._way(application)
         if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
@@ -289,7 +289,7 @@ class _Calibrations:
             self._by_application[number] = None if one is None else _calibration(one, y_down)
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
-        """Raise where no value of an interpreter would ever pass.
+        """Raise if no value of an interpreter would ever pass.
 
         Args:
             application: id of the application whose results are read; None: any.
@@ -440,7 +440,7 @@ class _ApplicationReader:
         interpreter: reader of the containers.
         simple: the interpreter where it wants nothing but the bytes, else None.
         sequenced: whether the interpreter may tell a sequence number.
-        numbering: how the layout carries the sequence number; None where it has none.
+        numbering: how the layout carries the sequence number; None if it has none.
         calibrated: whether values pass through the calibration, if there is one.
     """
 

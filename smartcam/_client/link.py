@@ -20,9 +20,9 @@ from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.doorbell import make_doorbell
-from smartcam._datagrams import LARGEST_DATAGRAM, read_no_more_than_needed, second_socket
+from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
 from smartcam.protocols._inside import Event, ResultBurst
 from smartcam.protocols.messages import (
@@ -42,18 +42,20 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 2
-"""Chunks that may wait for the receive task before the link stops reading from TCP.
+"""Largest number of chunks that may wait for the receive task before the link stops reading from
+TCP.
 
 The link stops sooner if one chunk is more than the task handles in a turn, and reads on when no
 chunk is left: a camera that sends results faster than they can be delivered has to wait.
 """
 
 MAX_DATAGRAMS = 256
-"""Datagrams that may wait for the receive task; further ones are dropped and counted."""
+"""Largest number of datagrams that may wait for the receive task; further ones are dropped and
+counted."""
 
 MAX_DATAGRAMS_AT_ONCE = 8
-"""Datagrams that are taken in one turn of the loop where they have come already: twice a trigger's
-answers."""
+"""Largest number of datagrams that are taken in one turn of the loop where they have come already:
+twice a trigger's answers."""
 
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
@@ -81,10 +83,12 @@ FIRST_CHUNK = 64
 """Frames of a chunk as long as it is not known how long they take."""
 
 LARGEST_CHUNK = 512
-"""Frames of a chunk, however fast they are worked off: the next ones may take longer."""
+"""Largest number of frames of a chunk, however fast they are worked off: the next ones may take
+longer."""
 
-MAX_REST = 256
-"""Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
+MAX_REST_BYTES = 256
+"""Largest number of bytes of an unfinished frame that a trace shows: it may be as long as the
+largest frame."""
 
 
 @dataclass(slots=True)
@@ -140,12 +144,14 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
-        self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
+        # function that takes the bytes of an unfinished frame
+        self.on_rest: Callable[[bytes], None] | None = None
         self._chunks: collections.deque[Chunk] = collections.deque()
         self.deliveries = 0  # of bytes that gave events, so far
         self._frames = 0  # that came until the last chunk
         self._most = FIRST_CHUNK  # frames of the next chunk
-        self._busy_since: float | None = None  # with the last chunk, where it was a large one
+        # time since which the link works on the last chunk, if that was a large one
+        self._busy_since: float | None = None
         self._busy_with = 0
         self._doorbell = make_doorbell(self.loop)  # of the task that receives
         self._closed: asyncio.Future[None] = self.loop.create_future()
@@ -382,7 +388,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """
         for _ in range(min(MAX_DATAGRAMS_AT_ONCE, MAX_DATAGRAMS) - 1):
             try:
-                data = sock.recv(LARGEST_DATAGRAM)
+                data = sock.recv(MAX_DATAGRAM_BYTES)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError as exc:
@@ -493,7 +499,7 @@ async def open_link(
     *,
     name: str,
     max_length: int,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
     liveness_timeout: float | None = None,
 ) -> Link:
     """Open a link; bounded by the caller's deadline.
@@ -515,17 +521,26 @@ async def open_link(
     loop = asyncio.get_running_loop()
     machine: LinkMachine
 
-    def note(entry: TraceEntry) -> None:
-        logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
+    def note(frame: RawFrame) -> None:
+        if logger.isEnabledFor(logging.DEBUG):
+            entry = frame.entry()
+            logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
         if trace is not None:
-            trace(entry)
+            trace(frame)
 
     def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
-        note(_trace_entry(name, machine.dialect, sender, frame))
+        at = datetime.now(UTC)
+        said: Frame | TraceEntry
+        if isinstance(frame, RemoteProtocolError):
+            said = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+        else:
+            said = frame
+        note(RawFrame(at, name, machine.dialect, sender, said))
 
     def on_rest(rest: bytes) -> None:
-        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST].hex()
-        note(TraceEntry(datetime.now(UTC), name, "!", None, text, None, shown))
+        at, text = datetime.now(UTC), f"{len(rest)} bytes that make no whole frame"
+        said = TraceEntry(at, name, "!", None, text, None, rest[:MAX_REST_BYTES].hex())
+        note(RawFrame(at, name, machine.dialect, Sender.CAMERA, said))
 
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
     machine = protocol.machine(
@@ -559,14 +574,3 @@ def _keep_alive(sock: socket.socket, timeout: float) -> None:
     for name, value in options.items():
         if hasattr(socket, name):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-
-
-def _trace_entry(
-    name: str, dialect: Dialect, sender: Sender, frame: Frame | RemoteProtocolError
-) -> TraceEntry:
-    at = datetime.now(UTC)
-    if isinstance(frame, RemoteProtocolError):
-        return TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
-    message_id, message, fields, data = dialect.spell(sender, frame)
-    direction = ">" if sender is Sender.CLIENT else "<"
-    return TraceEntry(at, name, direction, message_id, message, fields, data.hex())

@@ -1,9 +1,9 @@
-"""Asking for the status where it does not come by itself (``bid``), while somebody wants it.
+"""Poll the status, in dialects that do not send it unasked (``bid``), while somebody needs it.
 
-One timer, there as long as a wait for a status or a trigger is under way, or statuses or events are
-subscribed to. It asks while no question is open, whoever asked; one that was not answered is
-repeated after a while, since a datagram may be lost. On TCP nothing is lost: if a camera sends
-other messages there but no answer, the link is given up.
+There is one timer, which runs while a wait for a status or a trigger is pending, or while statuses
+or events are subscribed to. It asks only if no question is open, from whichever task; an unanswered
+question is repeated after a while, since a datagram may be lost. On TCP nothing is lost: if a
+camera sends other messages but no answer, the link is given up.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 PERIOD = 0.02
-"""Seconds between two questions while somebody waits: a fraction of a usual inspection."""
+"""Seconds between two questions while somebody waits: a fraction of a usual inspection time."""
 
 IDLE_PERIOD = 0.25
-"""Seconds between two questions where statuses are only subscribed to."""
+"""Seconds between two questions while statuses are only subscribed to."""
 
 REPEAT_AFTER = 0.5
 """Seconds until an open question counts as lost: answers take milliseconds."""
@@ -35,7 +35,7 @@ REPEAT_AFTER = 0.5
 
 @dataclass(eq=False)
 class Polling:
-    """Asks for the status over the link of each session in which it has to be asked for."""
+    """Polls the status over the link of each session that needs it."""
 
     _connection: Connection
     _requests: Requests
@@ -46,21 +46,21 @@ class Polling:
 
     def __post_init__(self) -> None:
         self._running = False
-        self._triggered = False  # a trigger is under way
+        self._triggered = False  # whether a trigger is pending
         self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0  # when it fires: a timer of uvloop does not tell
+        self._due = 0.0  # time at which the timer fires; a timer of uvloop does not say
         self._open_since = 0.0
-        self._heard = -1  # statuses that had come when this timer looked last
+        self._heard = -1  # number of statuses that had come when the timer fired last
 
     def begin_session(self) -> None:
-        """Begin to ask, where the status does not come by itself."""
+        """Begin to ask, if the dialect does not send the status unasked."""
         self._running = self._connection.features.polled
         self._open_since = 0.0
         self._heard = -1
         self.wanted()
 
     def end_session(self) -> None:
-        """Ask no more."""
+        """Stop asking."""
         self._running = False
         self._stop()
 
@@ -75,10 +75,10 @@ class Polling:
         self._set_timer(0.0)
 
     def begin_trigger(self, questions: int) -> None:
-        """Note that a trigger is under way, which needs the status.
+        """Note that a trigger is pending, which needs the status.
 
         Args:
-            questions: how often the status was asked for together with it.
+            questions: number of questions that were sent together with the trigger.
         """
         self._triggered = True
         if questions:
@@ -86,7 +86,7 @@ class Polling:
         self.wanted()
 
     def end_trigger(self) -> None:
-        """Note that no trigger is under way any more."""
+        """Note that no trigger is pending any more."""
         self._triggered = False
 
     def _stop(self) -> None:
@@ -114,7 +114,7 @@ class Polling:
         if not state.owes_status:
             try:
                 self._requests.ask_status()
-            except SmartCamError:  # the link is over: the receive task tells
+            except SmartCamError:  # the link has ended, which the receive task reports
                 return
         self._set_timer(PERIOD if soon else IDLE_PERIOD)
 
@@ -125,5 +125,5 @@ class Polling:
 
     @property
     def _may_be_silent(self) -> bool:
-        """The camera loads or inspects, and may answer only after that."""
+        """Return True while the camera loads or inspects, since it may answer only afterwards."""
         return self._waits.owes(SwitchAnswer) or self._waits.owes(TriggerAnswer)

@@ -1,4 +1,4 @@
-"""Log what a camera can cause, at a bounded rate: a camera that floods does not flood the log."""
+"""Log lines that a camera causes, at a bounded rate, so that no camera floods the log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 MAX_REMARKS = 20
-"""Lines of one kind that a camera may cause in each period."""
+"""Largest number of lines of one kind that a camera may cause in each period."""
 
 PERIOD = 60.0
 """Seconds in which the lines of a kind are counted together."""
@@ -25,7 +25,7 @@ class _Logged:
 class Remarks:
     """The log lines that one camera causes, each of a kind that has its own count.
 
-    Whoever calls it uses a handful of kinds, never a text of the camera's.
+    Callers use a handful of kinds, never a text from the camera.
 
     Args:
         name: the camera's name, which begins each line.
@@ -42,8 +42,8 @@ class Remarks:
             kind: name of the kind, for people.
             level: level of the line.
             text: form of the line.
-            values: what stands in the form.
-            now: seconds since any beginning.
+            values: values for the form.
+            now: seconds of any clock that does not jump.
         """
         found = self._kinds.setdefault(kind, _Logged(now))
         if now - found.begun >= PERIOD:
@@ -57,7 +57,7 @@ class Remarks:
             logger.log(level, more, self._name, kind, PERIOD, MAX_REMARKS)
 
     def end(self) -> None:
-        """Log how many lines were left out, since the session is over."""
+        """Log the number of left-out lines at the session's end."""
         for kind, found in self._kinds.items():
             self._tell_left_out(kind, logging.WARNING, found)
         self._kinds.clear()

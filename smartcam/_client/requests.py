@@ -49,13 +49,14 @@ class Requests:
     _state: CameraState
     # seconds that an answer may take, however short the caller's deadline is
     patience: float
-    _switch_patience: float  # the same of the answer to a switch
+    _switch_patience: float  # the same bound for the answer to a switch
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        self._late: asyncio.Future[None] | None = None  # of the wait that has the timer
+        # future of the wait that the timer belongs to
+        self._late: asyncio.Future[None] | None = None
         self._timer = DeadlineTimer(self._wake_late)
 
     def finish(self) -> None:

@@ -57,7 +57,7 @@ class PendingTrigger(SentTrigger):
         has_input: True if input data was sent with the trigger.
         sent_at: loop time at which the trigger was sent.
         triggered_at: time of the wall clock, UTC.
-        application: id of the application that is believed to be active, None where any will do.
+        application: id of the application that is believed to be active, None if any will do.
         results: results received so far.
         unproven: containers that wait for proof that the camera took the trigger (those with the
             fate ``triggered`` are its own then), and the containers behind them.
@@ -213,7 +213,7 @@ class Results:
         """Take a status.
 
         Args:
-            previous: the one before, None where there was none in this session.
+            previous: the one before, None if there was none in this session.
             bits: the new one.
             now: loop time.
         """
@@ -296,7 +296,7 @@ class Results:
         return not ours and self._listeners.streams_results
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
-        """Return the results of a burst that is only streamed; None where one may be anything else.
+        """Return the results of a burst that is only streamed; None if one may be anything else.
 
         Otherwise a trigger or a single waiter may want one of them, one may pay a debt, an observer
         may look at each by itself, and one that cannot be interpreted is an item of its own.

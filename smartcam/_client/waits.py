@@ -89,7 +89,7 @@ class Waits:
         self._asked_at: dict[object, float] = {}
         self._behind: dict[object, int] = {}  # deliveries that came before the request was sent
         self._fences_open = 0  # Queries that went out with the last trigger and are not answered
-        self.statuses: dict[StatusWaiter, None] = {}  # in order; each leaves in one step
+        self.statuses: dict[StatusWaiter, None] = {}  # waiters in order; each leaves in one step
 
     def begin_session(self) -> None:
         """Begin a session, in which nothing is asked yet."""

@@ -1,6 +1,6 @@
-"""A plane as a camera without distortion sees it: ``w (p, 1) = matrix (u, v, 1)``.
+"""Map a plane as a camera without distortion does: ``w (p, 1) = matrix (u, v, 1)``.
 
-The matrix is (3, 3) where points come out in a plane, and (4, 3) where they come out in space.
+The matrix is (3, 3) if the results are points in a plane, and (4, 3) if they are points in space.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 def fit_homography(flat: Array, pixels: Array) -> Array | None:
-    """Return the (3, 3) matrix from points of a plane to pixels; None where nothing fits.
+    """Return the (3, 3) matrix from points of a plane to pixels; None if no matrix fits.
 
-    There are four points or more: ``flat`` (N, 2), metres, and ``pixels`` (N, 2).
+    Four points or more are needed: ``flat`` (N, 2), metres, and ``pixels`` (N, 2).
     """
     # Each pair gives two linear equations of the nine elements, u (h3 x) = h1 x and
     # v (h3 x) = h2 x; their least singular vector, of normalised points, begins a refinement of
@@ -66,10 +66,10 @@ def element_derivatives(matrix: Array, points: Array) -> Array:
 
 
 def tangent_frames(slopes: Array, ahead: Array) -> Array:
-    """Return rotations (N, 3, 3) whose z is a plane's normal, and x a direction of the camera's.
+    """Return rotations (N, 3, 3) with a plane's normal as z and a direction of the camera as x.
 
-    ``slopes`` (N, 3, 2): the derivatives where they stand, or multiples of them. ``ahead`` (N, 2):
-    the directions in the camera's coordinates.
+    ``slopes`` (N, 3, 2): the derivatives at each place, or multiples of them. ``ahead`` (N, 2): the
+    directions in the camera's coordinates.
     """
     first = np.einsum("nij,nj->ni", slopes, ahead)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -81,7 +81,7 @@ def tangent_frames(slopes: Array, ahead: Array) -> Array:
 def local_steps(seen: Callable[[Array], Array], points: Array, step: float) -> Array:
     """Return the image vectors of ``step`` along x and along y, (N, 2, 2), pixels.
 
-    ``seen`` gives where points (N, 2) of the plane are seen; ``step`` is in the plane's unit.
+    ``seen`` maps points (N, 2) of the plane to pixels; ``step`` is in the plane's unit.
     """
     ways = [(seen(points + way) - seen(points - way)) / 2 for way in step * np.eye(2)]
     return np.stack(ways, axis=1)

@@ -1,4 +1,4 @@
-"""Names that other rooms import from this one; users do not need them."""
+"""Names that other packages of smartcam import from this one; users do not need them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from smartcam.calibration._printing.sheets import on_paper
     from smartcam.calibration._stereo.rectification import Rectification, rectify
     from smartcam.calibration._targets import Target
-    from smartcam.calibration._units import METRES
+    from smartcam.calibration._units import METRES_PER_UNIT
     from smartcam.calibration._verdict import doubt_of
-    from smartcam.calibration.formats._cameras import MAX_FILE, CameraInfo, parse_camera_info
+    from smartcam.calibration.formats._cameras import MAX_FILE_BYTES, CameraInfo, parse_camera_info
     from smartcam.calibration.formats._lenses import StoredLenses, read_lenses
     from smartcam.calibration.wizards._listing import listing
-    from smartcam.calibration.wizards._pictures import MAX_PICTURE, SUFFIXES, decode_picture
+    from smartcam.calibration.wizards._pictures import MAX_PICTURE_BYTES, SUFFIXES, decode_picture
     from smartcam.calibration.wizards._steps import Input
     from smartcam.calibration.wizards._thesis import (
         CalibrationCamera,
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOOKS",
-    "MAX_FILE",
-    "MAX_PICTURE",
-    "METRES",
+    "MAX_FILE_BYTES",
+    "MAX_PICTURE_BYTES",
+    "METRES_PER_UNIT",
     "SUFFIXES",
     "WIZARD",
     "AnyCalibration",
@@ -83,12 +83,12 @@ if not TYPE_CHECKING:
             "_printing.sheets": "on_paper",
             "_stereo.rectification": "Rectification rectify",
             "_targets": "Target",
-            "_units": "METRES",
+            "_units": "METRES_PER_UNIT",
             "_verdict": "doubt_of",
-            "formats._cameras": "CameraInfo MAX_FILE parse_camera_info",
+            "formats._cameras": "CameraInfo MAX_FILE_BYTES parse_camera_info",
             "formats._lenses": "StoredLenses read_lenses",
             "wizards._listing": "listing",
-            "wizards._pictures": "MAX_PICTURE SUFFIXES decode_picture",
+            "wizards._pictures": "MAX_PICTURE_BYTES SUFFIXES decode_picture",
             "wizards._steps": "Input",
             "wizards._thesis": "CalibrationCamera CalibrationDesks CalibrationStart "
             "PixelPoseRequest StepRequest ThesisCalibration",

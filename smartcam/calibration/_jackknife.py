@@ -1,8 +1,8 @@
-"""The jackknife: an estimate's covariance, from what it would be without each of its views.
+"""Compute the jackknife: the covariance of an estimate from the estimates without each view.
 
-What residuals of one view have in common (a sheet that bends anew, a shutter that rolls, a lens
-that is not quite of its model) is no noise of points, of which there are hundreds: it is one error
-a view. So the number of views counts, and how far each of them pulls the estimate.
+An error that all residuals of a view share (a sheet that bends anew, a rolling shutter, a lens that
+does not quite follow its model) is no noise of its hundreds of points: it is one error per view. So
+the number of views counts, and how far each of them pulls the estimate.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def jackknife(left_out: Array) -> Array:
     """Return the covariance (K, K) of an estimate of K values.
 
-    ``left_out`` (V, K): what it is without each of its V views, 2 or more; differences to any one
-    value do, too. NaN where one of them is.
+    ``left_out`` (V, K): the estimate without each of its V views, 2 or more, or its difference to
+    any fixed value. The covariance is NaN where one of these is.
     """
     # (V - 1) / V times the squares about their mean: an estimate without one view is off the whole
     # one by 1 / (V - 1) of how far that view is off the mean of all.
@@ -35,19 +35,19 @@ def jackknife(left_out: Array) -> Array:
 
 
 def weighed_jackknife(changes: Array, spreads: Array, whole: Array) -> Array:
-    """Return the covariance of a least squares estimate, views that pull more weighed less.
+    """Return the jackknife of a least-squares estimate, with less weight for views that pull more.
 
-    The plain one is too large by a half and more where single views tell much of what is known, as
-    they do of lenses. ``changes`` (V, K): by how much the estimate changes without each view.
-    ``spreads`` (V, K, K): covariance of the estimate without it, ``whole`` (K, K): with all, both
-    as independent errors of all points would lead to.
+    The plain jackknife is too large by a half and more if single views carry much of the
+    information, as they do for lenses. ``changes`` (V, K): by how much the estimate changes without
+    each view. ``spreads`` (V, K, K) is the covariance of the estimate without each view, ``whole``
+    (K, K) that with all; both are those that independent errors of all points would cause.
     """
-    # With L L^T the whole one and W_i = L^-1 C_i L^-T, change i weighs W_i^(-1/3). With W_i^(-1/2)
-    # the squares' sum has the expectation of the covariance where points err independently, and
-    # halves of recorded sets differ by 1.2 times as much; with 1, the plain jackknife, they differ
-    # by 0.8 times as much, and simulated lenses by 0.7 (measured).
-    # Source: Bell and McCaffrey, Bias Reduction in Standard Errors for Linear Regression with
-    # Multi-Stage Samples (2002).
+    # With L L^T the whole covariance and W_i = L^-1 C_i L^-T, change i weighs W_i^(-1/3). With
+    # W_i^(-1/2) the squares' sum has the expectation of the covariance where points err
+    # independently, and halves of recorded sets differ by 1.2 times as much; with 1, the plain
+    # jackknife, they differ by 0.8 times as much, and simulated lenses by 0.7 (measured). Source:
+    # Bell and McCaffrey, Bias Reduction in Standard Errors for Linear Regression with Multi-Stage
+    # Samples (2002).
     if not changes.size:
         return np.zeros(whole.shape)
     scale = unit_diagonal(whole)

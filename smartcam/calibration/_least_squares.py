@@ -1,10 +1,10 @@
-"""Least squares with many poses, each of which concerns its own views alone.
+"""Solve least squares with many poses, each of which affects its own views only.
 
-The unknowns are those that all residuals share (lenses, a rig, where a camera is on a robot), and
-six or none for each pose. The matrix of the normal equations is an arrow then: a block for what is
-shared, a small block for each pose, and what lies between the two; poses have nothing to do with
-each other. So poses are eliminated before what is shared is solved, and time grows with their
-number, not with its cube.
+The unknowns are those that all residuals share (lenses, a rig, the place of a camera on a robot),
+and six or none for each pose. The matrix of the normal equations then has the form of an arrow: a
+block for the shared unknowns, a small block for each pose, and blocks between the two, but none
+between poses. So the poses are eliminated before the shared unknowns are solved, and the time grows
+with the number of poses, not with its cube.
 
 Source: Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle Adjustment - A Modern Synthesis (2000),
 section 6; Hartley and Zisserman, Multiple View Geometry, 2nd edition, appendix 6.
@@ -31,16 +31,19 @@ MAX_STEPS = 100
 """A fit takes at most this many steps; from a linear solution it takes about ten."""
 
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
-"""Part of the diagonal that is added to it; with the most of it no step is large enough to gain."""
+"""Least and largest part of the diagonal that is added to it; with the largest no step is long
+enough to gain anything."""
 
 RANK = 1e-14
-"""Singular values of a matrix with a unit diagonal are rounding below this part of the largest."""
+"""In a matrix with a unit diagonal, singular values below this part of the largest are rounding
+errors."""
 
 RANK_OF_COVARIANCE = 1e-12
-"""Eigenvalues of a covariance with a unit diagonal are rounding below this part of the largest."""
+"""In a covariance with a unit diagonal, eigenvalues below this part of the largest are rounding
+errors."""
 
 MAX_UNKNOWNS_BY_SVD = 60
-"""Unknowns, beyond which singular values cost too much time to be looked at first."""
+"""With more unknowns than this, computing singular values first would take too much time."""
 
 
 class Normal(NamedTuple):
@@ -48,9 +51,9 @@ class Normal(NamedTuple):
 
     cost: float  # sum of the squared residuals; infinite where there is no model
     shared: Array  # (S, S), J^T J of the shared unknowns
-    shared_right: Array  # (S,), J^T r of them
-    own: Array  # (P, K, K), J^T J of each pose's K unknowns; 0 where nothing moves a pose
-    own_right: Array  # (P, K), J^T r of them
+    shared_right: Array  # (S,), J^T r of the shared unknowns
+    own: Array  # (P, K, K), J^T J of each pose's K unknowns; 0 for a pose that has no observation
+    own_right: Array  # (P, K), J^T r of each pose's unknowns
     mixed: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
@@ -66,11 +69,11 @@ class Normal(NamedTuple):
         )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-        """Return the shared unknowns' matrix and right side, and what gives the poses back.
+        """Eliminate the poses; return the shared equations, and what the poses follow from.
 
-        Matrix (S, S) and right side (S,), then (P, K, S) and (P, K): a pose's change is the last
-        less the one before it times the shared change. ``damping``: part of the diagonal that is
-        added to it.
+        The result is a matrix (S, S) and a right side (S,), then (P, K, S) and (P, K): the change
+        of a pose is the last minus the third times the shared change. ``damping``: part of the
+        diagonal that is added to it.
         """
         # Schur's complement. Of the equations
         #     A x + sum_p B_p^T y_p = a      (shared)
@@ -96,7 +99,7 @@ class Normal(NamedTuple):
     def covariance(self) -> tuple[Array, Array]:
         """Return the covariances of the shared unknowns (S, S) and of each pose (P, K, K).
 
-        They are NaN where ``cost`` is infinite.
+        They are NaN if ``cost`` is infinite.
         """
         if not math.isfinite(self.cost):
             return np.full_like(self.shared, np.nan), np.full_like(self.own, np.nan)
@@ -120,15 +123,15 @@ def minimize(
 ) -> tuple[T, Normal]:
     """Minimise the sum of squares; return the solution and the normal equations there.
 
-    Levenberg's and Marquardt's method: a step that gains makes the damping ten times smaller, one
-    that does not is taken back and makes it ten times larger.
+    Levenberg's and Marquardt's method: a step that lowers the sum makes the damping ten times
+    smaller; any other is taken back and makes it ten times larger.
 
-    ``moved`` gives what the changes of the shared unknowns (S,) and of the poses (P, K) lead to; a
-    :class:`CalibrationError` says that they lead nowhere. ``gain``: part of the cost that a step
-    must gain, else it was the last; ``noise`` is added to the cost there: exact samples leave only
-    rounding errors to gain. ``damping``: part of the diagonal that is added to it at first; little
-    where it begins near. The best that was found is returned; its cost is infinite where it is so
-    from the beginning.
+    ``moved`` returns the solution changed by steps of the shared unknowns (S,) and of the poses (P,
+    K); it raises :class:`CalibrationError` if the steps lead to no valid one. A step that lowers
+    the cost by less than the part ``gain`` of it is the last; for this comparison ``noise`` is
+    added to the cost, since exact samples leave only rounding errors to gain. ``damping`` is the
+    part of the diagonal that is added to it at first; it may be small if the start is near. The
+    best solution found is returned; its cost is infinite if that of the start is.
     """
     normal = evaluate(at)
     for _ in range(MAX_STEPS):
@@ -153,7 +156,7 @@ def minimize(
 
 
 def unit_diagonal(matrix: Array) -> Array:
-    """Return by what rows and columns of a positive matrix are divided to make its diagonal 1."""
+    """Return the divisors of a positive matrix' rows and columns that make its diagonal 1."""
     # Pixels, radians and metres differ by orders of magnitude; with D = diag(A)^(1/2) the condition
     # of D^-1 A D^-1 is near the least that any diagonal scaling gives.
     # Source: van der Sluis, Condition numbers and equilibration of matrices (1969).
@@ -185,7 +188,7 @@ def inverse_scaled(matrix: Array) -> Array:
 
 
 def independent_parts(covariance: Array) -> Array:
-    """Return independent vectors (K, S) of one standard deviation, whose squares add up to it."""
+    """Return independent vectors (K, S) whose outer products add up to a covariance."""
     scale = unit_diagonal(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = values > RANK_OF_COVARIANCE * values.max(initial=0.0)

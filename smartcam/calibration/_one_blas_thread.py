@@ -1,8 +1,8 @@
 """Hold the linear algebra to one thread while something is calibrated.
 
-The matrices have up to some hundred rows. OpenBLAS divides such a one among threads that wait for
-each other without sleeping: that takes several times the CPU time, and where other work keeps the
-processors busy, a hundred times as long.
+The matrices have up to some hundred rows. OpenBLAS divides the work on such a matrix among threads
+that wait for each other without sleeping. That takes several times the CPU time, and a hundred
+times as long while other work keeps the processors busy.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from smartcam.exceptions import MissingExtraError
 
 
 class OneBlasThread(ContextDecorator):
-    """Have BLAS use one thread inside of ``with``, or in a function, and afterwards what it did.
+    """Limit BLAS to one thread inside of ``with`` or a function; restore the number afterwards.
 
-    Whether that is a matter of the calling thread or of the process depends on the version of
+    Whether the limit applies to the calling thread or to the process depends on the version of
     threadpoolctl (extra ``calibration``). So each thread sets the limit, and the number that the
     first one found is restored. Without threadpoolctl nothing changes.
     """
@@ -32,7 +32,7 @@ class OneBlasThread(ContextDecorator):
     def forked(self) -> None:
         """Start anew in a fork, which may go on with one thread."""
         self._lock = threading.Lock()
-        self._inside: Counter[int] = Counter()  # how deep, by thread
+        self._inside: Counter[int] = Counter()  # depth of nested uses, by thread
         self._before: Any = None
 
     def __enter__(self) -> None:

@@ -1,13 +1,14 @@
-"""Solvers: the parts that a way from the camera's coordinates to the robot's is made of.
+"""Solvers: the parts of a transformation from the camera's coordinates to the robot's.
 
 Each does one part of the transformation and knows nothing of the others; a :class:`Chain` applies
-them in order. All of them take and give :class:`Poses`: arrays of points and orientations. What the
-camera says is a pose on its own plane: ``z`` is 0 and the orientation a turn about ``z``.
+them in order. All of them map :class:`Poses` to :class:`Poses`: arrays of points and orientations.
+A localization of the camera is a pose on its own plane: ``z`` is 0 and the orientation a turn about
+``z``.
 
-The thesis' two solvers are :class:`CameraPosition2D` and :class:`RealWorldPosition`. Where their
-description differs from what stands here, what stands here is right: the origin is subtracted
-before turning, the part's own angle loses the origin's, and the plane has a direction in itself
-beside its normal.
+The thesis' two solvers are :class:`CameraPosition2D` and :class:`RealWorldPosition`. The thesis'
+description differs in three points, which are corrected here: the origin is subtracted before
+turning, the origin's angle is subtracted from the part's, and the plane has a direction within
+itself in addition to its normal.
 """
 
 from __future__ import annotations
@@ -76,14 +77,14 @@ class Poses(NamedTuple):
 
     @classmethod
     def of(cls, localizations: Iterable[Localization]) -> Poses:
-        """Return the poses of what a camera found."""
+        """Return the poses of localizations."""
         poses = [part.pose for part in localizations]
         points = np.array([pose.position for pose in poses], dtype=np.float64)
         quaternions = np.array([pose.orientation for pose in poses], dtype=np.float64)
         return cls(points.reshape(-1, 3), quaternions.reshape(-1, 4))
 
     def moved(self, rotation: Array, translation: Array) -> Poses:
-        """Return all of them after one rigid motion, given in the frame that they are in.
+        """Return the poses after one rigid motion, which is given in their own frame.
 
         Args:
             rotation: (3, 3).
@@ -93,7 +94,7 @@ class Poses(NamedTuple):
         return Poses(self.points @ rotation.T + translation, turned)
 
     def put(self, localizations: Iterable[Localization]) -> list[Localization]:
-        """Return as many localizations with these poses, and the headers that they had."""
+        """Return the localizations with these poses, in the same order, and their own headers."""
         rows = zip(localizations, self.points.tolist(), self.quaternions.tolist(), strict=True)
         return [
             part._replace(pose=Pose(part.pose.header, Position(*at), Quaternion(*turn)))
@@ -106,23 +107,24 @@ class Solver(Protocol):
     """One part of a coordinate transformation."""
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses behind this part; those that came are left as they are."""
+        """Return the poses after this part; the given ones are not changed."""
         ...
 
 
 class CameraPosition2D:
-    """From the camera's coordinates to those of the origin mark on its plane.
+    """Solver from the camera's coordinates to those of the origin mark on its plane.
 
-    ``p' = scale R(-theta) (p - origin)``, and each orientation loses ``theta``. A height above the
-    camera's plane stays one.
+    ``p' = scale R(-theta) (p - origin)``, and ``theta`` is subtracted from each orientation. A
+    height above the camera's plane is only scaled.
 
     Args:
-        origin: (2,), the origin mark as the camera sees it, in the camera's unit.
-        theta: angle of the origin mark as the camera sees it, radians, counter-clockwise with y up.
-        scale: metres in one of the camera's units; 1 where the camera gives metres.
+        origin: (2,), the origin mark in the camera's coordinates.
+        theta: angle of the origin mark in the camera's coordinates, radians, counter-clockwise with
+            y up.
+        scale: metres per unit of the camera; 1 if the camera gives metres.
 
     Raises:
-        CalibrationError: ``SHAPE``, or ``NOT_FINITE``: a scale that is not positive, too.
+        CalibrationError: ``SHAPE``, or ``NOT_FINITE``, also for a scale that is not positive.
 
     Source: the thesis' ``solver_camera_2D_position``, 3.2.5.1; that the origin is subtracted, and
     first, is derived: the origin itself must come to zero.
@@ -137,24 +139,24 @@ class CameraPosition2D:
         self._back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses as the origin mark sees them, metres."""
+        """Return the poses relative to the origin mark, metres."""
         # the origin first: turned first, it would not come to zero
         centred = poses.points - np.array([*self.origin, 0.0])
         return Poses(self.scale * centred, poses.quaternions).moved(self._back, np.zeros(3))
 
 
 class RealWorldPosition:
-    """From the plane of the origin mark into the robot's space: ``p' = rotation p + origin``.
+    """Solver from the plane of the origin mark to the robot's space: ``p' = rotation p + origin``.
 
     Args:
-        origin: (3,), where the robot touched the origin mark, metres.
+        origin: (3,), place at which the robot touched the origin mark, metres.
         rotation: (3, 3), whose columns are the plane's x, y and normal in the robot's frame.
 
     Raises:
-        CalibrationError: ``NOT_RIGID``: no rotation.
+        CalibrationError: ``NOT_RIGID``: the matrix is no rotation.
 
-    Source: the thesis' ``solver_real_world_position``, 3.2.5.1. Point, normal and scale leave the
-    turn about the normal open; so the whole rotation stands here (derived).
+    Source: the thesis' ``solver_real_world_position``, 3.2.5.1. Point, normal and scale do not
+    determine the turn about the normal, so the whole rotation is given (derived).
     """
 
     def __init__(self, origin: ArrayLike, rotation: ArrayLike) -> None:
@@ -189,10 +191,10 @@ class RealWorldPosition:
 
 
 class PlaneProjection:
-    """From the plane of a camera that is tilted, or whose axes have scales of their own.
+    """Solver for a camera that is tilted, or whose two axes have different scales.
 
-    ``w (x, y, z, 1) = matrix (u, v, 1)``. An orientation follows its x axis as it is mapped at that
-    place, and stands on the plane.
+    ``w (x, y, z, 1) = matrix (u, v, 1)``. The x axis of an orientation is mapped at its place; its
+    z axis is the plane's normal.
 
     Args:
         matrix: (4, 3), metres; ``w`` is positive in the camera's field.
@@ -233,7 +235,7 @@ class PlaneProjection:
 
 
 class Height:
-    """Parts that stand out of the plane: from where the camera sees them to where they are.
+    """Solver for parts that are higher than the plane: from where they are seen to where they are.
 
     A point at ``height`` above the plane is seen where the ray through it meets the plane, farther
     from the point below the camera than it is. Without ``viewpoint`` the rays are taken as parallel
@@ -242,8 +244,8 @@ class Height:
     Args:
         height: metres above the plane, in the direction of ``normal``; negative is below.
         normal: (3,), the plane's, of any length.
-        viewpoint: (3,), where the rays meet: the camera's centre of projection, metres. In the same
-            frame as the poses that come, as ``normal`` is.
+        viewpoint: (3,), the camera's centre of projection, metres. It is in the frame of the poses,
+            as ``normal`` is.
 
     Raises:
         CalibrationError: ``SHAPE`` or ``NOT_FINITE``; ``SHORT_LEVER``: a normal without a length;
@@ -269,7 +271,7 @@ class Height:
         )
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses at the height of what was seen."""
+        """Return the poses at the height of the features that were seen."""
         points = poses.points
         if self.viewpoint is None:
             return Poses(points + self.height * self.normal, poses.quaternions)
@@ -288,17 +290,17 @@ class Height:
 
 
 class ToolOffset:
-    """From the pose of a part to one that is fixed to it: where a tool is to go.
+    """Solver from the pose of a part to the pose that a tool must take at it.
 
-    ``T_robot_tool = T_robot_part @ T_part_tool``. With the inverse of a tool's tip on the flange it
-    gives the flange's pose that puts the tip onto the part.
+    ``T_robot_tool = T_robot_part @ T_part_tool``. With the inverse of the tip's pose on the flange,
+    the result is the flange's pose that puts the tip onto the part.
 
     Args:
         translation: (3,), metres, in the part's frame.
         quaternion: (4,), the tool's orientation in the part's frame, ``x, y, z, w``.
 
     Raises:
-        CalibrationError: ``NOT_RIGID``: no quaternion.
+        CalibrationError: ``NOT_RIGID``: the numbers are no quaternion.
     """
 
     def __init__(
@@ -312,7 +314,7 @@ class ToolOffset:
 
     @classmethod
     def facing(cls) -> ToolOffset:
-        """Return the half turn about x: a tool whose z points into the plane, as grippers' do."""
+        """Return the half turn about x, for a tool whose z points into the plane."""
         return cls(quaternion=(1.0, 0.0, 0.0, 0.0))
 
     @classmethod
@@ -331,7 +333,7 @@ class ToolOffset:
         return cls(back.translation, back.quaternion)
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the tool's poses, in the frame of the poses that came."""
+        """Return the tool's poses, in the frame of the given poses."""
         return Poses(
             poses.points + rotate(poses.quaternions, self.translation),
             quaternion_multiply(poses.quaternions, self.quaternion),
@@ -339,14 +341,15 @@ class ToolOffset:
 
 
 class Chain:
-    """Solvers, one behind the other; itself a solver, so chains can be parts of chains.
+    """Solvers that are applied one after the other; a chain is itself a solver.
 
     Args:
         solvers: solvers in the order in which they are applied.
-        frame: name of the frame that they lead to; it stands in the headers of :meth:`to_robot`.
+        frame: name of the frame that the chain leads to, which :meth:`to_robot` writes into
+            headers.
         camera_frame: name of the frame that localizations must come in; None for any.
-        y_down: whether the camera's y axis points down and is turned up before they come, as
-            :func:`smartcam.connect` does and compares; None: not known.
+        y_down: whether the camera's y axis points down and is turned up before localizations come,
+            as :func:`smartcam.connect` does and compares; None: not known.
     """
 
     @takes(solvers=a_list)
@@ -364,7 +367,7 @@ class Chain:
         self.y_down: bool | None = y_down
 
     def then(self, *solvers: Solver) -> Chain:
-        """Return a chain with these behind its own."""
+        """Return a chain with further solvers after those of this one."""
         return Chain(
             [*self.solvers, *solvers],
             frame=self.frame,
@@ -373,10 +376,11 @@ class Chain:
         )
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses behind the last solver.
+        """Return the poses after the last solver.
 
         Raises:
-            CalibrationError: ``NOT_FINITE``: they are no numbers; and what the solvers raise.
+            CalibrationError: ``NOT_FINITE``: a pose has a value that is no finite number; and the
+                errors of the solvers.
         """
         with np.errstate(all="ignore"):
             for solver in self.solvers:
@@ -386,7 +390,7 @@ class Chain:
         return poses
 
     def transform(self, points: ArrayLike) -> Array:
-        """Return points of the camera, (N, 2), in the robot's frame, (N, 3) in metres."""
+        """Map points of the camera (N, 2) to the robot's frame, (N, 3), metres."""
         return self.solve(Poses.planar(points)).points
 
     @overload
@@ -398,11 +402,11 @@ class Chain:
     ) -> Localization | list[Localization]:
         """Return one or many localizations with their poses in the robot's frame.
 
-        Names, qualities, numbers and times are those of the localizations that came.
+        Names, qualities, numbers and times are those of the given localizations.
 
         Raises:
-            CalibrationError: ``WRONG_FRAME``: one comes in another frame than ``camera_frame``; and
-                what the solvers raise.
+            CalibrationError: ``WRONG_FRAME``: a localization is in another frame than
+                ``camera_frame``; and the errors of the solvers.
         """
         if isinstance(localizations, Localization):
             return self._found([localizations])[0]
@@ -418,9 +422,9 @@ class Chain:
 
 
 def check_frames(localizations: Sequence[Localization], frame: str | None, what: str = "") -> None:
-    """Raise (WRONG_FRAME) where a localization comes in another frame than ``frame``; None: any.
+    """Raise WRONG_FRAME if a localization is in another frame than ``frame``; None allows any.
 
-    ``what`` begins the text.
+    ``what`` begins the message.
     """
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
@@ -434,13 +438,13 @@ def check_frames(localizations: Sequence[Localization], frame: str | None, what:
 def chain_of(
     calibration: PlaneCalibration, *, origin: ArrayLike = (0.0, 0.0), theta: float = 0.0
 ) -> Chain:
-    """Return the chain that does what a plane's calibration does.
+    """Return the chain of solvers that is equivalent to a plane's calibration.
 
     Args:
         calibration: calibration from :func:`~smartcam.calibration.fit_plane`.
-        origin: (2,), the camera's point that becomes the plane's origin between the two solvers;
-            where it is changes nothing in the robot's frame, but solvers that are put in between
-            see their poses from there.
+        origin: (2,), the camera's point that becomes the plane's origin between the two solvers; it
+            does not change results in the robot's frame, but it is the origin for solvers that are
+            put in between.
         theta: the angle of the plane's x axis in the camera's coordinates, radians.
 
     Returns:
@@ -449,7 +453,7 @@ def chain_of(
         are ignored.
 
     Raises:
-        CalibrationError: ``SHAPE`` or ``NOT_FINITE``: no such origin.
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``: the origin is not valid.
     """
     frame, camera_frame = calibration.robot_frame, calibration.camera_frame
     y_down = calibration.y_down

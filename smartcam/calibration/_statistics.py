@@ -1,4 +1,4 @@
-"""Compute the probability of a sum of squares where only the touches' noise is at work."""
+"""Compute the probability that the touches' noise alone causes a sum of squares."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ if TYPE_CHECKING:
 class Noise(NamedTuple):
     """The variance of the touches' noise, and how well it is known."""
 
-    variance: float  # of one coordinate, m^2
-    freedom: int | None = None  # of the estimate that it comes from; None where it was given
+    variance: float  # variance of one coordinate, m^2
+    # degrees of freedom of the estimate that the variance comes from; None if it was given
+    freedom: int | None = None
 
     def chance(self, squares: float, count: float) -> float:
         """Return the probability that noise alone gives ``squares`` (m^2, of ``count``) or more.
 
-        Of a chi-square test where the variance was given, of an F-test where it is an estimate from
+        This is a chi-square test if the variance was given, and an F-test if it was estimated from
         other squares.
         """
         special = load("scipy.special")
@@ -29,5 +30,5 @@ class Noise(NamedTuple):
 
 
 def normal_deviations(chance: float | Array) -> float:
-    """Return the number of standard deviations of a normal distribution that is as unlikely."""
+    """Convert a probability to the number of standard deviations that is as unlikely."""
     return float(-load("scipy.special").ndtri(0.5 * max(float(chance), 1e-300)))

@@ -1,4 +1,4 @@
-"""Elements of the pictures, as SVG: lines of text, written the same way on every machine."""
+"""Write the elements of pictures as SVG, with the same bytes on every machine."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ text { fill: #ddd } .paper { fill: #181818 } .first { fill: #56b4e9 } .second { 
 .off { fill: #777 } .axis { stroke: #999 } .first-line { stroke: #56b4e9 }
 .second-line { stroke: #f0a040 } .board { fill: #56b4e9; stroke: #56b4e9 }
 .camera { fill: #f0a040; stroke: #f0a040 } .halo { stroke: #181818 } .on-map { fill: #fff } }"""
-"""Style sheet of pictures that follow a page that is light or dark, in colours that colour-blind
-people tell apart.
+"""Style sheet of pictures that adapt to a light or a dark page, in colours that colour-blind people
+can distinguish.
 
 Source of the colours: Okabe and Ito, Color Universal Design (2008).
 """
 
 
 def document(width: float, height: float, parts: Iterable[str], style: str = STYLE) -> str:
-    """Return a whole picture with a size of its own; lines end with a line feed."""
+    """Return a whole picture of a fixed size; lines end with a line feed."""
     size = f"{width:.0f}", f"{height:.0f}"
     return "\n".join(
         [
@@ -54,7 +54,7 @@ def document(width: float, height: float, parts: Iterable[str], style: str = STY
 
 
 def line(start: Place, end: Place, kind: str, more: str = "") -> str:
-    """Return a line; ``more``: further attributes, a space before them."""
+    """Return a line; ``more``: further attributes, after a space."""
     return (
         f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
         f'class="{kind}"{more}/>'
@@ -62,13 +62,13 @@ def line(start: Place, end: Place, kind: str, more: str = "") -> str:
 
 
 def text(place: Place, said: str, kind: str = "", more: str = "") -> str:
-    """Return a text that begins at a place; ``more``: further attributes, a space before them."""
+    """Return a text that begins at a place; ``more``: further attributes, after a space."""
     of_kind = f' class="{kind}"' if kind else ""
     return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(said)}</text>'
 
 
 def circle(place: Place, radius: float, kind: str) -> str:
-    """Return a circle about a place."""
+    """Return a circle around a place."""
     return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius:g}" class="{kind}"/>'
 
 
@@ -91,6 +91,6 @@ def _titled(element: str, title: str) -> str:
 
 
 def round_down(wanted: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, as large as is wanted at most."""
+    """Return the largest 1, 2 or 5 times a power of ten that is not above ``wanted``."""
     power = 10.0 ** math.floor(math.log10(wanted))
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))

@@ -1,8 +1,8 @@
-"""Printed targets: what is on a sheet, and where each of its points lies.
+"""Describe printed targets: the pattern on a sheet, and the place of each of its points.
 
-A target's frame lies on the sheet as one reads it: origin at a corner of its points, x to the right
-along the ray A, y up along the ray B, z out of the sheet towards the reader. Points are numbered
-from the origin along x, then row by row along y.
+The frame of a target lies on the sheet as it is read: origin at a corner of its points, x to the
+right along the ray A, y up along the ray B, z out of the sheet towards the reader. Points are
+numbered from the origin along x, then row by row along y.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ MAX_POINTS = 10_000
 """A target has at most this many points."""
 
 MAX_LENGTH_M = 1.0
-"""Side of a square, of a marker and distance of dots at most, metres: those of a printed sheet are
-some millimetres to a few hundred, and a number beyond is one of millimetres."""
+"""Largest side of a square or marker, and largest distance of dots, metres: those of a printed
+sheet are some millimetres to a few hundred, so a larger number was meant in millimetres."""
 
-AREA_DISTANCE = 0.3
-"""Sides of a square from an outer corner of a checkerboard, along x and along y, to the middle of
-the round area outside of it."""
+AREA_DISTANCE_SQUARES = 0.3
+"""Distance along x and along y from an outer corner of a checkerboard to the centre of the round
+area outside of it, in sides of a square."""
 
-AREA_DIAMETER = 0.3
-"""Diameter of the round area outside of an outer corner of a checkerboard, sides of a square."""
+AREA_DIAMETER_SQUARES = 0.3
+"""Diameter of the round area outside of an outer corner of a checkerboard, in sides of a square."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkerboard:
     """A checkerboard; its points are the corners where four squares meet.
 
-    The outermost square at the origin is black, and the squares reach from (-1, -1) to
-    (columns, rows) sides of one.
+    The outermost square at the origin is black, and the squares reach from (-1, -1) to (columns,
+    rows), in sides of a square.
 
     Attributes:
         columns: corners along x, at least 3.
         rows: corners along y, at least 3.
         square: side of a square, metres.
-        origin_mark: the area outside of the outer corner next to the origin is a black dot, and
-            those outside of the three other ones are white (thesis 3.2.3.2).
+        origin_mark: whether the area outside of the outer corner next to the origin is a black dot,
+            and the areas outside of the three other corners are white (thesis 3.2.3.2).
     """
 
     kind: ClassVar[str] = "checkerboard"
@@ -75,20 +75,20 @@ class Checkerboard:
 
     @property
     def corner_areas(self) -> Array:
-        """(4, 2), metres: middles of the round areas outside of the outer corners.
+        """Centres of the round areas outside of the outer corners, (4, 2), metres.
 
-        The first is the origin's, the others follow counter-clockwise as one reads the sheet: at
-        the end of the ray A, opposite, at the end of the ray B.
+        The first is at the origin, the others follow counter-clockwise on the sheet as it is read:
+        at the end of the ray A, opposite, at the end of the ray B.
         """
-        low = -self.square * (1 + AREA_DISTANCE)
-        right = self.square * (self.columns + AREA_DISTANCE)
-        top = self.square * (self.rows + AREA_DISTANCE)
+        low = -self.square * (1 + AREA_DISTANCE_SQUARES)
+        right = self.square * (self.columns + AREA_DISTANCE_SQUARES)
+        top = self.square * (self.rows + AREA_DISTANCE_SQUARES)
         return np.array([[low, low], [right, low], [right, top], [low, top]])
 
     @property
     def corner_area_diameter(self) -> float:
         """Diameter of each of the ``corner_areas``, and of the origin's dot, metres."""
-        return AREA_DIAMETER * self.square
+        return AREA_DIAMETER_SQUARES * self.square
 
     @property
     def turned_alike(self) -> bool:
@@ -105,9 +105,9 @@ class Charuco:
         rows: squares along y, at least 3.
         square: side of a square, metres.
         marker: side of a marker, metres, less than ``square``.
-        dictionary: name of one of OpenCV's, such as ``DICT_5X5_250``.
-        legacy_pattern: True to print as OpenCV before 4.6 prints an even number of rows: a white
-            square at the upper left, where a black one is.
+        dictionary: name of one of OpenCV's dictionaries, such as ``DICT_5X5_250``.
+        legacy_pattern: True for the pattern that OpenCV before 4.6 prints with an even number of
+            rows: the square at the upper left is white instead of black.
     """
 
     kind: ClassVar[str] = "charuco"
@@ -150,14 +150,14 @@ class CircleGrid:
     """Dots in rows and columns; its points are their centres.
 
     Attributes:
-        columns: dots of a row, at least 3.
-        rows: dots of a column, at least 3.
-        spacing: between the centres of two neighbours of a row, metres.
+        columns: number of dots in a row, at least 3.
+        rows: number of dots in a column, at least 3.
+        spacing: distance between the centres of two neighbours in a row, metres.
         diameter: diameter of a dot, metres, less than ``spacing``.
         asymmetric: True if rows are half of ``spacing`` apart and every other one is shifted by as
             much.
-        origin_diameter: diameter of the dot at the origin where it is larger, metres; None for a
-            grid that looks the same when it is turned.
+        origin_diameter: diameter of the larger dot at the origin, metres; None for a grid without
+            one, which looks the same when it is turned.
     """
 
     kind: ClassVar[str] = "circles"
@@ -211,7 +211,7 @@ class CircleGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerGrid:
-    """Markers in rows and columns; its points are the markers' corners, some may be hidden.
+    """Markers in rows and columns; the points are their corners, some may be hidden.
 
     It is OpenCV's ``GridBoard``, whose numbers count from the upper left marker row by row, or
     Kalibr's AprilGrid (:meth:`april_grid`), whose numbers count from the lower left one upwards.
@@ -222,11 +222,12 @@ class MarkerGrid:
         columns: markers along x, at least 1.
         rows: markers along y, at least 1; two markers or more in all.
         marker: side of a marker with its black border, metres.
-        gap: between two neighbouring markers, metres.
-        dictionary: name of one of OpenCV's, such as ``DICT_4X4_50``.
-        border: modules of a marker's black border: 1, or 2.
+        gap: distance between two neighbouring markers, metres.
+        dictionary: name of one of OpenCV's dictionaries, such as ``DICT_4X4_50``.
+        border: width of a marker's black border in modules, 1 or 2.
         first_id: number of the first marker.
-        kalibr: numbered, turned and with black squares between the corners as Kalibr prints it.
+        kalibr: whether the markers are numbered and turned as Kalibr prints them, with black
+            squares between their corners.
     """
 
     kind: ClassVar[str] = "marker_grid"
@@ -266,8 +267,8 @@ class MarkerGrid:
             columns: tags along x, Kalibr's ``tagCols``.
             rows: tags along y, ``tagRows``.
             tag: side of a tag from edge to edge of its black border, metres, ``tagSize``.
-            spacing: between two tags in parts of ``tag``, ``tagSpacing``.
-            border: modules of a tag's black border; Kalibr prints 2.
+            spacing: distance between two tags as a part of ``tag``, ``tagSpacing``.
+            border: width of a tag's black border in modules; Kalibr prints 2.
         """
         return cls(
             columns=columns,
@@ -288,7 +289,7 @@ class MarkerGrid:
 
     @property
     def corners(self) -> NDArray[np.intp]:
-        """(M, 4), numbers of each marker's points as OpenCV has its corners, by marker.
+        """Numbers of the points at each marker's corners, in OpenCV's order, (M, 4).
 
         Corners go clockwise from the upper left one of a marker as OpenCV prints it; it prints
         tags of AprilTag, and so those of Kalibr, upside down.
@@ -314,7 +315,7 @@ _KINDS: Mapping[str, type[Target]] = {
 
 @takes(target=a_target)
 def target_to_data(target: Target) -> dict[str, Any]:
-    """Return a target as JSON takes it; :func:`target_from_data` gives it back."""
+    """Return a target as JSON data, which :func:`target_from_data` reads."""
     return {"kind": target.kind, **dataclasses.asdict(target)}
 
 
@@ -322,7 +323,7 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     """Return the target that :func:`target_to_data` describes.
 
     Raises:
-        CalibrationError: SHAPE: not a description of a target.
+        CalibrationError: SHAPE: the data do not describe a target.
     """
     given = dict(data) if hasattr(data, "items") else {}
     named = given.pop("kind", None)
@@ -343,7 +344,7 @@ def resized(target: T, factor: float, digits: int | None = None) -> T:
     """Return a target with all of its lengths multiplied by a factor, and rounded to some digits.
 
     Raises:
-        CalibrationError: SHAPE: a factor that is not positive.
+        CalibrationError: SHAPE: the factor is not positive.
     """
     lengths = {
         one.name: factor * value if digits is None else round(factor * value, digits)

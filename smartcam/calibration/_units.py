@@ -1,8 +1,8 @@
-"""Units of length: said by a file, by its format or by the user, and never guessed.
+"""Handle units of length, which a file, its format or the user says, and are never guessed.
 
-Programs write the same files in metres and in millimetres. Where neither the file nor its format
-says which, the user has to; where one does, values that no robot's cell has are refused all the
-same, with the question whether they are in another unit.
+Programs write the same files in metres and in millimetres. If neither the file nor its format says
+which, the user has to. Even if one does, values that do not occur in a robot's cell are refused,
+with the question whether they are in another unit.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ if TYPE_CHECKING:
 LengthUnit: TypeAlias = Literal["m", "cm", "mm", "inch"]
 """Names of units of length."""
 
-METRES: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-"""Metres of each unit."""
+METRES_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+"""Metres per unit."""
 
 MAX_UNASKED_M: Final = 20.0
-"""Metres from a frame to another, or from a sensor to a point, beyond which the unit has to be
-said: 20 mm and more are then asked for, and a robot's cell is smaller than 20 m."""
+"""Largest distance, metres, from one frame to another or from a sensor to a point, for which the
+unit need not be confirmed: a robot's cell is smaller than 20 m, and millimetres that are taken for
+metres exceed it from 20 mm on."""
 
 MAX_ANGLE: Final = 2 * math.pi + 1e-3
-"""Radians beyond which an angle is taken for degrees."""
+"""A larger angle, radians, is taken for degrees."""
 
 
 def metres_of(unit: object, what: str) -> float:
-    """Return the metres of a unit; else UNIT_UNKNOWN. ``what`` has its lengths in it."""
-    if not isinstance(unit, str) or unit not in METRES:
+    """Return the metres per unit, or raise UNIT_UNKNOWN; ``what`` names the lengths."""
+    if not isinstance(unit, str) or unit not in METRES_PER_UNIT:
         raise Code.UNIT_UNKNOWN.refusal(
-            f"{what}: expected a unit of length of {', '.join(METRES)}, got {unit!r}",
-            list(METRES),
+            f"{what}: expected a unit of length of {', '.join(METRES_PER_UNIT)}, got {unit!r}",
+            list(METRES_PER_UNIT),
             unit,
         )
-    return METRES[unit]
+    return METRES_PER_UNIT[unit]
 
 
 def no_unit(what: str) -> CalibrationError:
@@ -47,12 +48,12 @@ def no_unit(what: str) -> CalibrationError:
     return Code.UNIT_UNKNOWN.refusal(
         f"{what}: expected to know the unit of its lengths, which neither the file nor its format "
         'says; give it as unit="m" or unit="mm", or as --unit on the command line',
-        list(METRES),
+        list(METRES_PER_UNIT),
     )
 
 
 def check_length(metres: float, what: str) -> None:
-    """Raise (UNIT_UNKNOWN) where a length in metres is not one that a robot's cell has."""
+    """Raise UNIT_UNKNOWN for a length, metres, that does not occur in a robot's cell."""
     if metres > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"{what}: expected at most {MAX_UNASKED_M:g} m, got {metres:g} m; is it in "
@@ -63,7 +64,7 @@ def check_length(metres: float, what: str) -> None:
 
 
 def check_angles(radians: Sequence[float], what: str) -> None:
-    """Raise (UNIT_UNKNOWN) where angles are more than a whole turn."""
+    """Raise UNIT_UNKNOWN for angles of more than a whole turn."""
     largest = max(map(abs, radians))
     if largest > MAX_ANGLE:
         raise Code.UNIT_UNKNOWN.refusal(

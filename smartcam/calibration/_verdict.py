@@ -1,8 +1,8 @@
-"""Verdicts on what came out: whether it is good, for how many millimetres, and what to do next.
+"""Judge a calibration: whether it is good, for how many millimetres, and what to do next.
 
-"Good" takes three things: nothing is wrong that has a cure, points that were left out tell the
-error, and twice that error is within what the user allows; the default is :data:`MAX_ERROR_PART`
-of the field. The log warns whoever loads a calibration that is not good.
+A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
+twice that error is within what the user allows; the default is :data:`MAX_ERROR_SHARE` of the
+field. Loading a calibration that is not good logs a warning.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-MAX_ERROR_PART: Final = 0.01
-"""Largest error that is allowed where the user does not say, as a part of the field."""
+MAX_ERROR_SHARE: Final = 0.01
+"""Largest allowed error, as a part of the field, if the user does not say another."""
 
-_WITHIN: Final = 2.0
-"""Twice an rms error holds 95 of 100 errors or more, in one direction as in three."""
+_RMS_OF_95_PERCENT: Final = 2.0
+"""Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class CalibrationVerdict:
 
     Attributes:
         level: ``good``, ``poor`` (not good enough), or ``unknown``.
-        text: the judgement in words, and what to do about it.
+        text: the judgement in words, with the cure.
     """
 
     level: Literal["good", "poor", "unknown"]
@@ -43,20 +43,20 @@ class CalibrationVerdict:
 class Allowed(NamedTuple):
     """The largest error that is allowed."""
 
-    error: float  # mm, of 95 of 100 new points
-    said: bool  # whether the user said so
+    error: float  # error that 95 of 100 new points may have, mm
+    said: bool  # whether the user gave it
 
     @classmethod
     def of(cls, error: float | None, field: float) -> Allowed:
         """Return the allowed error: the user's, or a part of the ``field``, both in metres."""
-        return cls(1e3 * (MAX_ERROR_PART * field if error is None else error), error is not None)
+        return cls(1e3 * (MAX_ERROR_SHARE * field if error is None else error), error is not None)
 
     @property
     def text(self) -> str:
         """The error that is allowed, and who said so, in words."""
         if self.said:
             return f"{self.error:.3g} mm are allowed"
-        share = f"{100 * MAX_ERROR_PART:g} % of the field"
+        share = f"{100 * MAX_ERROR_SHARE:g} % of the field"
         return f"{self.error:.3g} mm are allowed, {share}, as nobody said"
 
 
@@ -75,7 +75,7 @@ CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.POOR_FIT: (_AGAIN, "redo"),
     Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
 }
-"""Advice and the option that follows it, by what is wrong; the first that applies counts."""
+"""Advice and matching option for each thing that may be wrong; the first that applies counts."""
 
 VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),
@@ -87,24 +87,25 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.INSUFFICIENT_ROTATION: ("take views that are tilted more to both sides", "more"),
     Code.POSES_TOO_SIMILAR: ("take views that are tilted more to both sides", "more"),
 }
-"""Advice and option for calibrations from views, as :data:`CURES`."""
+"""The table :data:`CURES` for calibrations from views."""
 
 
 class Judgement(NamedTuple):
-    """A verdict, and what is advisable."""
+    """A verdict, and the advice."""
 
     verdict: CalibrationVerdict
-    good_for: float | None = None  # mm, of 95 of 100 new points; None: not good, or not known
-    option: str = "accept"  # the advisable one
-    number: int | None = None  # the point or view that it is about, from 1
+    # error that 95 of 100 new points may have, mm; None: not good, or not known
+    good_for: float | None = None
+    option: str = "accept"  # the option that is advised
+    number: int | None = None  # number, from 1, of the point or view that the advice is about
 
     def chosen(self, options: Iterable[str]) -> str:
-        """Return the advisable one of some options; what is not good is never just accepted."""
+        """Return the advised one of some options; a poor result is never just accepted."""
         return next(one for one in (self.option, "redo", "more") if one in options)
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The fields of a wizard's result that say it."""
+        """Fields of a wizard's result that carry the judgement."""
         return {"good_for_mm": self.good_for}
 
 
@@ -121,11 +122,11 @@ def judge(
 ) -> Judgement:
     """Return the judgement of a calibration.
 
-    ``held_out``: rms error at points that were left out, mm. ``wrong``: warnings; those that have
-    no cure do not count. ``worst``: number of the point to blame where a warning names none.
-    ``predicted``: rms error that noise leads to, mm; what is promised is not below it.
-    ``allowed``: what may be promised at most. ``more``: what tells how good it is. ``where``: of
-    what the promise is, for people.
+    ``held_out``: RMS error at points that were left out, mm. ``wrong``: warnings; those without a
+    cure do not count. ``worst``: number of the point to blame if a warning names none.
+    ``predicted``: RMS error that noise causes, mm; the promised error is never less. ``allowed``:
+    largest error that may be promised. ``more``: things that would show how good it is. ``where``:
+    place that the promise is about, for people.
     """
     wrong = list(wrong)
     texts = dict(reversed(wrong))
@@ -136,14 +137,14 @@ def judge(
         return Judgement(
             CalibrationVerdict("unknown", f"Not known how good: {more}"), option="more"
         )
-    good_for = _rounded_up(_WITHIN * max(held_out, predicted or 0.0))
+    good_for = _rounded_up(_RMS_OF_95_PERCENT * max(held_out, predicted or 0.0))
     promise = f"95 of 100 new points lie within {good_for:g} mm{where}"
     if good_for > max(allowed.error, _rounded_up(0.0)):
         text = f"Not good enough: {promise}, but {allowed.text}: {more}"
         return Judgement(CalibrationVerdict("poor", text), option="more")
     if Code.SIDE_UNKNOWN in texts:
         text = f"Not known how good: say where the tool points. If y is not mirrored, {promise}"
-        return Judgement(CalibrationVerdict("unknown", text))
+        return Judgement(CalibrationVerdict("unknown", text), option="side")
     text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it; {allowed.text}"
     return Judgement(CalibrationVerdict("good", text), good_for)
 
@@ -155,7 +156,7 @@ def refused(
     worst: int = 1,
     cures: Mapping[Code, tuple[str, str]] = CURES,
 ) -> Judgement:
-    """Return the judgement that a calibration is not good; ``text`` says what is wrong with it."""
+    """Return the judgement that a calibration is not good; ``text`` says what is wrong."""
     named = re.search(r"\bpoints? (\d+)", text)
     number = int(named[1]) if named else worst
     cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
@@ -164,16 +165,16 @@ def refused(
 
 
 def _rounded_up(value: float) -> float:
-    """Return a value rounded up to one decimal, below 0.1 to one digit."""
+    """Return a value rounded up to one decimal, or below 0.1 to one digit."""
     digits = 1 if value > 0.1 else -math.floor(math.log10(max(value, 0.001)))
     factor = 10.0**digits
     return max(math.ceil(round(value * factor, 6)), 1) / factor
 
 
 def doubt_of(calibration: Any) -> str:
-    """Return a warning for users of a calibration that is not good; else an empty text.
+    """Return a warning for users of a calibration that is not good, or an empty text.
 
-    ``calibration``: one with a ``verdict``; any other gives an empty text.
+    A ``calibration`` without a ``verdict`` gives an empty text.
     """
     verdict: CalibrationVerdict | None = getattr(calibration, "verdict", None)
     if verdict is None or verdict.level == "good":
@@ -182,6 +183,6 @@ def doubt_of(calibration: Any) -> str:
 
 
 def warn(calibration: Any, name: str) -> None:
-    """Log a warning where the calibration of a file is not known to be good."""
+    """Log a warning if the calibration of a file is not known to be good."""
     if doubt := doubt_of(calibration):
         _log.warning("%s: %s", name, doubt)

@@ -1,4 +1,4 @@
-"""A target as one image shows it."""
+"""Hold the points of a target in one image."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ IDS = storage.Form(
     write=lambda ids: ids.tolist(),
 )
 
-ROUNDED: Final = 1e-9
-"""Part of a covariance by which its elements may be off."""
+MAX_ROUNDING_RATIO: Final = 1e-9
+"""Elements of a covariance may be off by this part of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TargetView(storage.Stored):
     """The points of a target in one image.
 
-    Pixels count from the middle of the upper left one: u to the right, v down.
+    Pixels count from the centre of the upper left pixel: u to the right, v down.
 
     Attributes:
-        target: what was looked for.
+        target: the target that was looked for.
         size: width and height of the image, pixels.
         ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
-        points: (N, 2), where they are, pixels.
-        covariance: (N, 2, 2), of each, pixels^2, as the noise of the image leads to; 0 for points
+        points: (N, 2), places of these points in the image, pixels.
+        covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
             without noise.
-        margin: how clearly the origin was told from the other corners: by how many grey levels of
-            255 its mark, or the rim by which its dot is larger, is darker there; None where the
-            target says it by itself (ids, colours of squares), or looks the same when turned.
+        margin: how clearly the origin differs from the other corners: the number of grey levels, of
+            255, by which its mark, or the rim of its larger dot, is darker; None if ids or colours
+            of squares show the origin, or if the target looks the same when turned.
         name: name of the image, for messages.
-        warnings: what was left out of the image because it contradicts the target.
+        warnings: points that were left out because they contradict the target.
 
     Raises:
-        CalibrationError: ``SHAPE``: no target, no size, arrays that do not fit together, or ids
-            that the target does not have, that stand twice or do not ascend; ``NOT_FINITE``;
+        CalibrationError: ``SHAPE``: the target or the size is not valid, arrays do not fit
+            together, or ids are unknown to the target, repeated or not ascending; ``NOT_FINITE``;
             ``NO_COVARIANCE``.
     """
 
@@ -89,7 +89,7 @@ class TargetView(storage.Stored):
 
     @property
     def object_points(self) -> Array:
-        """(N, 3), where they are on the target, metres."""
+        """Places of the points on the target, (N, 3), metres."""
         points: Array = self.target.points[self.ids]
         return points
 
@@ -97,8 +97,8 @@ class TargetView(storage.Stored):
     def agreement(self) -> float:
         """Agreement, -1 to 1, of the target's orientation with the image's; NaN on a line.
 
-        Near -1 for the sheet as one reads it (y is up there, and v down), near 1 for one in a
-        mirror, near 0 where points are taken for others.
+        Near -1 for the sheet as it is read (y is up there, and v down), near 1 for a mirrored one,
+        near 0 if points have wrong numbers.
         """
         # det(A^T B) is the sum, over all triples of points, of the products of their triangles'
         # signed areas (Cauchy and Binet), and a plane before a camera keeps all signs. Over the
@@ -112,18 +112,18 @@ class TargetView(storage.Stored):
 
     @property
     def sigmas(self) -> Array:
-        """(N,), standard deviation of a coordinate, pixels."""
+        """Standard deviation of a coordinate of each point, (N,), pixels."""
         sigmas: Array = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2)
         return sigmas
 
 
 def label(view: TargetView, number: int) -> str:
-    """Return a view's name for texts, or its number."""
+    """Return a view's name for messages, or its number."""
     return view.name or f"view {number}"
 
 
 def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
-    """Return a value that is of one of some kinds; else SHAPE, which says what it is instead."""
+    """Return a value if it is of one of some kinds; otherwise raise SHAPE, which describes it."""
     if isinstance(value, kinds):
         return value
     names = [one.__name__ for one in (kinds if isinstance(kinds, tuple) else (kinds,))]
@@ -138,12 +138,12 @@ def described(value: Any) -> str:
 
 
 def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
-    """Return views as a list; else SHAPE: something else is among them, or it is no list."""
+    """Return views as a list; raise SHAPE if something else is among them, or it is no list."""
     return as_list(views, TargetView, f"{what}: view")
 
 
 def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
-    """Return a list of the values, which are all of one of some kinds; else raise SHAPE."""
+    """Return values as a list; raise SHAPE unless each is of one of some kinds."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.unexpected(f"{what}: expected a list of such", "a list", described(values))
     return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
@@ -152,7 +152,7 @@ def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]
 def as_covariances(values: Any, count: int, what: str) -> Array:
     """Return covariances of points in an image, (``count``, 2, 2).
 
-    Raises SHAPE, NOT_FINITE, or NO_COVARIANCE: not symmetric, or with a negative variance.
+    Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
     """
     try:
         given = np.asarray(values, dtype=np.float64)
@@ -163,11 +163,15 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
             f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
         )
     found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
-    # a symmetric matrix is one where neither its trace nor its determinant is negative
+    # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
     trace = np.trace(found, axis1=1, axis2=2)
-    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > ROUNDED * np.abs(found).max(axis=(1, 2))
+    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(found).max(
+        axis=(1, 2)
+    )
     product = found[:, 0, 0] * found[:, 1, 1]
-    negative = (found[:, 0, 0] < 0) | (product - found[:, 0, 1] ** 2 < -ROUNDED * trace**2)
+    negative = (found[:, 0, 0] < 0) | (
+        product - found[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
+    )
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
         got = found[wrong[0]].tolist()

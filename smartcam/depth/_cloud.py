@@ -30,8 +30,8 @@ class Cloud:
     Attributes:
         points: (N, 3) float32, metres, all finite.
         colours: (N, 3) uint8, red, green, blue; None without.
-        sigma: (N,) float32, metres, standard deviations along the ray on which each point was
-            seen; None where nobody said.
+        sigma: (N,) float32, metres, standard deviations along the ray on which each point was seen;
+            None if nobody said.
 
     Raises:
         ConfigurationError: other shapes, no numbers, a point that is not finite, a sigma below 0.

@@ -12,7 +12,7 @@ import numpy as np
 from smartcam._argument_checks import of_class, or_none, takes
 from smartcam._arguments import check_flag, check_path, check_text, shown
 from smartcam._whole_files import replace_file
-from smartcam.calibration._inside import METRES
+from smartcam.calibration._inside import METRES_PER_UNIT
 from smartcam.depth import _pcd, _ply
 from smartcam.depth._cloud import Cloud
 from smartcam.depth._tables import BadTableError
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats import LengthUnit
 
 MAX_FILE_BYTES: Final = 1 << 30
-"""Bytes of a file that is read, at most."""
+"""Largest number of bytes of a file that is read."""
 
-MAX_HEAD: Final = 1 << 12
-"""Bytes of a file in which a comment says the unit."""
+MAX_HEAD_BYTES: Final = 1 << 12
+"""Largest number of bytes of a file in which a comment says the unit."""
 
 UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
 """The comment with which :func:`save_cloud` says the unit."""
@@ -86,8 +86,10 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     """
     path = check_path(path, "path", "cloud")
     form = _format(path)
-    if unit is not None and unit not in METRES:
-        raise ConfigurationError(f"unit: expected one of {', '.join(METRES)}, got {shown(unit)}")
+    if unit is not None and unit not in METRES_PER_UNIT:
+        raise ConfigurationError(
+            f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {shown(unit)}"
+        )
     try:
         with path.open("rb") as stream:
             told = os.fstat(stream.fileno())  # what is asked for is reserved at once
@@ -99,14 +101,14 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     try:
         if len(data) > MAX_FILE_BYTES:
             raise BadTableError(f"a file of {MAX_FILE_BYTES:,} bytes at most", "more")
-        return _cloud(form.read(data), METRES[unit or _said_unit(data)])
+        return _cloud(form.read(data), METRES_PER_UNIT[unit or _said_unit(data)])
     except BadTableError as exc:
         raise FrameFormatError(f"{path}: {exc}", source=str(path)) from exc
 
 
 def _said_unit(data: bytes) -> str:
     """Return the unit that a comment of the header says; else BadTableError."""
-    found = UNIT.search(data[:MAX_HEAD])
+    found = UNIT.search(data[:MAX_HEAD_BYTES])
     if found is None:
         raise BadTableError(
             'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '

@@ -72,7 +72,7 @@ class ColourRange:
                 uint8, red first.
 
         Raises:
-            FrameFormatError: no such picture.
+            FrameFormatError: there is no such picture.
             MissingExtraError: OpenCV (extra ``depth``) is not installed.
         """
         return self.mask_hsv(hsv(picture))
@@ -107,7 +107,7 @@ class ColourRange:
 
         Raises:
             ConfigurationError: a pixel outside of the picture, or a number out of its range.
-            FrameFormatError: no such picture.
+            FrameFormatError: there is no such picture.
             MissingExtraError: OpenCV (extra ``depth``) is not installed.
         """
         if not (0 <= radius <= 1000 and 0 <= margin <= 255):

@@ -52,7 +52,7 @@ class _WholeParameter(NamedTuple):
     default: int
     low: int
     high: int
-    every: int = 1  # it is ``low`` and a multiple of this
+    every: int = 1  # the value is ``low`` plus a multiple of this
 
     def __str__(self) -> str:
         step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
@@ -71,7 +71,7 @@ class _WordParameter(NamedTuple):
     """A parameter that is one of some words; the first is the default."""
 
     words: tuple[str, ...]
-    prefix: str  # of OpenCV's constant
+    prefix: str  # beginning of the names of OpenCV's constants
 
     @property
     def default(self) -> str:
@@ -145,8 +145,8 @@ class StereoMatcher:
             and ``P2`` of 0 are 8 and 32 times ``block_size`` squared.
 
     Raises:
-        ConfigurationError: no such algorithm, parameter or value; the text lists what there is.
-            ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
+        ConfigurationError: there is no such algorithm, parameter or value; the text lists what
+            there is. ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
 

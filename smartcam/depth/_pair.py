@@ -10,7 +10,7 @@ import numpy as np
 from smartcam._argument_checks import takes
 from smartcam._arguments import check_path
 from smartcam._extras import load
-from smartcam.calibration._inside import MAX_FILE, parse_camera_info, rectify
+from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info, rectify
 from smartcam.calibration.formats import CameraChain
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameFormatError
 from smartcam.geometry import CameraModel, Code, Transform
@@ -89,10 +89,10 @@ def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDAr
 
 def _text(path: str | os.PathLike[str]) -> str:
     with Path(path).open("rb") as file:
-        said = file.read(MAX_FILE + 1)
-    if len(said) > MAX_FILE:
+        said = file.read(MAX_FILE_BYTES + 1)
+    if len(said) > MAX_FILE_BYTES:
         raise CalibrationError(
-            f"{path}: expected a camera_info of {MAX_FILE} bytes at most", code=Code.MALFORMED
+            f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most", code=Code.MALFORMED
         )
     try:
         return said.decode()

@@ -68,7 +68,7 @@ class PairClock:
         return (drift, "frames") if abs(drift) <= MAX_DRIFT else (None, "")
 
     def _rates(self) -> tuple[float, float] | None:
-        """Return both cameras' frames a second of our clock."""
+        """Return both cameras' frames per second of our clock."""
         seen = list(self._seen)
         if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None

@@ -39,8 +39,9 @@ TYPES: Final = {
 }
 """numpy's type for each TYPE and SIZE."""
 
-MAX_UNPACKED: Final = 1 << 30
-"""Bytes that compressed points may unpack to, as many as an uncompressed file has."""
+MAX_UNPACKED_BYTES: Final = 1 << 30
+"""Largest number of bytes that compressed points may unpack to, as many as an uncompressed file
+has."""
 
 COLOURS: Final = ("rgb", "rgba")
 """Fields of 4 bytes that are a colour, blue in the lowest byte; as a float its bits are meant."""
@@ -56,7 +57,7 @@ class _PcdHeader:
     counts: Sequence[int]  # numbers of each
     points: int
     data: str  # ascii, binary, binary_compressed
-    start: int  # where the rows begin
+    start: int  # offset of the first row
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
@@ -142,8 +143,8 @@ def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     """Return columns that come one after the other, and compressed."""
     size = head.points * _row(head).itemsize
-    if size > MAX_UNPACKED:  # LZF's 3 bytes can stand for 264
-        raise BadTableError(f"points that unpack to {MAX_UNPACKED} bytes at most", f"{size}")
+    if size > MAX_UNPACKED_BYTES:  # LZF's 3 bytes can stand for 264
+        raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
     packed, whole = struct.unpack_from("<II", data, head.start)

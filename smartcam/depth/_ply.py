@@ -49,7 +49,7 @@ TYPES: Final = {
 """The document's names, and those that others write."""
 
 MAX_LIST_ROWS: Final = 1 << 20
-"""Rows of lists before the vertices, such as cameras; faces stand behind."""
+"""Largest number of rows of lists before the vertices, such as cameras; faces stand behind."""
 
 ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 

@@ -27,41 +27,42 @@ METHODS: Final = {"gicp": "GICP", "icp": "ICP", "plane": "PLANE_ICP"}
 """small-gicp's name of each method."""
 
 NEIGHBOURS: Final = 20
-"""Points to which the plane about each is fitted."""
+"""Number of neighbours that the plane around each point is fitted to."""
 
 MAX_STEPS: Final = 60
 MORE_STEPS: Final = 10
-"""Steps in which the cloud still moves, after the others: it may alternate between neighbours."""
+"""Number of further steps after the last regular one, since the cloud may alternate between
+neighbours."""
 
 TURN_STEP: Final = 1e-5
 SHIFT_STEP: Final = 1e-4
-"""Steps that count as none: radians, and of ``max_distance``."""
+"""Smaller steps count as none: in radians, and as a part of ``max_distance``."""
 
 MAX_REACH_FACTOR: Final = 5.0
-"""Times ``max_distance`` beyond which points take no part, measured at the beginning.
+"""Points farther off than this many times ``max_distance`` at the beginning take no part.
 
 small-gicp takes very long to find the neighbours of points that are far away.
 """
 
 MAX_REST_SHARE: Final = 1e-3
-"""Share of ``max_distance``: a fit counts as ended if :data:`MORE_STEPS` move it by less."""
+"""A fit has converged if :data:`MORE_STEPS` move it by less than this part of ``max_distance``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Registration:
     """The pose of the source in the target.
 
-    Look at ``converged`` before the pose is used: ``reason`` says what speaks against it.
+    Check ``converged`` before using the pose; otherwise ``reason`` says what is wrong.
 
     Attributes:
         pose: :class:`~smartcam.calibration.Transform`, from source to target.
-        converged: the steps ended, enough of the source lies on the target, and every direction
-            is determined.
-        reason: why not, in words; empty if converged.
-        rms: metres, of the matched points' distances to the target: from its planes, or to its
-            points for ``icp``.
+        converged: whether the steps ended, enough of the source lies on the target, and every
+            direction is determined.
+        reason: reason why it has not converged, in words; empty if it has.
+        rms: RMS distance of the matched points from the target's planes, or for ``icp`` from its
+            points, metres.
         overlap: part of the source's points with a target point within ``max_distance``, 0 to 1.
-        matched: how many they are.
+        matched: number of these points.
         information: (6, 6), for a small turn in radians about the target's axes, of the source as
             it was turned, and then a shift in metres: the sum of squares of how the matched
             points' distances from the target's planes change with it. Without a unit of noise:
@@ -84,12 +85,12 @@ class Registration:
 
 
 class _Neighbours(NamedTuple):
-    """The matched points, in target coordinates less the target's centre."""
+    """The matched points, in target coordinates relative to the target's centre."""
 
-    moved: Array  # (M, 3) of the source
-    nearest: NDArray[np.intp]  # (M,) which one of the target
-    offsets: Array  # (M, 3) from one to the other
-    arms: Array  # (M, 3) of the source, turned, from its origin
+    moved: Array  # (M, 3), points of the source
+    nearest: NDArray[np.intp]  # (M,), index of the matched point of the target
+    offsets: Array  # (M, 3), vectors from one to the other
+    arms: Array  # (M, 3), points of the source, turned, from its origin
 
 
 @takes(
@@ -112,24 +113,24 @@ def register(
 ) -> Registration:
     """Return the pose of a cloud in another cloud.
 
-    It finds the pose that is nearest to ``initial``, which should be off by less than
-    ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all
-    the while, for tenths of a second with 100,000 points: beside an event loop it belongs into a
-    process.
+    The pose nearest to ``initial`` is found, which should be off by less than ``max_distance``;
+    points that are off by five times as much take no part. Python's GIL is held all the time, for
+    tenths of a second with 100,000 points: beside an event loop, run this in another process.
 
     Args:
-        source: at least 20 points, as the target.
-        target: has the points that the source's are moved to.
+        source: cloud of at least 20 points.
+        target: cloud of at least 20 points, which the source is moved to.
         method: ``gicp`` from surface to surface, ``plane`` from point to surface, ``icp`` from
             point to point.
-        voxel: metres; both clouds are thinned to it first. None: they stay as they are.
-        max_distance: metres, up to which a point has something to do with another.
+        voxel: size of the voxels that both clouds are thinned to first, metres; None: no thinning.
+        max_distance: largest distance, metres, at which two points are matched.
         initial: ``T_target_source`` to begin with, whose frames' names the pose gets; None: the
             clouds lie almost as they should, in frames ``target`` and ``source``.
         min_overlap: part of the source that must lie on the target.
 
     Raises:
-        ConfigurationError: no such method, lengths that are not above 0, fewer than 20 points.
+        ConfigurationError: there is no such method, lengths that are not above 0, fewer than 20
+            points.
         MissingExtraError: the extra ``depth`` is not installed.
     """
     _check(method, max_distance, min_overlap)
@@ -174,7 +175,7 @@ def _check(method: str, max_distance: float, min_overlap: float) -> None:
 def _aligned(
     points: Array, goals: Array, begin: Transform, kind: str, reach: float
 ) -> tuple[Transform, bool]:
-    """Return the pose, and whether the steps ended; each cloud is moved to its centre for it."""
+    """Return the pose, and whether the steps ended; both clouds are centred for it."""
     gicp = load("small_gicp")
     here, there = points.mean(axis=0), goals.mean(axis=0)
     clouds = [gicp.PointCloud(points - here), gicp.PointCloud(goals - there)]
@@ -275,9 +276,10 @@ def _judged(
 
 
 def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
-    """Return the covariance of a fit to planes, by what is left over.
+    """Return the covariance of a fit to planes, from its residuals.
 
-    What lies beside the same point of the target errs with it, and is added before it is squared.
+    Residuals beside the same point of the target share its error, so they are added before they are
+    squared.
     """
     # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
     # groups as Liang and Zeger have it (1986).
@@ -291,7 +293,7 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
 
 
 def _in_words(step: Array, arms: Array) -> str:
-    """Return a text of the motion about the matched points' centre that stays undetermined."""
+    """Describe the motion around the matched points' centre that stays undetermined."""
     turn, shift = step[:3], step[3:]
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     size = np.linalg.norm(turn) * reach

@@ -37,7 +37,7 @@ GRIP: Final = 5e-3
 """Metres by which the gripper may miss a block and still take it."""
 
 MIN_GAP_METRES: Final = 0.01
-"""Metres between things on the table at least, for a gripper and for the eye."""
+"""Least distance, metres, between things on the table, for a gripper and for the eye."""
 
 GREY_SIGMA: Final = 3.0
 """Noise of a picture's levels."""
@@ -71,8 +71,8 @@ class WoodenBlock:
 
     x: float
     y: float
-    angle: float  # of its length, from x towards y
-    z: float = 0.0  # of its lower side
+    angle: float  # direction of the block's length, from x towards y
+    z: float = 0.0  # height of the block's lower side
     colour: str = "wood"
     size: tuple[float, float, float] = BLOCK
 
@@ -85,7 +85,7 @@ class WoodenBlock:
 class TableSight(NamedTuple):
     """The picture and depth that the camera sees from a place."""
 
-    camera: tuple[float, float, float]  # where it is, metres
+    camera: tuple[float, float, float]  # place of the camera, metres
     rgb: NDArray[np.uint8]  # (H, W, 3)
     depth: list[NDArray[np.uint16]]  # (H, W) each, millimetres
 
@@ -145,7 +145,7 @@ class TowerTable:
     def pick(self, x: float, y: float, angle: float) -> Grip:
         """Close the gripper at a pose on the table; a block within :data:`GRIP` is taken.
 
-        Returns how far the next black block was from there; ``held`` is None where it is missed.
+        Returns how far the next black block was from there; ``held`` is None if it is missed.
         """
         wanted = WoodenBlock(x, y, angle)
         loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]

@@ -1,4 +1,4 @@
-"""Two cameras as one that sees depth."""
+"""Use two cameras as one that measures depth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 SEARCHED: Final = 5
-"""Part of the width, one in so many, that disparities are searched in by default."""
+"""By default, disparities are searched up to the width divided by this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,9 +40,9 @@ class DepthFrame:
     """The depth seen by two cameras at one moment, in the rectified left camera's view.
 
     Attributes:
-        depth: (H, W), float32, metres along the optical axis; 0: none.
-        sigma: (H, W), float32, standard deviation of ``depth``, metres; NaN: none.
-        disparity: (H, W), float32, pixels; NaN: none.
+        depth: (H, W), float32, metres along the optical axis; 0 where it is unknown.
+        sigma: (H, W), float32, standard deviation of ``depth``, metres; NaN where it is unknown.
+        disparity: (H, W), float32, pixels; NaN where it is unknown.
         left: the rectified left picture, uint8: (H, W), or, red first, (H, W, 3); 0 where it has
             no source.
         camera_info: lens of the rectified left camera, without distortion.
@@ -73,10 +73,10 @@ class StereoStatistics:
         group: statistics of the frames' pairing; its ``skew`` is the largest.
         skew: seconds by which the right frames are later: the median of the last pairs; None: no
             pair came yet.
-        drift: rate by which the right camera's clock is faster than the left one's, seconds a
+        drift: rate by which the right camera's clock is faster than the left one's, seconds per
             second; None: not known yet.
-        drift_from: ``clocks``: of what the cameras' own clocks said; ``frames``: they have none,
-            and it is by how much the right one gives more frames of the same nominal rate; "".
+        drift_from: source of ``drift``: ``clocks``, the cameras' own clocks; ``frames``, if they
+            have none: the ratio of their frame counts at the same nominal rate; or "".
     """
 
     group: GroupStatistics
@@ -96,24 +96,24 @@ class StereoDepth:
                 frame.depth, frame.sigma, frame.skew
 
     The frames may have any size of the calibrated shape, and any format with brightness. They are
-    paired by when they were captured. The matching is done in a thread, when it is asked for: who
-    is slow skips pairs, and never lags.
+    paired by when they were captured. Matching runs in a thread, on demand: a slow reader skips
+    pairs, and never lags.
 
     Args:
-        left: the left camera, as ``smartcam.frames.open`` or ``camera.frames()`` gives it, not
-            open; it belongs to this object from now on.
-        right: the right one.
-        calibration: calibration of the pair: ours, that of :func:`read_camera_infos`, or of
-            ``smartcam.calibration.formats.read_cameras`` with two cameras.
+        left: source of the left camera, as from ``smartcam.frames.open`` or ``camera.frames()``,
+            not open; this object opens and closes it.
+        right: source of the right camera.
+        calibration: calibration of the pair: smartcam's own, or one from :func:`read_camera_infos`
+            or from ``smartcam.calibration.formats.read_cameras`` with two cameras.
         matcher: None: ``sgbm`` for disparities up to a fifth of the width.
         size: width and height of the rectified pictures, pixels; None: as the left one was
             calibrated.
         alpha: 0 to 1, from no invalid pixels to no lost ones.
         colour: whether :attr:`DepthFrame.left` is in colour.
         focal_sigma: standard deviation of the focal length, pixels of the calibrated left picture;
-            a calibration of a pair tells only that of where the cameras are.
+            a calibration of a pair has only that of the cameras' poses.
         within: largest skew, seconds; None: half of the time between two frames.
-        timeout: seconds that an iteration waits for a pair; None: as long as it takes.
+        timeout: seconds that an iteration waits for a pair; None: without limit.
 
     Raises:
         ConfigurationError: a value that is not valid, or no calibration of two cameras.
@@ -164,7 +164,7 @@ class StereoDepth:
         """Make the maps, and open both cameras; they do not stream yet.
 
         Raises:
-            CalibrationError: rectified, the pictures would have nothing in them.
+            CalibrationError: the rectified pictures would be empty.
             ConfigurationError: the cameras are swapped, or one above the other.
             FrameSourceError: a camera cannot be opened; nothing stays open.
             MissingExtraError: OpenCV (extra ``depth``) is not installed.
@@ -224,7 +224,7 @@ class StereoDepth:
 
     @property
     def nearest(self) -> float:
-        """Metres from which on a depth is found; raises as :attr:`camera_info` does."""
+        """Least depth that is measured, metres; raises as :attr:`camera_info` does."""
         _, pair, matcher = self._opened()
         return pair.focal * pair.baseline / max(matcher.nearest, 1)
 
@@ -244,11 +244,11 @@ class StereoDepth:
         Raises:
             FrameTimeoutError: no pair came in time.
             FrameFormatError: a frame is cut, or has no brightness; the next one may have.
-            FrameSourceError: of the camera that ended with one.
+            FrameSourceError: a camera ended with an error.
             LocalProtocolError: the pair is not open.
 
-        Cancellation: safe; a pair that is matched then is thrown away, and the next call waits
-        until that is done before it takes the newest.
+        Cancellation: safe; a pair that is being matched is thrown away, and the next call waits for
+        the end of that before it takes the newest pair.
         """
         worker, pair, matcher = self._opened()
         await worker.idle()
@@ -279,7 +279,7 @@ def _depth(
     found = matcher(grey[0], grey[1])
     disparity = found.pixels
     pair.drop_outside(disparity)
-    disparity[~(disparity > 0)] = np.nan  # at infinity, or behind it
+    disparity[~(disparity > 0)] = np.nan  # at infinity, or behind the camera
     depth = pair.depth(disparity)
     shown = pair.rectified(_bytes(left, left.rgb()), 0, left.source) if colour else grey[0]
     return DepthFrame(

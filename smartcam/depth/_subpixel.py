@@ -1,4 +1,4 @@
-"""Disparities between the pixels: by least squares, which tell how sure they are."""
+"""Refine disparities to parts of a pixel by least squares, with their sigma."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ MIN_COARSE_SIGMA_PX: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
 
 MAX_GAUSS_NEWTON_STEPS: Final = 3
-"""Steps of Gauss and Newton that refine the disparities."""
+"""Largest number of steps of Gauss and Newton that refine the disparities."""
 
 MAX_LAST_MOVE_SIGMAS: Final = 1.0
-"""Sigmas, rms, by which the last step may move the disparities: another would by about a tenth."""
+"""The fit ends when a step moves the disparities by less than this RMS, in sigmas: another step
+would move them by about a tenth of it."""
 
 MAX_SHIFT_PX: Final = 0.5
-"""Pixels by which a disparity may be moved: farther off is another point."""
+"""A disparity may be moved by at most this many pixels: farther off is another point."""
 
 MAX_ROUGHNESS_PX: Final = 0.5
-"""Pixels, rms, of coarse disparities from a plane; a window with more has an edge in it."""
+"""Largest RMS distance, pixels, of coarse disparities from a plane; a window with more has an edge
+in it."""
 
 MIN_FILLED_SHARE: Final = 0.5
 """Least share of a window's pixels that must have disparities."""
 
 HOLE_MARGIN_PX: Final = 2
-"""Pixels from a hole within which nothing is refined."""
+"""Within this distance from a hole, pixels, nothing is refined."""
 
 MIN_VARIANCE: Final = 1 / 6
 """Least variance of the difference of two pictures, whose grey levels are whole numbers."""
@@ -41,13 +43,13 @@ MAX_INLIER_SIGMAS: Final = 4.0
 """Standard deviations of a pixel's noise above which its difference does not count."""
 
 MIDDLE_GREY: Final = 128
-"""Grey level that is taken off, so that squares keep their digits."""
+"""Grey level that is subtracted, so that squares keep their precision."""
 
 MIN_WINDOW_PIXELS: Final = 12
-"""Pixels of a window at least, whose least squares have two unknowns."""
+"""Least number of pixels of a window, whose least squares have two unknowns."""
 
 GAIN_SIGMA: Final = 0.3
-"""Standard deviation, about 1, that the gain between the pictures is taken to have beforehand."""
+"""Prior standard deviation of the gain between the pictures around 1."""
 
 MAX_NOISE_LAG_PX: Final = 2
 """Largest distance, in pixels, at which the noise is checked for correlation."""
@@ -62,10 +64,9 @@ def refined(
     """Return disparities and their sigma, both (H, W), NaN where ``coarse`` is.
 
     In a window the disparity is a plane, and the brightness of the pictures differs by a constant
-    and a factor: exposures, gains and the shade of lenses differ.
-    Where a window has an edge in it, too little texture, or the least squares lead too far, the
-    coarse value stays: its sigma is ``MIN_COARSE_SIGMA_PX``, or the roughness of the window where
-    that is more.
+    and a factor: exposures, gains and the shade of lenses differ. If a window has an edge in it or
+    too little texture, or if the result is too far off, the coarse value stays: its sigma is
+    ``MIN_COARSE_SIGMA_PX``, or the roughness of the window if that is more.
     """
     known = np.isfinite(coarse)
     sigma = np.where(known, np.float32(MIN_COARSE_SIGMA_PX), np.float32(np.nan))
@@ -105,7 +106,7 @@ def refined(
 
 
 def _moved(fit: _Refined, before: Field, usable: NDArray[np.bool_]) -> float:
-    """Return by how many sigmas a step moved the usable disparities, root mean square."""
+    """Return the RMS movement of the usable disparities by a step, in sigmas."""
     moves = (fit.disparity - before)[usable] / fit.sigma[usable]
     return float(np.sqrt((moves**2).mean())) if len(moves) else 0.0
 
@@ -117,7 +118,7 @@ def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 class _WindowSums:
-    """Sums over the window around each pixel; outside of the picture there is nothing."""
+    """Sums over the window around each pixel; pixels outside of the picture count as 0."""
 
     def __init__(self, side: int) -> None:
         self._cv2 = load("cv2")
@@ -140,15 +141,15 @@ class _WindowSums:
 class _DisparityPlane(NamedTuple):
     """The disparities in each window, as a plane; all are (H, W)."""
 
-    across: Field  # slope, pixels a pixel
+    across: Field  # slope, pixels per pixel
     down: Field
-    rough: Field  # how far the disparities are from it, rms, pixels
-    pixels: Field  # how many have a disparity
+    rough: Field  # RMS distance of the disparities from the plane, pixels
+    pixels: Field  # number of pixels with a disparity
 
 
 def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
     mask = known.astype(np.float32)
-    # near 0, so that the squares below keep their digits
+    # kept near 0, so that the squares below keep their precision
     values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
     count = np.maximum(sums(mask), 1)
     total = sums(values)
@@ -168,10 +169,10 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _Di
 class _LinearMatch(NamedTuple):
     """The difference of the pictures and its slope by disparity; 0 where they are unknown."""
 
-    e: Field  # left less right, grey levels
-    g: Field  # slope of both, grey levels a pixel
-    r: Field  # right, grey levels about the middle of their range
-    mask: Field  # 1 where they are known
+    e: Field  # left minus right picture, grey levels
+    g: Field  # slope of both, grey levels per pixel
+    r: Field  # right picture, grey levels about the middle of their range
+    mask: Field  # 1 where they are known, else 0
 
 
 def _linearized(
@@ -180,7 +181,7 @@ def _linearized(
     left, right = pictures
     width = left.shape[1]
     there = np.arange(width, dtype=np.float32) - disparity
-    inside = known & (there >= 2) & (there <= width - 4)  # six pixels are looked at
+    inside = known & (there >= 2) & (there <= width - 4)  # interpolation uses six pixels
     mask = inside.astype(np.float32)
     moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
     slope += np.gradient(left, axis=1)
@@ -191,11 +192,12 @@ def _linearized(
 class _Refined(NamedTuple):
     """All (H, W); the sigma is infinite where there is no texture."""
 
-    disparity: Field  # pixels
-    sigma: Field  # of noise that is not correlated, pixels
+    disparity: Field  # disparities, pixels
+    sigma: Field  # sigma from uncorrelated noise, pixels
     linear: _LinearMatch
-    expected: Field  # of linear.e, by the constant and the gain of each window, grey levels
-    variance: Field  # of linear.e, grey levels^2
+    # expected part of linear.e, by the constant and the gain of each window, grey levels
+    expected: Field
+    variance: Field  # variance of linear.e, grey levels^2
 
 
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
@@ -213,7 +215,7 @@ def _fitted(
 ) -> _Refined:
     """Return one step of Gauss and Newton for every window.
 
-    What noise there is follows from the ``trusted`` pixels.
+    The noise is estimated from the ``trusted`` pixels.
     """
     # With the right picture's row taken at u - d_q, L - R_q = b + c R_q - g (D + s (q - p) - d_q)
     # + noise for all q of the window around p: linear in D, b and the gain less 1, c. g is the mean
@@ -236,7 +238,7 @@ def _fitted(
     se = sums(e_)
     see, sre = sums(e_ * e) - se * se / m, sums(e_ * level) - st * se / m
     srr = np.maximum(srr - st * st / m, 0)
-    # how little is known of the gain beforehand, as so much variance of R
+    # the uncertainty of the gain beforehand, as an additional variance of R
     held = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
     gain = sre / (srr + held)
     variance = np.maximum((see - gain * sre) / np.maximum(m - 3, 1), MIN_VARIANCE)
@@ -282,9 +284,10 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
 
 
 def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
-    """Return by how much the noise e of neighbours is correlated, as it counts for sums of g e.
+    """Return the factor by which the neighbours' correlation changes the variance of sums of g e.
 
-    1: not at all. A picture that was rectified has some: its pixels share those of the source.
+    It is 1 without correlation. A rectified picture has some, since its pixels share those of the
+    source.
     """
     # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge, as of normal values: Isserlis, On a
     # formula for the product-moment coefficient (1918). Of white noise only lag 0 is there. Where

@@ -11,16 +11,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-MAX_HEADER: Final = 1 << 16
-"""Bytes."""
+MAX_HEADER_BYTES: Final = 1 << 16
+"""Largest number of bytes of the header."""
 
 MAX_FIELDS: Final = 256
 
-MAX_ROW: Final = 1 << 12
-"""Bytes of a row."""
+MAX_ROW_BYTES: Final = 1 << 12
+"""Largest number of bytes of a row."""
 
-MAX_LINE: Final = 1 << 20
-"""Bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
+MAX_LINE_BYTES: Final = 1 << 20
+"""Largest number of bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
 
 WORDS: Final = 1 << 18
 """Numbers of text at a time; each is an object in memory for a while."""
@@ -41,10 +41,11 @@ def shown(data: bytes | str) -> str:
 
 def header_line(data: bytes, start: int) -> tuple[str, int]:
     """Return a header's line and where the next one begins; it ends in LF, or CR LF."""
-    end = data.find(b"\n", start, MAX_HEADER)
+    end = data.find(b"\n", start, MAX_HEADER_BYTES)
     if end < 0:
         raise BadTableError(
-            f"a header of up to {MAX_HEADER} bytes", shown(data[start : start + MAX_HEADER])
+            f"a header of up to {MAX_HEADER_BYTES} bytes",
+            shown(data[start : start + MAX_HEADER_BYTES]),
         )
     line = data[start:end].removesuffix(b"\r")
     try:
@@ -68,8 +69,8 @@ def _fail(expected: str, came: bytes | str) -> NoReturn:
 
 def check_row(row: np.dtype[Any]) -> None:
     """Check that rows are not too long, since each is in memory."""
-    if row.itemsize > MAX_ROW:
-        raise BadTableError(f"rows of up to {MAX_ROW} bytes", f"{row.itemsize}")
+    if row.itemsize > MAX_ROW_BYTES:
+        raise BadTableError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row.itemsize}")
 
 
 def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArray[Any]:
@@ -101,8 +102,8 @@ def from_text(
                 raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
             end = data.find(b"\n", place)
             end = len(data) if end < 0 else end
-            if end - place > MAX_LINE:
-                raise BadTableError(f"lines of up to {MAX_LINE} bytes", f"{end - place}")
+            if end - place > MAX_LINE_BYTES:
+                raise BadTableError(f"lines of up to {MAX_LINE_BYTES} bytes", f"{end - place}")
             words, place = data[place:end].split(), end + 1
             if left:
                 left -= 1

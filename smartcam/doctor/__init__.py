@@ -78,16 +78,16 @@ MAX_SECONDS = 86_400
 """Seconds that a camera is watched at most: a day."""
 
 MAX_TRIGGERS = 10_000
-"""Triggers of an examination at most, since their times are kept."""
+"""Largest number of triggers of an examination, since their times are kept."""
 
 
 class _DoctorCheck(NamedTuple):
     """One check."""
 
-    name: str  # as its findings call it
+    name: str  # name of the examination in its findings
     run: Callable[[Examination], Awaitable[None]]  # looks, and reports to the exam
     limit: Callable[[DoctorOptions], float]  # seconds that it may take, by what was asked for
-    in_session: bool = True  # whether it needs a session
+    in_session: bool = True  # whether the examination needs a session
 
 
 def _requests(options: DoctorOptions) -> float:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_KEPT = 1000
-"""Statuses and arrival times kept: at 300 results a second those of the default 3 seconds."""
+"""Statuses and arrival times kept: at 300 results per second those of the default 3 seconds."""
 
 MAX_CONTAINERS = 32
 """Result containers kept, to be compared with the layout: 2 MB of the largest."""
@@ -53,7 +53,7 @@ class DoctorOptions:
 
     Attributes:
         application: id that is expected to be active, None for any.
-        interpreter: interpretation of the results; None where none was given.
+        interpreter: interpretation of the results; None if none was given.
         y_down: whether the camera's y axis points down.
         trigger: whether triggers may be sent, and ``application`` loaded for them.
         timeout: seconds for each step, None for the defaults.
@@ -123,10 +123,10 @@ class Witness(Observer):
 class Diagnosis(NamedTuple, Generic[T]):
     """One of several things that may be wrong; the first that fits is it."""
 
-    fits: Callable[[T], bool]  # whether it is this one, by what was seen
-    text: str  # what to say, with fields to be filled in
-    cure: str  # what to do, the same
-    exit_code: Exit = Exit.NO_SESSION  # of the finding
+    fits: Callable[[T], bool]  # function that says, by what was seen, whether this is the cause
+    text: str  # text with fields to fill in
+    cure: str  # text of the cure, also with fields
+    exit_code: Exit = Exit.NO_SESSION  # exit code of the finding
 
 
 @dataclass(eq=False)
@@ -144,8 +144,8 @@ class Reading(NamedTuple):
     """A result container's bytes and what an interpreter made of them."""
 
     data: bytes
-    byte_order: ByteOrder  # of their numbers
-    error: InterpretationError | None  # why they do not fit, None where they do
+    byte_order: ByteOrder  # byte order of their numbers
+    error: InterpretationError | None  # why they do not fit, None if they do
 
 
 class Keeper(Interpreter):
@@ -179,18 +179,18 @@ class Keeper(Interpreter):
 class Examination:
     """An examination under way."""
 
-    options: DoctorOptions  # what was asked for
-    address: Address  # where the camera is; what was found out is pinned
+    options: DoctorOptions  # options that the user gave
+    address: Address  # address of the camera, with what was found out pinned
     trace: Callable[[TraceEntry], None] | None  # called with every frame
     witness: Witness  # sees what it sends
-    stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # what is undone at the end
+    stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # steps to undo at the end
     # an application that is loaded for the triggers, and goes back
     borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
-    bus: Bus | None = None  # that of a fleet, None before it answered
+    bus: Bus | None = None  # bus of a fleet; None before it answered
     camera: Camera | None = None  # the client, None before the session
     connected_at: float = 0.0  # loop time of the session
     wants_trigger: bool = False  # whether triggers are still wanted
-    may_trigger: bool = False  # whether the camera waits for them
+    may_trigger: bool = False  # whether the camera waits for triggers
     check: str = ""  # name of the check that runs
     # findings that were not handed out yet
     pending: list[Finding] = field(default_factory=list[Finding])

@@ -23,7 +23,7 @@ class Exit(enum.IntEnum):
     NO_SESSION = 3
     """There is no session, or it broke."""
     RAN_OUT = 4
-    """A wait in a session ran out."""
+    """A wait in a session timed out."""
     REFUSED = 5
     """The camera refused, is stopped, or has a System Error."""
     UNREADABLE = 6
@@ -32,16 +32,16 @@ class Exit(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that was found out.
+    """One result of a check.
 
     Attributes:
         check: name of the check that made the finding.
-        severity: ``ok``: as it should be, or only said; ``hint``: something to know or to try;
-            ``warning``: it works, and something is wrong; ``error``: it does not work.
+        severity: ``ok``: as it should be, or only information; ``hint``: something to know or to
+            try; ``warning``: it works, but something is wrong; ``error``: it does not work.
         text: what was found, in plain words.
-        cure: what to do, empty where nothing is to be done.
+        cure: what to do, empty if nothing is to be done.
         details: the finding as values for programs; times in seconds.
-        exit_code: what a command that ends with it returns; 0 for all but errors.
+        exit_code: exit code of a command that ends with this finding; 0 for all but errors.
     """
 
     check: str
@@ -56,7 +56,8 @@ def summary(findings: Iterable[Finding]) -> Finding:
     """Return the sum of findings, as one of ``check="summary"``.
 
     It has the severity and the exit code of the worst; of several that are equally bad the first
-    decides, since the checks go from the ground up and what follows may come of it.
+    decides, since the checks begin with the basics, and later findings may follow from earlier
+    ones.
     """
     all_found = list(findings)
     counts: dict[str, int] = {

@@ -38,7 +38,7 @@ LOOKS_WITHIN = 1.0
 LOOK_AGAIN = 0.1
 
 MAX_CAMERAS_LISTED = 20
-"""Cameras that a finding names."""
+"""Largest number of cameras that a finding names."""
 
 SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
 LISTENS = (

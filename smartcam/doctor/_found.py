@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Evidence = Literal["greeted", "silent", "said", "ended", "other"]
 
 MAX_PORTS = 32
-"""Ports of one address that a search opens at most."""
+"""Largest number of ports of one address that a search opens."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,8 +30,8 @@ class FoundPort:
     Attributes:
         host: address of the host.
         port: number of the port.
-        protocols: names of the protocols that it may speak, the most probable first; empty where
-            what was heard is none of them.
+        protocols: names of the protocols that it may speak, the most probable first; empty if what
+            was heard is none of them.
         evidence: ``greeted``: it said by itself what cameras of the protocol say; ``silent``: it
             says nothing before it is spoken to, and so do they; ``said``: it said something, and
             what they say is not known; ``ended``: it hung up at once, as a camera may that has a
@@ -133,7 +133,7 @@ def _scheme(protocol: Protocol) -> str:
 
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
-    """Raise ConfigurationError where asking at these ports may take a camera from its client."""
+    """Raise ConfigurationError if asking at these ports may take a camera from its client."""
     names = sorted({one.name for several in ports.values() for one in several if serves_one(one)})
     if names:
         raise ConfigurationError(

@@ -69,7 +69,7 @@ class _GigEExamination:
     local: str = ""
     payload: int = 0
     rate: float | None = None
-    camera_link: float = SPEED_UNKNOWN  # bits a second
+    camera_link: float = SPEED_UNKNOWN  # bits per second
 
     def tell(
         self,
@@ -377,7 +377,7 @@ def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
 
 
 def _link_speed(local: str) -> float:
-    """Return the speed of the interface with an address, bits a second; 0: not known."""
+    """Return the speed of the interface with an address, bits per second; 0: not known."""
     if sys.platform != "linux":
         return SPEED_UNKNOWN
     import fcntl
@@ -579,7 +579,7 @@ async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
 
 
 async def _waiting_triggers(exam: _GigEExamination) -> str:
-    """Return the triggers that are on, and where each comes from; "" where none is."""
+    """Return the triggers that are on, and where each comes from; "" if none is."""
     told: list[str] = []
     try:
         async with _session(exam) as features:

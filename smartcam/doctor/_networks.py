@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     SocketAddress = tuple[str, int] | tuple[str, int, int, int]
 
 MAX_IPV6 = 256
-"""Addresses of an IPv6 network at most: nobody has the time to try one of the usual size."""
+"""Largest number of addresses of an IPv6 network: nobody has the time to try one of the usual
+size."""
 
 _NAME = re.compile(r"(?=.*[A-Za-z])\w(?:[\w.-]{0,251}\w)?", re.ASCII)
 

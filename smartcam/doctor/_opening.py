@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     from smartcam.doctor._networks import HostAddress
 
-MAX_SAID = 512
-"""Bytes that are read at most of what comes by itself."""
+MAX_SAID_BYTES = 512
+"""Largest number of bytes that are read of what comes by itself."""
 
 Outcome = Literal["open", "refused", "no answer", "unreachable", "failed"]
 
@@ -87,8 +87,8 @@ async def open_port(
         said, ended = b"", False
         try:
             async with asyncio.timeout(timeout):
-                while len(said) < MAX_SAID and not enough(said):
-                    data = await loop.sock_recv(sock, MAX_SAID - len(said))
+                while len(said) < MAX_SAID_BYTES and not enough(said):
+                    data = await loop.sock_recv(sock, MAX_SAID_BYTES - len(said))
                     if not data:
                         ended = True
                         break

@@ -22,7 +22,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.models import Status
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Transport
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, load_protocol
 from smartcam.protocols.messages import QueryAnswer, StatusReport
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
-"""Entries that a trial keeps: making a session takes six, and a camera may send results at once."""
+"""Largest number of entries that a trial keeps: making a session takes six, and a camera may send
+results at once."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""
@@ -65,7 +66,7 @@ class Trial(Try):
         address: address that was tried, with the scheme of the transport.
         frames: what went over the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
-        answer: answer of the camera; None where none answered.
+        answer: answer of the camera; None if none answered.
         other: whether the protocol is another one than that of the address asked for.
     """
 
@@ -93,8 +94,8 @@ class Trial(Try):
 class Way(NamedTuple):
     """One way to speak to an address."""
 
-    address: Address  # with the scheme of the transport
-    transport: Transport  # what carries it
+    address: Address  # address with the scheme of the transport
+    transport: Transport  # transport that carries the protocol
     dialects: tuple[Dialect, ...]  # one, or several that begin a session alike
 
 
@@ -187,7 +188,7 @@ def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) 
 
 
 def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
-    """Return the one of these protocols whose greeting a try has heard, None where none is."""
+    """Return the one of these protocols whose greeting a try has heard, None if none is."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
     heard = next((one.hex for one in trial.frames if one.direction == "!"), "")
@@ -259,7 +260,8 @@ async def _try(
     address, transport, dialects = way
     trial = Trial(names_of(dialects), transport.value, address=address)
 
-    def take(entry: TraceEntry) -> None:
+    def take(frame: RawFrame) -> None:
+        entry = frame.entry()
         trial.keep(entry)
         if trace is not None:
             trace(entry)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40
-"""Rows of a dump at most: a screen."""
+"""Largest number of rows of a dump: a screen."""
 
 
 # ---------------------------------------------------------------------- the layout
@@ -195,11 +195,11 @@ def _say_misfit(
 class _Plausible(NamedTuple):
     """The plausible values of a field without a unit."""
 
-    quantity: str  # what it measures
-    names: re.Pattern[str]  # which fields do, by their name
+    quantity: str  # quantity that such fields measure
+    names: re.Pattern[str]  # pattern of the names of such fields
     most: float  # the largest magnitude that is plausible, SI
-    text: str  # what a larger one looks like
-    unit: str  # what to write behind the type then
+    text: str  # description of a larger value
+    unit: str  # unit to write after the type then
     reason: str  # why the limit
 
 
@@ -241,7 +241,7 @@ class _Converted(NamedTuple):
     """The signs of a field with a unit whose values were in SI already."""
 
     most: float  # the largest magnitude, SI, up to which it does
-    text: str  # what the camera may send instead
+    text: str  # text that the camera may send instead
     reason: str  # why the limit
 
 
@@ -266,7 +266,7 @@ def _look_at_values(
 ) -> None:
     """Give a hint for each field whose values are not plausible in its unit, or without one."""
     found: dict[str, float] = {}  # largest magnitude by field
-    # the same, by unit
+    # converted values, by unit
     converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERTED}
     nonsense: dict[str, float] = {}
     fields = [f for f in layout.fields if f.wire.is_number and (integers or not f.wire.is_integer)]

@@ -45,16 +45,16 @@ DEFAULT_ADDRESSES = 65_536
 """Addresses of one search, unless more are asked for."""
 
 MAX_ADDRESSES = 1 << 24
-"""Addresses of one search at most."""
+"""Largest number of addresses of one search."""
 
 MAX_NETWORK_TEXT = 300
 """Characters of a network's text: a host's name has 253 at most."""
 
 MAX_OPEN_CONNECTIONS = 1_000
-"""Connections at a time at most."""
+"""Largest number of connections at a time."""
 
 MAX_OPENINGS_PER_SECOND = 10_000.0
-"""Openings a second at most."""
+"""Largest number of connections opened in a second."""
 
 MAX_SECONDS = 60.0
 """Seconds that one opening may take at most."""

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
     from smartcam.models import ByteOrder
 
-MAX_CONTAINER = 1 << 16
-"""Bytes of a result container: about 64 kB (HALCON script manual p. 15, published)."""
+MAX_CONTAINER_BYTES = 1 << 16
+"""Largest number of bytes of a result container: about 64 kB (HALCON script manual p. 15,
+published)."""
 
 
 def _layout_text(value: object) -> object:
@@ -101,7 +102,7 @@ class Application(EmulatorData):
 
     @property
     def period(self) -> int | None:
-        """After how many runs its containers come again; None where each run makes its own."""
+        """After how many runs its containers come again; None if each run makes its own."""
         layout = self.result_layout
         if layout is None or layout.sequence_field is not None or self.generator is not None:
             return None
@@ -160,9 +161,9 @@ class Application(EmulatorData):
             slots=self.slots,
             sequence=None if field is None else wrap_number(field, number),
         )
-        if len(data) > MAX_CONTAINER:
+        if len(data) > MAX_CONTAINER_BYTES:
             raise ConfigurationError(
-                f"application {self.id}: a container has at most {MAX_CONTAINER} bytes, "
+                f"application {self.id}: a container has at most {MAX_CONTAINER_BYTES} bytes, "
                 f"these values make {len(data)}"
             )
         return data

@@ -17,7 +17,7 @@ from smartcam._arguments import check_application, check_flag, check_port, check
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK
 from smartcam.emulator._bvs.device import Device
-from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
+from smartcam.emulator._client_link import MAX_INPUT_BYTES, SecondClientSession
 from smartcam.emulator._clock import ManualClock, nanoseconds
 from smartcam.emulator._inspected import InspectedApplication
 from smartcam.emulator._scenario.merge import make_plan
@@ -222,7 +222,7 @@ class EmulatedCamera(WireCamera):
 
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place in it of what the camera cannot do, and why; None where all is well."""
+        """Return the place in it of what the camera cannot do, and why; None if all is well."""
         dialect = BVS.dialects[plan.dialect]
         known = [application.id for application in plan.all_applications]
         for number, application in enumerate(plan.applications):
@@ -287,7 +287,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def table(self) -> TableScene | None:
-        """The table that its pages show; None where all applications inspect real pictures."""
+        """The table that its pages show; None if all applications inspect real pictures."""
         applications = self.device.applications.values()
         inspects = all(isinstance(one, InspectedApplication) for one in applications)
         return None if inspects else self.scene
@@ -306,7 +306,7 @@ class EmulatedCamera(WireCamera):
         return last._replace(time=self._moved_at - (self.device.time - last.time))
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
-        """Return the application that describes a result; None where none does."""
+        """Return the application that describes a result; None if none does."""
         return self.device.applications.get(message.application)
 
     def shown(self) -> dict[str, Any]:
@@ -353,7 +353,7 @@ class EmulatedCamera(WireCamera):
             self.spoken,
             Role.CAMERA,
             transport,
-            max_length=MAX_INPUT,
+            max_length=MAX_INPUT_BYTES,
             policy=self._policy(transport),
             trace=trace,
         )

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
-MAX_INPUT = 1 << 16
-"""Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
-script manual p. 35, published for the other direction)."""
+MAX_INPUT_BYTES = 1 << 16
+"""Largest number of bytes of payload the camera takes: input data has the container's limit of
+about 64 kB (HALCON script manual p. 35, published for the other direction)."""
 
 _ENDED = "connection ended"
 _UNSENT = "not sent"
@@ -253,7 +253,8 @@ class FaultyLink:
         self.dead: bool = False  # nothing is read either
         self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
         self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
-        self._framer: WireFramer | None = None  # where it is, the client's bytes go through it
+        # framer that the client's bytes go through, if there is one
+        self._framer: WireFramer | None = None
         self._revival = OneTimer(self._owner.clock, self._revive)
 
     def _line(
@@ -342,7 +343,7 @@ class FaultyLink:
             if not heard or self.machine.buffered:
                 self._link.feed(data)
                 return
-            self._framer = self._owner.codec.framer(MAX_INPUT)
+            self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
         for message in cut(data, self._framer, self._owner.codec):
             if self.dead or self._link.closed:
                 return

@@ -107,7 +107,7 @@ class EvaluatingCamera(LineCamera):
             number: itertools.cycle(some) for number, some in parts.items()
         }
         self._numbers_of_applications = [*parts]
-        self._call: LineClient | None = None  # that the evaluation under way answers
+        self._call: LineClient | None = None  # call that the running evaluation answers
         self._run = 0  # an application that is switched voids the evaluation under way
         self.device: Any = Operator(self)
 

@@ -22,7 +22,7 @@ class InspectionOrder(NamedTuple):
     Attributes:
         application: id of the program that is to run.
         number: sequence number of the run.
-        input: input data of the trigger; empty where none was ever given.
+        input: input data of the trigger; empty if none was ever given.
     """
 
     application: int
@@ -48,7 +48,7 @@ class Inspector(ABC):
         Args:
             order: the run.
             seen: function that is called when the picture is there.
-            done: function that is called with what the application's layout holds; None where the
+            done: function that is called with what the application's layout holds; None if the
                 inspection failed and there is no result.
 
         Both are called in the event loop's thread, later and not from inside this call. After

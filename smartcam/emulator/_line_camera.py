@@ -37,10 +37,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT_BYTES = 1 << 16
-"""Bytes of lines that may wait behind the one under way; more bytes are not read yet."""
+"""Largest number of bytes of lines that may wait behind the one under way; more bytes are not read
+yet."""
 
 MAX_AGENDA = 10_000
-"""Calls that may be scheduled for later at one time."""
+"""Largest number of calls that may be scheduled for later at one time."""
 
 
 _FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import Trace
     from smartcam.protocols import LineRow, Transport
 
-MAX_LOGGED = 4096
-"""Bytes of a line, or of an answer of several, that the log keeps."""
+MAX_LOGGED_BYTES = 4096
+"""Largest number of bytes of a line, or of an answer of several, that the log keeps."""
 
 HIDDEN = b"***"
 """The text that the log shows in place of a secret line."""
@@ -110,7 +110,7 @@ class LineCodec:
         return next((number for number, one in enumerate(self._rows, 1) if one.word == word), 0)
 
     def request_key(self, data: bytes) -> str:
-        """Return the word or ticket of the answer to a line, "" where order alone tells."""
+        """Return the word or ticket of the answer to a line, "" if order alone tells."""
         if self._split is None:
             return ""
         text = self.text(data)
@@ -119,7 +119,7 @@ class LineCodec:
         return text.partition(",")[0] if word is None else word
 
     def answer_key(self, data: bytes) -> str:
-        """Return the word or ticket of an answer, "" where order alone tells."""
+        """Return the word or ticket of an answer, "" if order alone tells."""
         try:
             return "" if self._split is None else self._split(self.said(data))[0]
         except (ValueError, LookupError):
@@ -340,7 +340,7 @@ class LineServer:
     def send(self, message: SaidLine) -> None:
         """Say bytes."""
         self._outbox.append(message.data)
-        self._trace(m.Sender.CAMERA, Frame(message.row, message.data[:MAX_LOGGED]))
+        self._trace(m.Sender.CAMERA, Frame(message.row, message.data[:MAX_LOGGED_BYTES]))
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""

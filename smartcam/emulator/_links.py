@@ -30,12 +30,12 @@ CLOSE_TIMEOUT = 1.0
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
 FIRST_READ_BYTES = 1 << 10
-"""Bytes that one read of a connection takes at most, at first: what a client says is short, and
-hundreds of cameras may have a buffer each. It doubles each time that a read took so many, as input
-data may; a read that took fewer makes it small again."""
+"""Largest number of bytes that one read of a connection takes at first: what a client says is
+short, and hundreds of cameras may have a buffer each. It doubles each time that a read took so
+many, as input data may; a read that took fewer makes it small again."""
 
 MAX_READ_BYTES = 1 << 16
-"""Bytes that one read takes at most in the end."""
+"""Largest number of bytes that one read takes in the end."""
 
 REFUSED = "refuse"
 """Kind of the fault that closes the port for a time."""
@@ -319,7 +319,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
 
     def __init__(self, owner: LinkOwner) -> None:
         super().__init__(owner)
-        self.links: dict[Any, _UdpLink] = {}  # by address
+        self.links: dict[Any, _UdpLink] = {}  # links by address
         self._transport: asyncio.DatagramTransport | None = None
 
     async def serve(self, sock: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""Emulated cameras by the protocol that they speak; a plug-in's protocol brings its own."""
+"""Find the emulated cameras of a protocol; a plug-in's protocol brings its own."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def emulated_class(protocol: str) -> type[WireCamera]:
 
 
 def _with_emulator() -> list[str]:
-    """Return the protocols that have one; a broken one costs only its own name."""
+    """Return the protocols that have an emulated camera; broken plug-ins are left out."""
     names: list[str] = []
     for info in PROTOCOLS.available():
         try:
@@ -57,10 +57,10 @@ def _with_emulator() -> list[str]:
 
 
 def check_options(kind: type[WireCamera], given: Iterable[str]) -> None:
-    """Refuse what a class of emulated cameras does not take.
+    """Refuse options that a class of emulated cameras does not take.
 
     Raises:
-        ConfigurationError: names what it takes.
+        ConfigurationError: an option is unknown; the text names the known ones.
     """
     known = options_of(kind)
     for name in given:
@@ -72,7 +72,7 @@ def check_options(kind: type[WireCamera], given: Iterable[str]) -> None:
 
 
 def options_of(kind: type[WireCamera]) -> frozenset[str]:
-    """Return the names of what a class of emulated cameras is made of."""
+    """Return the names of the options of a class of emulated cameras."""
     names: set[str] = set()
     for one in kind.__mro__:
         if one is WireCamera:

@@ -26,7 +26,7 @@ class Port:
     _listener: Listener
     _host: str
     number: int  # 0 for a free one until it is open
-    _name: str  # for logs
+    _name: str  # name for logs
 
     def __post_init__(self) -> None:
         self._address: tuple[int, Any] = (socket.AF_INET, (self._host, self.number))

@@ -31,7 +31,7 @@ class TablePose(NamedTuple):
 class Observation(NamedTuple):
     """The observation of one piece by the camera."""
 
-    name: str  # of the piece
+    name: str  # name of the piece
     u: float  # pixels to the right
     v: float  # pixels upwards, or downwards for a scene with ``y_down``
     theta: float  # radians, counter-clockwise (clockwise with ``y_down``), in (-pi, pi]

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_codec import HeardLine
     from smartcam.protocols import LineRow
 
-MAX_REQUEST = 1 << 16
-"""Bytes of a request's content at most."""
+MAX_REQUEST_BYTES = 1 << 16
+"""Largest number of bytes of a request's content."""
 
 
 class TicketedClient(LineClient):
@@ -31,7 +31,7 @@ class TicketedClient(LineClient):
 
     Attributes:
         dialect: how the client is spoken to.
-        ticket: ticket of the request under way, "" where it has none.
+        ticket: ticket of the request under way, "" if it has none.
         number: number of its session, from 1.
     """
 
@@ -83,7 +83,7 @@ class TicketedCodec(LineCodec):
             dialect.rows,
             line_end=dialect.line_end,
             ends=re.compile(b"\r\n"),
-            max_line=MAX_REQUEST,
+            max_line=MAX_REQUEST_BYTES,
             encoding=dialect.encoding,
             split=dialect.split,
         )

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 
 
 MAX_ENTRIES = 10_000
-"""Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+"""Largest number of entries kept; the oldest go first. A day of a fast line is not what the log is
+for."""
 
 MAX_BYTES = 1 << 25
-"""Bytes that the entries hold, read or not; the oldest go first. 10,000 results of seven parts
-fit; of the largest containers, 64 kB, it keeps 120."""
+"""Largest number of bytes that the entries hold, read or not; the oldest go first. 10,000 results
+of seven parts fit; of the largest containers, 64 kB, it keeps 120."""
 
 MAX_IDS = 1000
 """Message ids of which it is counted how often they came. Those of the dialect always are: more
@@ -34,7 +35,7 @@ _ENTRY = 400  # bytes of an entry with its message, without what is as long as t
 _PER_BYTE = 4  # of each byte of a payload: one in the message, three in hex
 
 MAX_VISITS = 1000
-"""Connections that have ended of which a record is kept; the oldest go first."""
+"""Largest number of connections that have ended of which a record is kept; the oldest go first."""
 
 
 Direction = Literal["in", "out"]
@@ -54,9 +55,9 @@ class LogEntry(NamedTuple):
         error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
         fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
-            behind them where it was lost for that reason. None where none did. The entry of a
-            message is made when it has passed, or is lost. What the camera sends is told as it
-            meant it, what it hears as it heard it.
+            behind them where it was lost for that reason. None if none did. The entry of a message
+            is made when it has passed, or is lost. What the camera sends is told as it meant it,
+            what it hears as it heard it.
         wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
             of the frame.
     """
@@ -126,9 +127,9 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # behind those
-        self._weights: deque[int] = deque()  # of both, in the same order
-        self._size = 0  # their sum, bytes
+        self._unread: deque[LogEntry | _Traced] = deque()  # entries after those
+        self._weights: deque[int] = deque()  # sizes of both, in the same order, bytes
+        self._size = 0  # sum of these, bytes
         self._gone = 0  # entries that there have been before them
 
     def __repr__(self) -> str:

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_LINKS = 32
-"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
-always gets in: the one without a session for longest makes room."""
+"""Largest number of clients that are looked at. The camera serves one; a few more may wait to take
+over. A newcomer always gets in: the one without a session for longest makes room."""
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read, or held back by faults; more end its connection."""
@@ -243,7 +243,7 @@ class WireCamera(Server):
 
     @property
     def table(self) -> TableScene | None:
-        """The table that its pages show; None where it looks at none."""
+        """The table that its pages show; None if it looks at none."""
         return self.scene
 
     @property
@@ -253,11 +253,11 @@ class WireCamera(Server):
 
     @property
     def last_report(self) -> LastReport | None:
-        """The last run's report, whether anybody heard it or not; None where none is kept."""
+        """The last run's report, whether anybody heard it or not; None if none is kept."""
         return None
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
-        """Return the application that describes a result; None where none does."""
+        """Return the application that describes a result; None if none does."""
         return None
 
     def shown(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.server import FleetServer
     from smartcam.fleet._agent.summary import CameraSummary
+    from smartcam.fleet._bus.bus import MemoryBus
     from smartcam.fleet._file.fleet_file import FleetFile, fleet_schema, load_fleet
     from smartcam.fleet._frames.wire import FleetFrame
     from smartcam.fleet._opening import open, serve
@@ -48,6 +49,7 @@ __all__ = [
     "FleetFrame",
     "FleetResults",
     "FleetServer",
+    "MemoryBus",
     "ReservationLost",
     "ToldOutlet",
     "ToldStore",
@@ -65,6 +67,7 @@ if not TYPE_CHECKING:
             "_agent.reload": "FleetChanges",
             "_agent.server": "FleetServer",
             "_agent.summary": "CameraSummary",
+            "_bus.bus": "MemoryBus",
             "_file.fleet_file": "FleetFile fleet_schema load_fleet",
             "_frames.wire": "FleetFrame",
             "_opening": "open serve",

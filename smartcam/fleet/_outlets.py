@@ -1,4 +1,4 @@
-"""Outlets beside an agent: what its sessions bring goes where the fleet file says."""
+"""Run an agent's outlets, which deliver its sessions' results as the fleet file says."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smartcam.observers import Observer
 from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._agent.server import FleetServer
@@ -34,18 +34,18 @@ COMMAND_CONNECT_TIMEOUT = 5.0
 class FleetOutlets(Server):
     """The outlets of an agent, as ``outlets:`` in a fleet file says.
 
-    It is started before the server, and stopped behind it. What a far end does never holds up the
-    agent.
+    It is started before the server, and stopped after it. A slow receiver never holds up the agent.
 
     Args:
-        server: server whose cameras are meant; not started yet.
-        tell: called with an outlet's name and its trouble, and with "" when that is over.
+        server: server of the cameras; not started yet.
+        tell: function that is called with an outlet's name and its trouble, and with "" once that
+            is over.
 
     Attributes:
         outlets: the outlets.
 
     Raises:
-        ConfigurationError: the file says nothing of outlets, or something wrong.
+        ConfigurationError: the file has no outlets, or wrong ones.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class FleetOutlets(Server):
         self._server.stored_results = self.stored
 
     async def stop(self) -> None:
-        """End; what is not delivered stays in the spools."""
+        """Stop; undelivered records stay in the spools."""
         if self._observer in self._server.observers:
             self._server.observers.remove(self._observer)
         programs, self._programs = [*self._programs.values()], {}
@@ -103,7 +103,7 @@ class FleetOutlets(Server):
         Raises:
             ConfigurationError: one of the stores cannot be read now.
 
-        Cancellation: its thread goes on to the end of what it does.
+        Cancellation: its thread finishes its work.
         """
         since = None if asked.since is None else datetime.fromisoformat(asked.since)
         question = self._question(since, asked.failed, asked.camera, asked.most)
@@ -132,7 +132,7 @@ class FleetOutlets(Server):
         return known[1]
 
     def endian(self, camera: str) -> int:
-        """Return the byte order that a camera's last status told."""
+        """Return the byte order in a camera's last status."""
         host = self._server.hosts.get(camera)
         return 0 if host is None else host.camera.endian
 
@@ -166,14 +166,14 @@ class FleetOutlets(Server):
 
 
 class _OutletObserver(Observer):
-    """Hands what an agent's sessions see to its outlets."""
+    """Passes the events of an agent's sessions to its outlets."""
 
     def __init__(self, owner: FleetOutlets) -> None:
         self._owner = owner
         self._states: dict[str, dict[str, Any]] = {}
 
     def on_state(self, event: CameraEvent) -> None:
-        """Tell of a camera that comes and goes, and of its application."""
+        """Pass on that a camera connects or is lost, and its application."""
         name = event.camera
         state = self._states.setdefault(
             name, {"connected": False, "application": None, "reason": None}
@@ -190,10 +190,14 @@ class _OutletObserver(Observer):
             return
         self._owner.outlets.state_changed(name, {**state, "at": event.at})
 
-    def on_result(self, result: Result) -> None:
-        """Hand on a result."""
-        owner, read = self._owner, self._owner.reading(result.camera)
-        endian = owner.endian(result.camera)
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Hand on results that came together."""
+        camera = results[0].camera
+        read, endian = self._owner.reading(camera), self._owner.endian(camera)
+        for result in results:
+            self._offer(result, read, endian)
+
+    def _offer(self, result: Result, read: Interpretation | None, endian: int) -> None:
         cells = result.value.cells
 
         def value() -> tuple[Any, int | None]:
@@ -212,10 +216,10 @@ class _OutletObserver(Observer):
             done = read(container, endian, camera=camera, number=number, at=at)
             return done.value, done.sequence
 
-        owner.outlets.offer_result(result, value)
+        self._owner.outlets.offer_result(result, value)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """Hand on how a trigger ended that has no result."""
+        """Pass on the error of a trigger without a result."""
         if triggered_at is not None:
             at, kind = datetime.now(UTC), type(error).__name__
             self._owner.outlets.offer_error(camera, at, str(error), kind, triggered_at)

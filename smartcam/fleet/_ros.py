@@ -85,7 +85,7 @@ class RosFleet(Server):
             controls, by name.
         places: hand-eye calibrations, which say where cameras are, by name.
         wanted: whether a camera, of an agent, is to be seen.
-        desks: calibrations that the agent's bus has, too; None where there is no folder for them.
+        desks: calibrations that the agent's bus has, too; None if there is no folder for them.
 
     Raises:
         ConfigurationError: there is no such domain; or no rclpy, where it is wanted.

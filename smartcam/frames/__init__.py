@@ -6,8 +6,9 @@
         async for frame in source:
             show(frame.grey())
 
-Nothing streams until somebody reads. A slow reader gets the newest frame, and a count of what it
-skipped and of what was lost before it came. The extra ``frames`` brings the codecs.
+A source streams only while somebody reads. A slow reader gets the newest frame, with the number of
+frames that it skipped and of those that were lost on the way. The extra ``frames`` brings the
+codecs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""URLs of frame sources."""
+"""Parse URLs of frame sources."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FrameAddress:
-    """The URL of a source of frames, taken apart.
+    """The parts of the URL of a frame source.
 
     Attributes:
         url: URL as it was given.
-        scheme: part of the URL before ``://``, in small letters; ``file`` for a bare path.
-        host: name or address, "" where the URL has none.
-        port: port; None: the scheme's own.
-        path: part behind the host, with its first slash; the whole of a bare path.
-        query: part behind ``?``.
+        scheme: part of the URL before ``://``, in lower case; ``file`` for a bare path.
+        host: name or address; "" if the URL has none.
+        port: port; None: the default of the scheme.
+        path: part after the host, with its first slash; a bare path as a whole.
+        query: part after ``?``.
         user: name of the user before the host, or "".
         password: password of the user, or ""; no text shows the password.
-        fragment: part behind ``#``: our parameters, where the query belongs to the server.
+        fragment: part after ``#``: smartcam's parameters if the query belongs to the server.
     """
 
     url: str
@@ -84,7 +84,7 @@ class FrameAddress:
         """Return the parameters in the query, or in another part of the URL.
 
         Raises:
-            ConfigurationError: a parameter is unknown, or stands there twice.
+            ConfigurationError: a parameter is unknown, or given twice.
         """
         said: dict[str, str] = {}
         for name, value in parse_qsl(
@@ -128,7 +128,7 @@ class FrameAddress:
         return value
 
     def wrong(self, name: str, expected: str, got: str) -> ConfigurationError:
-        """Return the error of a parameter that is wrong."""
+        """Return the error for a wrong parameter."""
         return ConfigurationError(
             f"frame source {self.shown!r}: {name}: expected {expected}, got {got!r}"
         )

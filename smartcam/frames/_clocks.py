@@ -1,4 +1,4 @@
-"""A camera's own clock on ours: what it says becomes seconds of ``time.monotonic()``."""
+"""Convert the time of a camera's own clock to seconds of ``time.monotonic()``."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from typing import Final
 
 WINDOW: Final = 40
-"""Intervals of time that are remembered."""
+"""Number of intervals of time that are remembered."""
 
 PIECE_DURATION: Final = 0.5
-"""Seconds of one interval, in which only the frame that came soonest counts."""
+"""Seconds of one interval; of its frames only the one with the shortest delay counts."""
 
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
-"""Seconds by which a frame must come sooner than the clock allows for a jump of the clock."""
+"""The clock has jumped if a frame comes this many seconds sooner than the clock allows."""
 
 MIN_SURE_INTERVALS: Final = 4
-"""Intervals after which such a jump is sure: before, all frames may have been late."""
+"""Number of intervals after which such a jump is certain: before, all frames may have been late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
 """Seconds of frames needed to measure a drift."""
 
 MAX_DRIFT: Final = 0.01
-"""Largest drift that is followed; a clock that is off by more counts in another unit."""
+"""Largest drift that is followed; a clock with a larger one counts in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class ClockStatistics:
     """The measured drift and jumps of a camera's clock.
 
     Attributes:
-        drift: seconds a second by which the clock is too fast; None: not known yet.
+        drift: seconds per second by which the clock is too fast; None: not known yet.
         jumps: number of times that the clock was set anew, forwards or backwards.
     """
 
@@ -39,16 +39,15 @@ class ClockStatistics:
 
 
 class DeviceClock:
-    """The offset of a device's clock from ours, estimated from when its frames arrive.
+    """The offset of a device's clock from the host's, estimated from the arrival of its frames.
 
-    A frame arrives after it was taken, by a way that takes longer now and shorter then. So
-    arrival minus device time has a lower edge, which is the offset between the clocks and the
-    shortest way; its slope is the drift. What is found is late by the shortest way, and by nothing
-    else.
+    A frame arrives after it was taken, with a delay that varies. So arrival minus device time has a
+    lower edge, which is the offset between the clocks plus the shortest delay; its slope is the
+    drift. The estimated time is late by the shortest delay, and by nothing else.
 
-    Frames that all come late have waited somewhere, however long it is: the offset rises no faster
-    than a clock drifts. A clock that was set back by less than the time between two frames looks
-    the same; its frames count as older than they are until the offset has followed.
+    If all frames come late, they have waited somewhere, for however long: the offset rises no
+    faster than a clock can drift. A clock that was set back by less than the time between two
+    frames looks the same; its frames count as older than they are until the offset has adapted.
 
     Attributes:
         jumps: number of times that the clock was set anew.
@@ -57,10 +56,11 @@ class DeviceClock:
     def __init__(self) -> None:
         self._lowest: collections.deque[tuple[float, float]] = collections.deque(maxlen=WINDOW)
         self._drift: float | None = None
+        self._edge = (0.0, 0.0)  # the one of them that the lower edge goes through
         self._last: float | None = None
         self._piece_began = 0.0
         self._held: float | None = None  # the offset at the last frame
-        self._before_queue: float | None = None  # the offset before frames waited somewhere
+        self._before_queue: float | None = None  # the offset before frames were delayed
         self.jumps = 0
 
     def statistics(self) -> ClockStatistics:
@@ -70,11 +70,11 @@ class DeviceClock:
         return ClockStatistics(drift, self.jumps)
 
     def captured(self, device: float, arrival: float) -> float:
-        """Return a device's time on ours; never later than ``arrival``.
+        """Return a device's time on the host's clock, never later than ``arrival``.
 
         Args:
-            device: what its clock said, seconds.
-            arrival: when that came, seconds of ``time.monotonic()``.
+            device: time of the device's clock, seconds.
+            arrival: time of arrival, seconds of ``time.monotonic()``.
         """
         if self._jumped(device, arrival):
             self.jumps += 1
@@ -98,7 +98,7 @@ class DeviceClock:
         if device < self._last:
             return True
         late = arrival - device - self._offset(device)
-        if self._before_queue is not None:  # frames come without waiting again
+        if self._before_queue is not None:  # frames come without delay again
             late = max(late, arrival - device - self._before_queue)
         return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= MIN_SURE_INTERVALS
 
@@ -111,15 +111,16 @@ class DeviceClock:
         else:
             return
         self._drift = self._slope()
+        self._edge = _lowest(list(self._lowest), self._drift or 0.0)
 
     def _slope(self) -> float | None:
-        """Return the slope of the lower edge; None where too little is known."""
+        """Return the slope of the lower edge; None if too little is known."""
         points = list(self._lowest)
         if points[-1][0] - points[0][0] < MIN_DRIFT_DURATION:
             return None
         half = len(points) // 2
         first, second = _lowest(points[:half], 0.0), _lowest(points[half:], 0.0)
-        for _ in range(3):  # with the slope taken off, the same again
+        for _ in range(3):  # the same again, with the slope subtracted
             slope = _slope(first, second)
             first = _lowest(points[:half], slope)
             second = _lowest(points[half:], slope)
@@ -127,10 +128,8 @@ class DeviceClock:
         return slope if abs(slope) <= MAX_DRIFT else None
 
     def _offset(self, device: float) -> float:
-        slope = self._drift
-        if not slope:
-            return min(offset for _, offset in self._lowest)
-        return min(offset + slope * (device - at) for at, offset in self._lowest)
+        at, offset = self._edge
+        return offset + (self._drift or 0.0) * (device - at)
 
 
 def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:

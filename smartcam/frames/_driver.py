@@ -26,9 +26,9 @@ class StreamFormat(NamedTuple):
 
     Attributes:
         format: format of the pixels.
-        width: pixels.
-        height: pixels.
-        rates: frames a second that it can do, the first is the fastest; empty: it does not say.
+        width: width in pixels.
+        height: height in pixels.
+        rates: possible frame rates, frames per second, the fastest first; empty: not known.
     """
 
     format: PixelFormat
@@ -37,7 +37,7 @@ class StreamFormat(NamedTuple):
     rates: tuple[float, ...] = ()
 
     def __str__(self) -> str:
-        """Return the format as URLs and error texts have it."""
+        """Return the format as in URLs and error texts."""
         rates = f" at {', '.join(f'{rate:g}' for rate in self.rates)}/s" if self.rates else ""
         return f"{self.format.name} {self.width}x{self.height}{rates}"
 
@@ -47,10 +47,10 @@ class FoundSource:
     """A source that a driver found on this machine or its network.
 
     Attributes:
-        url: opens it.
-        name: name shown to people.
-        formats: what it can stream.
-        remark: what keeps it from being opened, or "".
+        url: URL that opens it.
+        name: name for people.
+        formats: formats that it can stream.
+        remark: reason why it cannot be opened, or "".
     """
 
     url: str
@@ -60,53 +60,56 @@ class FoundSource:
 
 
 class FrameSink(ABC):
-    """The place into which a driver puts frames. All is called in the event loop's thread."""
+    """The receiver of a driver's frames. All methods are called in the event loop's thread."""
 
     @abstractmethod
     def frame(self, frame: Frame) -> None:
-        """Take a frame; ``frame.lost`` says what was lost before it."""
+        """Take a frame; ``frame.lost`` is the number of frames lost before it."""
 
     @abstractmethod
     def lost(self, count: int) -> None:
         """Count lost frames; the next frame does not count them again."""
 
     def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
-        """Note that frames came to the far end of a link, where newer ones took their place."""
+        """Note that frames were replaced by newer ones at the far end of a link."""
 
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
-        """Note that nothing more comes: None at the end of a file. Readers get the error."""
+        """Note that no more frames come; readers get ``error``, which is None at a file's end."""
 
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
-        """Note that the picture of the trigger under way will not come."""
+        """Note that the picture of the pending trigger will not come."""
 
     async def taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
-        """Return once every reader has taken the last frame: for a recording that is to lose none.
+        """Return once every reader has taken the last frame, for a recording that must lose none.
 
         Cancellation: safe.
         """
 
 
 class FrameDriver(ABC):
-    """One device, file or address that frames come from; made of its address.
+    """One device, file or address that frames come from, created from its URL.
 
     A :class:`~smartcam.frames.FrameSource` calls its coroutines one after the other, never two at a
     time. A new scheme is a subclass under the entry point ``smartcam.frames``; the entry's name is
     the scheme.
 
     Args:
-        address: what the URL says. A wrong parameter is a
-            :exc:`~smartcam.ConfigurationError` that names the known ones.
+        address: parts of the URL. A wrong parameter raises a :exc:`~smartcam.ConfigurationError`
+            that names the known ones.
 
     Attributes:
-        times_frames: ``captured`` of its frames is their time on our clock, also where they have a
-            ``device_time``; else the source finds it out.
-        form: format of the stream since a feature changed it; None: as :meth:`open` returned it.
-        waits_for: what the device waits for before each picture, as a text for errors, such as
-            ``TriggerSource is Line1``; ``""``: it streams by itself. One that waits is never stuck.
+        times_frames: whether ``captured`` of its frames is on the host's clock even if they have a
+            ``device_time``; else the source computes it.
+        lists_features: whether its device tells which features it has, if it has any.
+        form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
+        waits_for: condition that the device waits for before each picture, for errors, such as
+            ``TriggerSource is Line1``; ``""``: it streams by itself. A waiting device is never
+            considered stuck.
     """
 
     times_frames: ClassVar[bool] = False
+    lists_features: ClassVar[bool] = True
     form: StreamFormat | None = None
     waits_for: str = ""
 
@@ -115,24 +118,24 @@ class FrameDriver(ABC):
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
-        """Return the sources found; open a device only for as long as the search takes."""
+        """Return the sources found; a device is open at most during the search."""
         return []
 
     @property
     def name(self) -> str:
-        """The camera's name in frames, logs and errors."""
+        """Name of the camera in frames, logs and errors."""
         return self.address.shown
 
     @property
     def features(self) -> DeviceFeatures:
-        """The features of the device that can be read and set while it is open.
+        """Features of the device that can be read and set while it is open.
 
         Raises:
             UnsupportedError: devices of this kind have none.
         """
         raise UnsupportedError(
-            f"{self.name}: a source of this kind has no features to read or set; those of gige: "
-            "and v4l2: have them"
+            f"{self.name}: a source of this kind has no features to read or set; those of gige:, "
+            "v4l2: and rtsp: have them"
         )
 
     async def watch_events(
@@ -141,15 +144,15 @@ class FrameDriver(ABC):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the device tell events; return the coroutine function that ends it.
+        """Have the device report events; return the coroutine function that stops that.
 
         Args:
             names: names of the events.
-            take: takes each event.
-            ended: called when no more will come.
+            take: function that takes each event.
+            ended: function that is called when no more events will come.
 
         Raises:
-            UnsupportedError: devices of this kind tell no events.
+            UnsupportedError: devices of this kind report no events.
             FrameSourceError: the device has no such event.
         """
         raise UnsupportedError(f"{self.name}: a source of this kind tells no events")
@@ -157,20 +160,20 @@ class FrameDriver(ABC):
     async def trigger(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
     ) -> None:
-        """Trigger one picture, and return when the device has taken the trigger.
+        """Trigger one picture, and return when the device has accepted the trigger.
 
         The frame that the trigger causes goes into the sink with ``pending.number`` in its
-        ``trigger``; ``sink.trigger_failed`` tells a picture that will not come. It is called while
-        the device streams, and again only after :meth:`disarm`.
+        ``trigger``; ``sink.trigger_failed`` reports a picture that will not come. It is called
+        while the device streams, and again only after :meth:`disarm`.
 
         Args:
             pending: the trigger; ``pending.fire_begins()`` is called right before it is sent, and
-                ``pending.refused()`` where the device surely did not take it.
-            fire: coroutine function that sets the trigger's line; None: by software.
+                ``pending.refused()`` if the device certainly did not accept it.
+            fire: coroutine function that sets the trigger's line; None: a software trigger.
 
         Raises:
             UnsupportedError: devices of this kind have no trigger.
-            TriggerError: the device does not take it.
+            TriggerError: the device does not accept it.
             FrameSourceError: the device does not answer.
         """
         raise UnsupportedError(
@@ -182,49 +185,49 @@ class FrameDriver(ABC):
         """Have the device's owner trigger it, and return the picture that this caused.
 
         Args:
-            timeout: seconds for everything.
-            refuse: whether to raise where another trigger is under way.
+            timeout: seconds for the whole call.
+            refuse: whether to raise if another trigger is pending.
 
         Returns:
-            None where the device is here: :meth:`trigger` triggers it.
+            None for a local device, which :meth:`trigger` triggers.
 
         Raises:
-            SmartCamError: as :meth:`FrameSource.trigger`.
+            SmartCamError: as for :meth:`FrameSource.trigger`.
         """
         del timeout, refuse
         return None
 
     def disarm(self) -> None:  # noqa: B027 - most drivers have no trigger
-        """Take no picture for that of the last trigger any longer."""
+        """Assign no more pictures to the last trigger."""
 
     @abstractmethod
     async def open(self) -> StreamFormat:
-        """Find the device, see that it can do what the address asks for; it does not stream yet.
+        """Find the device and check that it supports the address; it does not stream yet.
 
         Raises:
-            FrameSourceError: the device is not there, is in use, or cannot do that; it says what it
-                can.
+            FrameSourceError: the device does not exist, is in use, or does not support the address;
+                the error says what it supports.
         """
 
     @abstractmethod
     async def start(self, sink: FrameSink) -> None:
-        """Start the stream into ``sink``. A device that was lost since is opened anew.
+        """Start the stream into ``sink``; open the device again if it was lost meanwhile.
 
         Raises:
-            FrameSourceError: the device does not; nothing streams.
+            FrameSourceError: the device does not start; nothing streams.
         """
 
     @abstractmethod
     async def stop(self) -> None:
-        """Stop the stream and all that runs for it. After that ``sink`` hears nothing."""
+        """Stop the stream and everything that runs for it; then ``sink`` is not called any more."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Give the device back. Idempotent, and right after any failure."""
+        """Release the device. Idempotent, and allowed after any failure."""
 
 
 class TaskDriver(FrameDriver):
-    """A driver whose frames come from a task: a subclass says by :meth:`deliver` how."""
+    """A driver whose frames come from a task, which runs :meth:`deliver` of a subclass."""
 
     _task: asyncio.Task[None] | None = None
 
@@ -237,12 +240,12 @@ class TaskDriver(FrameDriver):
         self._task = asyncio.create_task(self.deliver(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:
-        """End the task."""
+        """End the task, which must be running."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
 
     async def close(self) -> None:
-        """End the task, where it still delivers."""
+        """Stop, if frames are still delivered."""
         await self.stop()

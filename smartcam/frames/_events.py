@@ -1,4 +1,4 @@
-"""Events of a device: what happened in it, as it tells it beside its pictures."""
+"""Read the events that a device reports beside its pictures."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 MAX_QUEUED_EVENTS = 100_000
 
 MAX_EVENT_NAMES = 64
-"""Kinds of events that one reader may ask for."""
+"""A reader may ask for at most this many kinds of events."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameEvent:
-    """An event that a device told.
+    """An event that a device reported.
 
     Attributes:
-        name: name of the event, as its selector has it: ``ExposureEnd``.
+        name: name of the event in ``EventSelector``, such as ``ExposureEnd``.
         number: number of the event in the device's protocol.
-        block: id of the picture that the event belongs to; 0: of none.
+        block: id of the picture that the event belongs to; 0: no picture.
         device_time: seconds of the device's own clock; None: the device has none.
         arrived: time of arrival, seconds of ``time.monotonic()``.
         data: values that came with the event, by the name of their feature.
-        lost: events that this reader lost right before, since it was too slow.
+        lost: number of events that this reader lost right before, since it was too slow.
         remark: reason why a value could not be read; mostly empty.
     """
 
@@ -58,13 +58,13 @@ class FrameEvents:
             async for event in events:
                 ...
 
-    Of a reader that is slow the oldest events are dropped; ``FrameEvent.lost`` counts them.
+    If a reader is slow, its oldest events are dropped; ``FrameEvent.lost`` counts them.
 
     Args:
         source: source of the events.
         names: names of the events.
-        size: events that are kept for a reader that is slow.
-        timeout: seconds that an iteration waits for an event; None: as long as it takes.
+        size: number of events that are kept for a slow reader.
+        timeout: seconds that an iteration waits for an event; None: without limit.
     """
 
     def __init__(
@@ -84,13 +84,13 @@ class FrameEvents:
         self._over: tuple[FrameSourceError | None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Have the device tell its events from now on.
+        """Have the device report its events from now on.
 
         Raises:
-            UnsupportedError: a source of this kind tells no events.
+            UnsupportedError: a source of this kind reports no events.
             FrameSourceError: the device has no such event, or does not answer.
 
-        Cancellation: nothing stays on.
+        Cancellation: the events are switched off again.
         """
         if self._end is not None:
             raise LocalProtocolError(f"{self._source.name}: these events are read already")
@@ -99,7 +99,7 @@ class FrameEvents:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Have the device tell them no longer, where nobody else reads them."""
+        """Switch the events off, unless somebody else reads them."""
         end, self._end = self._end, None
         self._ended(None)
         if end is not None:
@@ -112,7 +112,7 @@ class FrameEvents:
         """Return the next event.
 
         Raises:
-            FrameTimeoutError: no event came in time; it may be waited for again.
+            FrameTimeoutError: no event came in time; the caller may wait again.
             FrameSourceError: the device is gone.
 
         Cancellation: safe; no event is lost.

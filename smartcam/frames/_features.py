@@ -30,27 +30,27 @@ FEATURE_TIMEOUT: Final = 10.0
 MAX_FEATURE_TIMEOUT: Final = 3600.0
 
 MAX_VALUE_LENGTH: Final = 4096
-"""Characters of a feature's name or text."""
+"""The name or the text of a feature has at most this many characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """The description of a feature, with its range and its value as they are now.
+    """The description of a feature, with its present range and value.
 
     Attributes:
         name: name of the feature, mostly one of GenICam's SFNC, such as ``ExposureTime``.
         kind: kind of the feature.
-        access: ``rw``, ``ro`` or ``wo``; ``""``: it is not available now, which another feature
-            may change.
+        access: ``rw``, ``ro`` or ``wo``; ``""``: it is not available now; that may depend on
+            another feature.
         value: value of the feature; None: it cannot be read now, or is a command.
         minimum: smallest value; None: no number, or not known.
         maximum: largest value; None: no number, or not known.
-        step: difference between two neighbouring values; None: no number, or any.
-        unit: unit of the value, such as ``us``; ``""``: none is told.
-        entries: names that an enumeration can have now.
-        selectors: features that choose which one this is, such as ``TriggerSelector``.
+        step: difference between two neighbouring values; None: no number, or there are no steps.
+        unit: unit of the value, such as ``us``; ``""``: it has none.
+        entries: values, by name, that an enumeration can have now.
+        selectors: features that select the instance of this one, such as ``TriggerSelector``.
         description: text of the device's maker.
-        problem: reason why value or range could not be read; ``""``: there was none.
+        problem: reason why value or range could not be read; ``""``: they were read.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Feature:
         return f"{ends}{f' {self.unit}' if self.unit else ''}{step}"
 
     def __str__(self) -> str:
-        """Return the feature as a list shows it."""
+        """Return the feature as a line of a list."""
         now = "" if self.value is None else f" = {as_text(self.value)}"
         now += f" {self.unit}" if self.value is not None and self.unit else ""
         access = {"rw": "", "": "; not available now"}.get(self.access, f"; {self.access}")
@@ -95,15 +95,15 @@ def _number(value: float | None) -> str:
 
 
 def as_text(value: FeatureValue) -> str:
-    """Return a value as a URL or a list has it: ``true``, ``5000``, ``Mono8``."""
+    """Return a value as in URLs and lists: ``true``, ``5000``, ``Mono8``."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 class DeviceFeatures(ABC):
     """The features of one driver's device.
 
-    A name may be written in snake_case: ``exposure_time`` is ``ExposureTime``. A name that is
-    unknown is a :exc:`~smartcam.exceptions.FrameFeatureError` with the names that there are.
+    A name may be written in snake_case: ``exposure_time`` is ``ExposureTime``. An unknown name
+    raises a :exc:`~smartcam.exceptions.FrameFeatureError` that lists the known ones.
     """
 
     @abstractmethod
@@ -112,10 +112,10 @@ class DeviceFeatures(ABC):
 
     @abstractmethod
     async def describe(self, name: str) -> Feature:
-        """Return a feature with its value and range as they are now."""
+        """Return a feature with its present value and range."""
 
     async def describe_all(self) -> dict[str, Feature]:
-        """Return all features with their values and ranges as they are now."""
+        """Return all features with their present values and ranges."""
         return {name: await self.describe(name) for name in await self.names()}
 
     @abstractmethod
@@ -124,7 +124,7 @@ class DeviceFeatures(ABC):
 
     @abstractmethod
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the device has then."""
+        """Set a feature; return the value that the device has afterwards."""
 
     @abstractmethod
     async def execute(self, name: str) -> None:
@@ -132,7 +132,7 @@ class DeviceFeatures(ABC):
 
 
 def spelled(name: str) -> str:
-    """Return a name's letters and digits, by which two spellings of one name are the same."""
+    """Return a name's letters and digits, which are the same for all spellings of the name."""
     return "".join(one for one in name.lower() if one.isalnum())
 
 
@@ -140,9 +140,9 @@ class FrameFeatures:
     """The features of a source's device, by name: ``await source.features["Gain"].set(6.0)``.
 
     Args:
-        device: function that returns the driver's features; it raises the error that explains why
+        device: function that returns the driver's features, or raises the error that explains why
             there are none now.
-        changed: called after each change of a feature.
+        changed: function that is called after each change of a feature.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class FrameFeatures:
         self._device, self._changed = device, changed
 
     def __getitem__(self, name: str) -> FrameFeature:
-        """Return the feature of a name; whether there is one, the device says when it is used.
+        """Return the feature of a name, which the device checks only when it is used.
 
         Raises:
             ConfigurationError: the name is no text.
@@ -164,7 +164,7 @@ class FrameFeatures:
 
         Raises:
             UnsupportedError: a source of this kind has no features.
-            FrameSourceError: the device does not tell them, or not within ``timeout``.
+            FrameSourceError: the device does not return them, or not within ``timeout``.
 
         Cancellation: safe.
         """
@@ -172,11 +172,11 @@ class FrameFeatures:
             return await self._device().names()
 
     async def describe(self, *, timeout: float = 6 * FEATURE_TIMEOUT) -> dict[str, Feature]:
-        """Return all features with their values and ranges, by name; a large camera has hundreds.
+        """Return all features with their present values and ranges, by name; there may be hundreds.
 
         Raises:
             UnsupportedError: a source of this kind has no features.
-            FrameSourceError: the device does not tell them, or not within ``timeout``.
+            FrameSourceError: the device does not return them, or not within ``timeout``.
 
         Cancellation: safe.
         """
@@ -184,11 +184,11 @@ class FrameFeatures:
             return await self._device().describe_all()
 
     async def load(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
-        """Have the device set its features as they are in a user set, such as ``UserSet1``.
+        """Have the device load its features from a user set, such as ``UserSet1``.
 
         Args:
-            user_set: entry of ``UserSetSelector``; ``Default`` is the maker's.
-            timeout: seconds for the device to do it.
+            user_set: entry of ``UserSetSelector``; ``Default`` has the maker's values.
+            timeout: seconds for the device to load it.
 
         Raises:
             FrameFeatureError: there is no such set, or the device does not load it now.
@@ -198,11 +198,11 @@ class FrameFeatures:
         await self._with_set(user_set, "UserSetLoad", timeout)
 
     async def save(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
-        """Have the device keep its features, as they are now, in a user set.
+        """Have the device save its present features in a user set.
 
         Args:
             user_set: entry of ``UserSetSelector`` that can be written.
-            timeout: seconds for the device to do it.
+            timeout: seconds for the device to save it.
 
         Raises:
             FrameFeatureError: there is no such set, or the device does not save it.
@@ -212,7 +212,7 @@ class FrameFeatures:
         await self._with_set(user_set, "UserSetSave", timeout)
 
     async def start_with(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
-        """Have the device begin with a user set when it is switched on (``UserSetDefault``).
+        """Have the device load a user set whenever it is switched on (``UserSetDefault``).
 
         Raises:
             FrameFeatureError: there is no such set, or the device cannot choose one.
@@ -234,7 +234,7 @@ class FrameFeature:
     """One feature of a source's device. Made by ``source.features[NAME]``.
 
     Attributes:
-        name: name as it was given.
+        name: name as the caller gave it.
     """
 
     def __init__(
@@ -260,7 +260,7 @@ class FrameFeature:
             return await self._device().get(self.name)
 
     async def describe(self, *, timeout: float = FEATURE_TIMEOUT) -> Feature:
-        """Return the feature with its value, range, unit, entries and access as they are now.
+        """Return the feature with its present value, range, unit, entries and access.
 
         Raises:
             FrameFeatureError: there is no such feature.
@@ -273,14 +273,14 @@ class FrameFeature:
             return await self._device().describe(self.name)
 
     async def set(self, value: FeatureValue, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
-        """Set the feature; return the value that the device has then, which it may have rounded.
+        """Set the feature; return the value that the device has then, perhaps rounded.
 
         Args:
             value: value, or its text: an entry's name, ``true``, a number.
-            timeout: seconds for the device to do it.
+            timeout: seconds for the device to set it.
 
         Raises:
-            ConfigurationError: a value of no kind that a feature has.
+            ConfigurationError: no feature can have a value of this type.
             FrameFeatureError: there is no such feature, it cannot be set now, or not to that value;
                 the text has its range.
             FrameTimeoutError: the device did not answer within ``timeout``.
@@ -310,7 +310,7 @@ class FrameFeature:
 
 
 def checked_value(value: object) -> FeatureValue:
-    """Return a value that a feature may have, as a plain one.
+    """Return a value that a feature may have, as a plain Python value.
 
     Raises:
         ConfigurationError: the value is not valid.
@@ -325,7 +325,7 @@ def checked_value(value: object) -> FeatureValue:
 
 @contextlib.asynccontextmanager
 async def _within(timeout: object, what: str) -> AsyncIterator[None]:
-    """Bound the time of a block; its end is a FrameTimeoutError that names what was waited for."""
+    """Bound the time of a block; raise FrameTimeoutError with ``what`` it waited for."""
     seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
     try:
         async with asyncio.timeout(seconds):

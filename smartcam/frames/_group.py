@@ -1,4 +1,4 @@
-"""Several cameras at once: frames of one moment."""
+"""Read several cameras at once: frames of the same moment."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_FRAMES: Final = 8
-"""Frames of each camera that wait for those of the others."""
+"""At most this many frames of each camera wait for those of the others."""
 
 UNKNOWN_PERIOD: Final = 0.04
-"""Seconds between frames of a camera that does not say."""
+"""Assumed seconds between frames of a camera whose frame rate is not known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Frames of one moment, one of each camera.
+    """Frames of the same moment, one from each camera.
 
     Attributes:
         frames: frames by the names that the group gave.
-        skew: seconds from the first to the last of them, by ``Frame.captured``.
+        skew: seconds from the first frame to the last, by ``Frame.captured``.
     """
 
     frames: Mapping[str, Frame]
@@ -58,13 +58,13 @@ class GroupStatistics:
     """Counts of the frames of a group.
 
     Attributes:
-        offered: sets that came together; always delivered + skipped + waiting.
-        delivered: sets that were taken.
-        skipped: sets that a newer one came before.
-        waiting: 1 where one is there that was not taken.
+        offered: number of complete sets; always delivered + skipped + waiting.
+        delivered: number of sets that a reader took.
+        skipped: number of sets that were replaced by a newer one.
+        waiting: 1 if there is a set that was not taken yet, else 0.
         alone: number of each camera's frames without one of the same moment from every other
             camera.
-        skew: the largest of any set, seconds.
+        skew: largest skew of any set, seconds.
     """
 
     offered: int
@@ -76,7 +76,7 @@ class GroupStatistics:
 
 
 class FrameGroup:
-    """Cameras that are opened, begin and end together; an iterator of :class:`FrameSet`.
+    """Cameras that are opened, started and stopped together; an iterator of :class:`FrameSet`.
 
     ::
 
@@ -84,17 +84,17 @@ class FrameGroup:
             async for both in pair:
                 both["left"], both["right"], both.skew
 
-    It gives the newest set, and skips what it missed. All cameras stream from the first iteration
-    on until the group is closed. Each frame is in one set at most.
+    It returns the newest set, and skips those that were missed. All cameras stream from the first
+    iteration on until the group is closed. Each frame is in one set at most.
 
     Args:
-        sources: sources by name, not open yet; they are the group's from now on.
+        sources: sources by name, not open yet; the group opens and closes them.
         within: largest skew of a set, seconds; None: half of the time between two frames of the
             fastest camera, so that each frame has one partner.
-        timeout: seconds that an iteration waits for a set; None: as long as it takes.
+        timeout: seconds that an iteration waits for a set; None: without limit.
 
     Raises:
-        ConfigurationError: no sources, one twice, or times that are not valid.
+        ConfigurationError: there are no sources, one is given twice, or a time is not valid.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class FrameGroup:
         """Largest skew of a set, seconds.
 
         Raises:
-            LocalProtocolError: the skew follows from what the cameras stream, and they are not
+            LocalProtocolError: the skew follows from the cameras' frame rates, and they are not
                 open.
         """
         if self._within is not None:
@@ -143,7 +143,7 @@ class FrameGroup:
         return 0.5 * (1 / max(rates) if rates else UNKNOWN_PERIOD)
 
     def statistics(self) -> GroupStatistics:
-        """Return the account as it is now."""
+        """Return the present counts."""
         return GroupStatistics(
             self._offered,
             self._delivered,
@@ -157,7 +157,7 @@ class FrameGroup:
         """Open all cameras at the same time; they do not stream yet.
 
         Raises:
-            FrameSourceError: of the first one that cannot be opened; all are closed again.
+            FrameSourceError: a camera cannot be opened; all are closed again.
         """
         if self._open:
             raise LocalProtocolError("the group of frame sources is open already")
@@ -177,7 +177,7 @@ class FrameGroup:
         await self.close()
 
     async def close(self) -> None:
-        """End and close all cameras. Idempotent."""
+        """Stop and close all cameras. Idempotent."""
         self._open = False
         for reader in self._readers.values():
             reader.close()
@@ -200,9 +200,9 @@ class FrameGroup:
 
         Raises:
             FrameTimeoutError: no set came in time; the text says which cameras gave frames.
-            FrameSourceError: of the first camera that ended with one.
+            FrameSourceError: a camera ended with an error.
 
-        Cancellation: safe; the set is there for the next one.
+        Cancellation: safe; the next call returns the set.
         """
         self._start()
         try:
@@ -224,7 +224,7 @@ class FrameGroup:
         if not self._open:
             raise LocalProtocolError("the group of frame sources is not open: use `async with`")
         if not self._readers and self._over is None:
-            # all in one turn of the loop, so that each begins when the others do
+            # all in one turn of the loop, so that all start together
             self._readers = {
                 name: _GroupReader(source, self, name) for name, source in self._sources.items()
             }
@@ -240,7 +240,7 @@ class FrameGroup:
         )
 
     def _take(self, name: str, frame: Frame) -> None:
-        """Take a frame of a camera; see whether it completes a set."""
+        """Take a frame of a camera, and deliver a set if it completes one."""
         kept = self._kept[name]
         kept.append(frame)
         if len(kept) > MAX_WAITING_FRAMES:
@@ -266,7 +266,7 @@ class FrameGroup:
         self._came.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
-        """Forget a frame that is in a set, and those before it, which will be in none."""
+        """Forget a frame that is in a set, and the earlier ones, which will be in none."""
         kept = self._kept[name]
         while kept.popleft() is not frame:
             self._alone[name] += 1
@@ -278,7 +278,7 @@ class FrameGroup:
 
 
 class _GroupReader(FrameReader):
-    """A reader that gives each frame to its group at once."""
+    """A reader that passes each frame to its group at once."""
 
     def __init__(self, source: FrameSource, group: FrameGroup, name: str) -> None:
         super().__init__(source, None)

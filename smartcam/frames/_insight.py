@@ -1,4 +1,4 @@
-"""Pictures of a smart camera that can be asked for the last one."""
+"""Read pictures from a smart camera that can be asked for its last one."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ OURS = ("fps", "name", "timeout")
 
 
 class InSightDriver(FrameDriver):
-    """The last picture of a smart camera, again and again: ``insight://admin@HOST?fps=2``.
+    """A source that polls the last picture of a smart camera: ``insight://admin@HOST?fps=2``.
 
-    What else stands in the query is the camera's, as in :func:`smartcam.connect`. The camera has a
-    session only while somebody reads.
+    Other parameters of the query are those of the camera, as in :func:`smartcam.connect`. A session
+    with the camera exists only while somebody reads.
 
     ============ ============================================================================
-    ``fps``      how often it is asked, times a second; usual 2
-    ``timeout``  seconds for connecting, and for a picture; usual 10
-    ``name``     of the camera
-    ============ ============================================================================
+    ``fps``      how often it is asked, times per second; usual 2 ``timeout``  seconds for
+    connecting, and for a picture; usual 10 ``name``     of the camera ============
+    ============================================================================
 
-    The camera does not say when a picture was taken, nor whether it is a new one. One with the
-    same bytes as the last is the same, and is not given again: where nothing triggers it, open it
-    with ``stall=None``. A frame is stamped with its arrival, and its ``duration`` goes back to when
-    the last one was asked for, since then it was not there yet; of the first one it is infinite.
+    The camera does not say when a picture was taken, nor whether it is new. A picture with the same
+    bytes as the last is taken for the same, and is not returned again: if nothing triggers the
+    camera, open it with ``stall=None``. ``captured`` is the arrival of a frame, and ``duration``
+    goes back to the previous request, when the picture did not exist yet; for the first frame it is
+    infinite.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -67,16 +67,15 @@ class InSightDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """The host and port, or as the URL says."""
+        """Host and port, or the name in the URL."""
         return self._name
 
     async def open(self) -> StreamFormat:
-        """Read a picture, and leave the camera again.
+        """Read a picture, and disconnect again.
 
         Raises:
             FrameFormatError: the camera sends no bitmap.
-            FrameSourceError: the camera is not there, refuses the session, or has no picture to be
-                read.
+            FrameSourceError: the camera does not answer, refuses the session, or has no picture.
         """
         try:
             await self._connect()
@@ -87,10 +86,10 @@ class InSightDriver(FrameDriver):
         return StreamFormat(_format(pixels), width, height, (self._rate,))
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect, and ask for pictures.
+        """Connect, and begin to ask for pictures.
 
         Raises:
-            FrameSourceError: the camera is not there, or refuses.
+            FrameSourceError: the camera does not answer, or refuses.
         """
         try:
             await self._connect()
@@ -100,7 +99,7 @@ class InSightDriver(FrameDriver):
         self._task = asyncio.create_task(self._poll(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:
-        """Ask no longer, and end the session."""
+        """Stop asking, and end the session."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -110,7 +109,7 @@ class InSightDriver(FrameDriver):
             await camera.close()
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
     async def _connect(self) -> None:

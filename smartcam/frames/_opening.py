@@ -1,4 +1,4 @@
-"""Sources of frames by their URLs."""
+"""Open sources of frames by their URLs."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def open(
         url: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``, ``gige://HOST``,
             ``rtsp://...``, ``http://...``, ``rtp://...``, ``synthetic://``, ``insight://...``, or
             the path of a file, also of a recording (``run.mcap``) or a folder of recordings.
-        camera_info: the lens, which every frame gets.
-        timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+        camera_info: lens of the camera, which is added to every frame.
+        timeout: seconds that an iteration waits for a frame; None: without limit.
         stall: seconds without a frame after which a streaming device counts as stuck; None: never.
-        linger: seconds that it goes on streaming after the last reader.
+        linger: seconds for which the source goes on streaming after the last reader.
 
     Raises:
-        ConfigurationError: the URL is wrong; the text says what is known.
+        ConfigurationError: the URL is wrong; the text names what is known.
     """
     address = FrameAddress.parse(url)
     scheme = RECORDING if _is_recording(address) else address.scheme
@@ -54,13 +54,13 @@ def open(
 
 
 async def discover(scheme: str | None = None) -> list[FoundSource]:
-    """Return the sources that are found on this machine and its network.
+    """Find sources on this machine and its network.
 
     Args:
-        scheme: scheme of the sources that are looked for; None: all.
+        scheme: scheme of the sources to look for; None: all.
 
     Raises:
-        ConfigurationError: no such scheme.
+        ConfigurationError: the scheme is unknown.
     """
     if scheme is None:
         schemes = [info.name for info in FRAMES.available()]

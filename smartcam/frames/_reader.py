@@ -1,4 +1,4 @@
-"""One of those who read a source: the newest frame, and an account of the others."""
+"""Read a source of frames: the newest frame, and counts of the others."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from smartcam.frames._source import FrameSource
 
 RELEASE_INTERVAL = 0.05
-"""Seconds after which it is looked again whether a frame that was held back can be handed on."""
+"""Seconds between two checks whether a held-back frame can be passed on."""
 
 FRAME_TIMEOUT = 5.0
-"""Seconds that a frame is waited for, unless one says otherwise."""
+"""Seconds to wait for a frame by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +43,16 @@ class ReaderStatistics:
 
 
 class FrameReader:
-    """One reader of a source: an iterator that gives the newest frame, and skips what it missed.
+    """One reader of a source: an iterator that returns the newest frame and skips missed ones.
 
-    The device streams while there is a reader: one that is not closed, and that somebody still
-    refers to.
+    The device streams while there is a reader that is not closed and still referenced.
     """
 
     def __init__(self, source: FrameSource, timeout: float | None) -> None:
         self._source: FrameSource | None = source
         self._timeout = timeout
         self._next: Frame | None = None
-        self._last: Frame | None = None  # the last one that was taken
+        self._last: Frame | None = None  # last frame that was taken
         self._ended = False
         self._error: FrameSourceError | None = None
         self._waiters: list[asyncio.Future[bool]] = []
@@ -70,7 +69,7 @@ class FrameReader:
         )
 
     def close(self) -> None:
-        """Read no longer; a frame that waits counts as skipped. Idempotent."""
+        """Stop reading; a waiting frame counts as skipped. Idempotent."""
         if self._next is not None:
             self._skipped += 1
             self._next = None
@@ -93,10 +92,10 @@ class FrameReader:
         """Return the newest frame that was not returned yet.
 
         Raises:
-            FrameTimeoutError: no frame came in time; it may be waited for again.
-            FrameSourceError: the source ended with it.
+            FrameTimeoutError: no frame came in time; the caller may wait again.
+            FrameSourceError: the source ended with this error.
 
-        Cancellation: safe; the frame is there for the next one.
+        Cancellation: safe; the next call returns the frame.
         """
         frame = await self._take(self._deadline(self._timeout), "the next frame")
         if frame is None:
@@ -104,11 +103,11 @@ class FrameReader:
         return frame
 
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame; one that is older than ``max_age`` is waited past.
+        """Return the newest frame, or wait for one that is not older than ``max_age``.
 
         Args:
-            max_age: seconds since it was captured; ``inf``: any.
-            timeout: seconds; None: as long as it takes.
+            max_age: largest age since the capture, seconds; ``inf``: any.
+            timeout: seconds; None: without limit.
 
         Raises:
             ConfigurationError: a time that is not valid.
@@ -126,14 +125,14 @@ class FrameReader:
         return await self._first(what, timeout, lambda frame: frame.age <= max_age)
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame that is here, or comes, whose exposure began after a moment.
+        """Return the first frame, waiting or to come, whose exposure began after a moment.
 
-        Where the source does not tell when the exposure began, it is the first one of which that is
-        sure: see :attr:`Frame.began`.
+        If the source does not know when the exposure began, it is the first frame for which that is
+        certain: see :attr:`Frame.began`.
 
         Args:
             moment: time of ``time.monotonic()``.
-            timeout: seconds; None: as long as it takes.
+            timeout: seconds; None: without limit.
 
         Raises:
             ConfigurationError: a time that is not valid.
@@ -151,11 +150,11 @@ class FrameReader:
         return await self._first(what, timeout, lambda frame: frame.began >= moment)
 
     async def fresh(self, since: float, until: float) -> None:
-        """Wait until the next frame is one that came since a moment, or it is too late for that.
+        """Wait until the next frame is one that came after a moment, or until it is too late.
 
         Args:
-            since: time of the loop's clock; a frame that has waited here longer is waited past.
-            until: time of the loop's clock; then an older one will do, or none.
+            since: time of the loop's clock; frames that came before are skipped.
+            until: time of the loop's clock; then an older frame is accepted, or none.
 
         Cancellation: safe.
         """
@@ -173,7 +172,7 @@ class FrameReader:
         return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
 
     def check_not_ended(self) -> None:
-        """Raise the error that the source ended with, where it ended.
+        """Raise the error that the source ended with, if it has ended.
 
         Raises:
             FrameSourceError: the source ended.
@@ -183,7 +182,7 @@ class FrameReader:
             raise self._error or ended
 
     def _waits(self) -> str:
-        """Return the trigger that the device waits for, behind an error's text."""
+        """Return an addition to an error's text: the trigger that the device waits for."""
         waits = "" if self._source is None else self._source.driver.waits_for
         return f": {waits}, and nothing triggered it" if waits else ""
 
@@ -208,7 +207,7 @@ class FrameReader:
         return asyncio.get_running_loop().time() + timeout
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
-        """Return the next frame as soon as there is one; None at the end of the source."""
+        """Return the next frame as soon as it comes; None at the end of the source."""
         while self._next is None and not self._ended:
             if not await self._woken(end):
                 raise FrameTimeoutError(
@@ -222,9 +221,9 @@ class FrameReader:
         return None
 
     async def _woken(self, end: float | None) -> bool:
-        """Wait until something came, or return False when its time is over.
+        """Wait for a frame or the end; return False if the time is over.
 
-        A future and a timer: what asyncio has for it costs twice as much, for each frame.
+        This uses a future and a timer; asyncio's own functions take twice as long per frame.
         """
         loop = asyncio.get_running_loop()
         waiter: asyncio.Future[bool] = loop.create_future()
@@ -271,16 +270,16 @@ class FrameReader:
 
 
 class FrameTap(FrameReader):
-    """A reader that has every frame handed on as it comes, where others get the newest one.
+    """A reader that passes on every frame as it comes, unlike others, which get the newest one.
 
-    While ``busy`` says so it holds the last frame back, for which a source waits that can wait,
-    such as a file. It hands that on when another one comes.
+    While ``busy`` returns True, the last frame is held back, and a source that can wait, such as a
+    file, waits. The frame is passed on when another one comes.
 
     Args:
         source: open source; the device streams from now on.
-        take: function that takes a frame and returns at once: False where it did not want it,
-            which counts as skipped.
-        busy: function that returns True where frames had better come later.
+        take: function that takes a frame and returns at once: False if it did not want the frame,
+            which then counts as skipped.
+        busy: function that returns True if frames should come later.
     """
 
     def __init__(
@@ -291,7 +290,7 @@ class FrameTap(FrameReader):
         source.attach(self)
 
     async def ended(self) -> None:
-        """Wait until the source has ended, and hand everything on.
+        """Wait until the source has ended, and pass everything on.
 
         Raises:
             FrameSourceError: the source ended with it.
@@ -307,7 +306,7 @@ class FrameTap(FrameReader):
             raise self._error
 
     def close(self) -> None:
-        """Read no longer; a frame that was held back is handed on. Idempotent."""
+        """Stop reading, and pass on a frame that was held back. Idempotent."""
         if self._next is not None:
             self._hand_on(self._next)
         super().close()

@@ -1,4 +1,4 @@
-"""A source of frames: its device streams while somebody reads."""
+"""Define a source of frames, whose device streams while somebody reads."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_LINGER = 3600.0
-"""Seconds that a device may go on streaming after the last reader at most."""
+"""Seconds that a device may go on streaming after the last reader."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +64,9 @@ class SourceStatistics:
         streaming: whether the device streams now.
         readers: number of present readers.
         started: number of times that the device began to stream.
-        frames: frames that came, with or without a reader.
-        lost: frames that never came: lost in the camera or on the way.
-        ahead: frames whose time was later than their arrival; the time of the arrival replaced it.
+        frames: number of frames that came, with or without a reader.
+        lost: number of frames that were lost in the camera or on the way.
+        ahead: number of frames whose time was later than their arrival, which replaced it.
         clock: drift and jumps of the camera's own clock; None: the camera has none.
     """
 
@@ -86,12 +86,13 @@ class FrameSource(FrameSink):
     :func:`smartcam.frames.open`.
 
     Args:
-        driver: driver of the device; it is the source's from now on.
-        camera_info: the lens, which every frame gets; None: as the driver has it.
-        timeout: seconds that an iteration waits for a frame; None: as long as it takes.
-        stall: seconds without a frame after which a streaming device counts as stuck: readers get
-            a :exc:`~smartcam.FrameSourceError`. None: never, as with one that waits for triggers.
-        linger: seconds that it goes on streaming after the last reader, for one that comes back.
+        driver: driver of the device, which only the source uses from now on.
+        camera_info: lens of the camera, which is added to every frame; None: that of the driver.
+        timeout: seconds that an iteration waits for a frame; None: without limit.
+        stall: seconds without a frame after which a streaming device counts as stuck: readers get a
+            :exc:`~smartcam.FrameSourceError`. None: never, as for a device that waits for triggers.
+        linger: seconds for which it goes on streaming after the last reader, for one that comes
+            back.
 
     Raises:
         ConfigurationError: a time that is not valid.
@@ -113,13 +114,14 @@ class FrameSource(FrameSink):
         self._camera_info = camera_info
         self._readers: set[weakref.ref[FrameReader]] = set()
         self._format: StreamFormat | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None  # while it is open
-        self._task: asyncio.Task[None] | None = None  # while somebody reads, and it lingers
-        self._changed = asyncio.Event()  # readers came or went, or the driver ended
-        self._took = asyncio.Event()  # a reader took a frame, or went
-        self._held_up = False  # the driver waits for readers
+        self._loop: asyncio.AbstractEventLoop | None = None  # while the source is open
+        self._task: asyncio.Task[None] | None = None  # while somebody reads, and while it lingers
+        self._changed = asyncio.Event()  # set when readers came or went, or the driver ended
+        self._took = asyncio.Event()  # set when a reader took a frame, or went
+        self._held_up = False  # whether the driver waits for readers
         self._streaming = False
-        self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
+        # error that the driver ended with, in a tuple
+        self._over: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
@@ -134,32 +136,34 @@ class FrameSource(FrameSink):
 
     @property
     def driver(self) -> FrameDriver:
-        """The device's driver, for what only its kind can."""
+        """The device's driver, for functions of its kind."""
         return self._driver
 
     @property
     def features(self) -> FrameFeatures:
         """Features of the device: ``await source.features["ExposureTime"].set(5000.0)``.
 
-        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls.
+        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls,
+        and RTSP cameras the parameters whose names their maker tells.
         """
         return FrameFeatures(self._device_features, self._feature_changed)
 
     @property
     def has_features(self) -> bool:
-        """True if devices of this kind have features that can be read and set."""
-        return type(self._driver).features is not FrameDriver.features
+        """True if devices of this kind have features, and tell which ones."""
+        driver = type(self._driver)
+        return driver.lists_features and driver.features is not FrameDriver.features
 
     def events(self, *names: str, size: int = 1000, timeout: float | None = None) -> FrameEvents:
-        """Return the events that the device tells, such as ``ExposureEnd``; see the class.
+        """Return the events that the device reports, such as ``ExposureEnd``; see the class.
 
         Args:
-            *names: names of the events, as ``EventSelector`` has them.
-            size: events that are kept for a reader that is slow.
-            timeout: seconds that an iteration waits for an event; None: as long as it takes.
+            *names: names of the events in ``EventSelector``.
+            size: number of events that are kept for a slow reader.
+            timeout: seconds that an iteration waits for an event; None: without limit.
 
         Raises:
-            ConfigurationError: no name, or a number that is not valid.
+            ConfigurationError: there is no name, or a number is not valid.
         """
         return FrameEvents(self, names, size, timeout)
 
@@ -169,7 +173,7 @@ class FrameSource(FrameSink):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the device tell events, as :meth:`FrameDriver.watch_events` does.
+        """Have the device report events, as :meth:`FrameDriver.watch_events` does.
 
         Raises:
             LocalProtocolError: the source is not open.
@@ -185,7 +189,7 @@ class FrameSource(FrameSink):
         return self._driver.features
 
     async def _feature_changed(self) -> None:
-        """Take the format that the device has since a feature was set."""
+        """Take the format of the device after a feature was set."""
         if self._loop is not None and self._driver.form is not None:
             self._format = self._driver.form
         self._changed.set()
@@ -217,7 +221,7 @@ class FrameSource(FrameSink):
         """Open the device; it does not stream yet.
 
         Raises:
-            FrameSourceError: the device is not there, in use, or cannot do what it is asked for.
+            FrameSourceError: the device does not exist, is in use, or does not support the URL.
 
         Cancellation: nothing stays open.
         """
@@ -232,12 +236,12 @@ class FrameSource(FrameSink):
         return self
 
     def _begin(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Have the device stream: somebody reads."""
+        """Start streaming, since somebody reads."""
         self._task = loop.create_task(self._run(), name=f"frames of {self.name}")
         self._task.add_done_callback(self._stopped)
 
     def _stopped(self, task: asyncio.Task[None]) -> None:
-        """Begin again for readers that came meanwhile; tell readers of a cancelled task."""
+        """Start again for readers that came meanwhile; end the readers of a cancelled task."""
         if task is not self._task or self._loop is None:
             return
         self._task = None
@@ -261,9 +265,9 @@ class FrameSource(FrameSink):
         await self.close()
 
     async def close(self) -> None:
-        """Stop streaming and give the device back; readers end. Idempotent.
+        """Stop streaming and release the device; readers end. Idempotent.
 
-        Cancellation: the device is given back first; how long that takes its driver bounds.
+        Cancellation: the device is released first, within the bounds of its driver.
         """
         loop, self._loop = self._loop, None
         task, self._task, self._format = self._task, None, None
@@ -276,7 +280,7 @@ class FrameSource(FrameSink):
         await finish(partial(self._give_back, task))
 
     async def _give_back(self, task: asyncio.Task[None] | None) -> None:
-        """Close the device when the task has ended, whether that ever began."""
+        """Close the device when the task has ended, even if it never began."""
         if task is not None:
             await asyncio.wait({task})
         await self._driver.close()
@@ -298,8 +302,8 @@ class FrameSource(FrameSink):
         """Begin to read; the device streams from now on.
 
         Args:
-            timeout: seconds that an iteration waits for a frame; None: as long as it takes; left
-                out: the source's.
+            timeout: seconds that an iteration waits for a frame; None: without limit; left out: the
+                source's.
 
         Raises:
             LocalProtocolError: the source is not open.
@@ -314,7 +318,7 @@ class FrameSource(FrameSink):
         return reader
 
     def attach(self, reader: FrameReader) -> None:
-        """Have a reader hear of frames from now on."""
+        """Pass frames to a reader from now on."""
         self._readers.add(weakref.ref(reader, self._dropped))
         self._changed.set()
         if self._task is None and self._loop is not None:
@@ -326,8 +330,8 @@ class FrameSource(FrameSink):
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
 
-        A program that asks often keeps a reader, or opens the source with ``linger``: without
-        either the device begins to stream for each frame.
+        To ask often, keep a reader, or open the source with ``linger``: otherwise the device starts
+        to stream for each frame.
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")
@@ -354,29 +358,29 @@ class FrameSource(FrameSink):
     ) -> Frame:
         """Trigger the device once, and return the picture that this trigger caused.
 
-        It is never a picture that was exposed before, and never that of an earlier trigger, also
-        where the earlier one was cancelled or timed out: the stream begins anew then.
-        :attr:`Frame.trigger` says on what that rests. The device streams for the trigger; one who
-        triggers often keeps a reader, or opens the source with ``linger``.
+        It is never a picture that was exposed before, and never that of an earlier trigger, even if
+        that was cancelled or timed out: then the stream is restarted. :attr:`Frame.trigger` gives
+        the evidence. The device streams for the trigger; to trigger often, keep a reader, or open
+        the source with ``linger``.
 
         Args:
-            timeout: seconds for everything: waiting for its turn, the start of the stream, the
+            timeout: seconds for the whole call: waiting for its turn, the start of the stream, the
                 trigger and its picture.
-            when_busy: whether to wait for a trigger that is under way, or to raise.
+            when_busy: whether to wait for a pending trigger, or to raise.
             fire: coroutine function that sets the line of ``TriggerSource``; None: the device is
                 triggered by its command ``TriggerSoftware``.
 
         Raises:
             UnsupportedError: a source of this kind has no trigger.
-            NotRunningError: the device is not set to be triggered so; the text says what to set.
-            CameraBusyError: another trigger is under way, and ``when_busy`` is ``refuse``; or the
-                device takes none now.
-            OvertriggeredError: the device says that it missed the trigger.
-            FrameLostError: the picture, or one that may be it, was lost on its way.
+            NotRunningError: the device is not set for such triggers; the text says what to set.
+            CameraBusyError: another trigger is pending, and ``when_busy`` is ``refuse``; or the
+                device accepts none now.
+            OvertriggeredError: the device reports that it missed the trigger.
+            FrameLostError: the picture, or one that may have been it, was lost on the way.
             TriggerTimeoutError: no picture came within ``timeout``.
             FrameSourceError: the device does not stream, or is gone.
 
-        Cancellation: the source works on; a picture that still comes is given to readers only.
+        Cancellation: the source goes on; a picture that still comes goes only to readers.
         """
         seconds = check_seconds(timeout, "timeout", "trigger", above=True)
         check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
@@ -387,13 +391,13 @@ class FrameSource(FrameSink):
         return self._seen(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
 
     def _seen(self, frame: Frame) -> Frame:
-        """Return a frame with the lens that was given for the source."""
+        """Return a frame with the source's lens added."""
         if self._camera_info is None or frame.camera_info is not None:
             return frame
         return changed(frame, camera_info=self._camera_info)
 
     async def wait_until_streaming(self, reader: FrameReader, *, anew: bool) -> None:
-        """Wait until the device streams; with ``anew`` the stream begins once more.
+        """Wait until the device streams; with ``anew`` restart the stream first.
 
         Raises:
             FrameSourceError: the device does not begin to stream.
@@ -409,7 +413,7 @@ class FrameSource(FrameSink):
     # what the driver says
 
     def trigger_failed(self, error: SmartCamError) -> None:
-        """Take from the driver that the picture of the trigger under way will not come."""
+        """Take the driver's report that the picture of the pending trigger will not come."""
         self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:
@@ -426,7 +430,7 @@ class FrameSource(FrameSink):
             reader._offer(frame)  # noqa: SLF001 - the two are one
 
     def _timed(self, frame: Frame, now: float) -> Frame:
-        """Return a frame with its time on our clock, not later than now."""
+        """Return a frame with its time on the host's clock, not later than now."""
         captured = frame.captured
         if frame.device_time is not None and not self._driver.times_frames:
             if self._clock is None:
@@ -446,24 +450,24 @@ class FrameSource(FrameSink):
         return changed(frame, captured=captured, utc=frame.utc + shift)
 
     def lost(self, count: int) -> None:
-        """Take from the driver that frames were lost."""
+        """Take the driver's report of lost frames."""
         self._lost += count
         for reader in self._alive():
             reader._miss(count)  # noqa: SLF001
 
     def skipped(self, count: int) -> None:
-        """Take from the driver that frames were skipped before they came here."""
+        """Take the driver's report of frames that were skipped earlier on the way."""
         self._frames += count
         for reader in self._alive():
             reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
-        """Take from the driver that nothing more comes."""
+        """Take the driver's report that no more frames come."""
         self._over = (error,)
         self._changed.set()
 
     async def taken(self) -> None:
-        """Wait until every reader has taken the last frame; meanwhile nothing is stuck."""
+        """Wait until every reader has taken the last frame; meanwhile the device is not stuck."""
         self._held_up = True
         try:
             while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
@@ -502,7 +506,7 @@ class FrameSource(FrameSink):
                 self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
     async def _stream(self) -> None:
-        """Have the device stream until nobody reads, or it ends."""
+        """Stream until nobody reads, or the device ends."""
         self._over = None
         self._newest = None
         self._again = False
@@ -525,7 +529,7 @@ class FrameSource(FrameSink):
             self._tell(over[0])
 
     async def _while_read(self) -> None:
-        """Wait until the driver ended, it is stuck, or nobody reads for as long as it lingers."""
+        """Wait until the driver ends or is stuck, or the time to linger after the last reader."""
         while self._over is None and not self._again:
             if not self._readers:
                 left = self._idle_since + self._linger - asyncio.get_running_loop().time()
@@ -564,7 +568,7 @@ class FrameSource(FrameSink):
             await self._changed.wait()
 
     def _tell(self, error: FrameSourceError | None) -> None:
-        """End all readers; one that comes later has the device tried again."""
+        """End all readers; for a later reader the device is tried again."""
         if error is not None:
             self._triggers.failed(error)
         for reader in self._alive():
@@ -573,7 +577,7 @@ class FrameSource(FrameSink):
 
 
 _closing: set[asyncio.Task[None]] = set()
-"""Tasks that give devices back whose sources nobody had any more."""
+"""Tasks that release the devices of sources that were garbage-collected."""
 
 
 def _close(loop: asyncio.AbstractEventLoop, driver: FrameDriver) -> None:

@@ -1,4 +1,4 @@
-"""Process frames on their way: take the lens out."""
+"""Process frames on their way: remove the distortion of the lens."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Undistorter:
 
     Args:
         camera: the lens.
-        alpha: 0: all pixels of the output are valid; 1: all of the source are kept.
+        alpha: 0 if all pixels of the output must be valid, to 1 if all of the source must be kept.
 
     Attributes:
-        camera: the lens of what comes out: no distortion.
+        camera: lens of the output, without distortion.
 
     Raises:
         ConfigurationError: an alpha outside of 0 to 1.
@@ -53,14 +53,14 @@ class Undistorter:
         self.camera: CameraModel = CameraModel(size=camera.size, matrix=straight)
 
     def __call__(self, frame: Frame, *, colour: bool = False) -> NDArray[Any]:
-        """Return a frame's picture without distortion; 0 where there is no source.
+        """Return a frame's picture without distortion; pixels without a source are 0.
 
         Args:
             frame: frame of the lens' size.
-            colour: whether its colours are wanted, (H, W, 3); else its brightness, (H, W).
+            colour: whether to return colours, (H, W, 3), or brightness, (H, W).
 
         Raises:
-            FrameFormatError: the frame has another size, or not what is wanted.
+            FrameFormatError: the frame has another size, or no colours or brightness.
         """
         _check_size(frame, self._size)
         picture = frame.rgb() if colour else frame.grey()
@@ -69,13 +69,13 @@ class Undistorter:
 
 
 class Rectifier:
-    """Pairs of pictures whose rows show the same points; the maps are those of a calibration.
+    """Rectifies pairs of pictures, so that rows show the same points, by a calibration's maps.
 
     Args:
-        rectification: what :meth:`~smartcam.calibration.StereoCalibration.rectify` gives.
+        rectification: result of :meth:`~smartcam.calibration.StereoCalibration.rectify`.
         size: size of the sources, width and height in pixels.
         left: name of the left camera in the sets.
-        right: frame of the right camera.
+        right: name of the right camera in the sets.
     """
 
     def __init__(
@@ -91,10 +91,10 @@ class Rectifier:
         self._maps = tuple(cv2.convertMaps(one, None, cv2.CV_16SC2) for one in rectification.maps)
 
     def __call__(self, pair: FrameSet, *, colour: bool = False) -> tuple[NDArray[Any], ...]:
-        """Return both pictures rectified, the left one first; 0 where there is no source.
+        """Return both rectified pictures, the left one first; pixels without a source are 0.
 
         Raises:
-            FrameFormatError: a frame has another size, or not what is wanted.
+            FrameFormatError: a frame has another size, or no colours or brightness.
         """
         cv2 = load("cv2")
         pictures = []

@@ -160,7 +160,7 @@ def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
         picture: (H, W) or (H, W, C), also after a lossy codec; of depth the distances.
 
     Returns:
-        None where there is no stamp, or it is damaged.
+        None if there is no stamp, or it is damaged.
     """
     if picture.shape[0] < MIN_SIZE_PX[1] or picture.shape[1] < MIN_SIZE_PX[0]:
         return None

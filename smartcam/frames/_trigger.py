@@ -1,7 +1,7 @@
-"""Triggers of a source: one at a time, each with the picture that it caused, or a typed error.
+"""Trigger a source, once at a time, each with the picture that it caused, or a typed error.
 
 A trigger that was sent and whose picture was not seen leaves the stream unsettled: the picture may
-still come. So the stream begins anew before the next trigger, and what comes of the old one is
+still come. So the stream is restarted before the next trigger, and pictures of the old one are
 dropped with it.
 """
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 
 MAX_NOTES = 5
-"""Things that an error's text tells of what happened meanwhile."""
+"""Largest number of notes on the wait in an error's text."""
 
 
 class AwaitedTrigger:
-    """A trigger that is under way.
+    """A pending trigger.
 
     Attributes:
         number: number of the trigger, counted by its source.
-        fired: time right before it was sent, seconds of ``time.monotonic()``; None: it was not.
+        fired: time right before it was sent, seconds of ``time.monotonic()``; None: not sent yet.
         outcome: the frame, or the error.
-        notes: what happened meanwhile, for the error's text.
+        notes: notes on the wait, for the error's text.
     """
 
     def __init__(self, number: int) -> None:
@@ -42,11 +42,11 @@ class AwaitedTrigger:
         self.notes: list[str] = []
 
     def fire_begins(self) -> None:
-        """Note that the trigger is sent now."""
+        """Note that the trigger is being sent."""
         self.fired = time.monotonic()
 
     def refused(self) -> None:
-        """Note that the device did not take the trigger, and causes no picture for it."""
+        """Note that the device did not take the trigger, and so causes no picture."""
         self.fired = None
 
 
@@ -116,7 +116,7 @@ class TriggerQueue:
             driver.disarm()
             self.settled = self.settled and (pending.fired is None or _came(pending))
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
-                pending.outcome.exception()  # somebody was told already
+                pending.outcome.exception()  # the caller has an outcome already
 
     def came(self, frame: Frame) -> None:
         """Take the frame that the driver says a trigger caused."""
@@ -130,7 +130,7 @@ class TriggerQueue:
             pending.outcome.set_result(frame)
 
     def failed(self, error: SmartCamError) -> None:
-        """Note that the trigger under way has no picture."""
+        """Note that the pending trigger has no picture."""
         if self._pending is not None and not self._pending.outcome.done():
             self._pending.outcome.set_exception(error)
 

@@ -93,7 +93,7 @@ class Desk:
 
     def __init__(self, shared: SharedDesk) -> None:
         self._shared = shared
-        self._rows: list[Row] | None = None  # of the last result; None: there is none
+        self._rows: list[Row] | None = None  # rows of the last result; None without one
         self._until = 0.0  # the loop time up to which they may be asked for
         self._last = RobotAnswer(AnswerCode.NONE, words="no request has failed")
         self._given = False  # the answer under way takes the first row with it

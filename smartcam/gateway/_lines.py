@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from smartcam.gateway._settings import Style
 
 MAX_LINE_BYTES: Final = 256
-"""Bytes of a request; a longer one ends the connection."""
+"""Largest number of bytes of a request; a longer one ends the connection."""
 
 MAX_BRACKETED_NUMBERS: Final = 30
-"""Numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module interfaces)."""
+"""Largest number of numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module
+interfaces)."""
 
 MAX_NUMBER: Final = 1e9
 """Largest number that is written; controllers read 32-bit floats."""
@@ -61,8 +62,8 @@ class RobotRequest(NamedTuple):
     """A request of a robot.
 
     Attributes:
-        word: the word, in capitals; "" where there is no word.
-        application: number behind the word, None without one.
+        word: the word, in capitals; "" if there is no word.
+        application: number after the word, None without one.
         tag: number before the word, which the answer repeats; None without one.
         given: text of the request, for errors.
     """
@@ -134,7 +135,7 @@ class RequestReader:
     def _end(self, data: bytes, at: int) -> int:
         """Return the place behind the request that begins at ``at``; 0 if it is not whole."""
         begin = _XML_BEGIN.match(data, at) if self._xml else None
-        if begin is None:  # a line; whatever it is instead of XML, it is one request
+        if begin is None:  # a line; of whatever kind instead of XML, it is one request
             mark = _LINE_END.search(data, at)
             return mark.end() if mark else 0
         closing = b"</" + begin[1] + b">"

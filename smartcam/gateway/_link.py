@@ -21,7 +21,7 @@ MAX_WAITING_REQUESTS: Final = 8
 """RequestReader with a number that may wait while another one is under way."""
 
 MAX_UNSENT_BYTES: Final = 1 << 16
-"""Bytes that a robot which reads nothing may leave unsent."""
+"""Largest number of bytes that a robot which reads nothing may leave unsent."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
 """Seconds without a byte until the system asks whether the robot is there, and how often."""

@@ -42,9 +42,9 @@ class Style(NamedTuple):
         pose: convention of poses, a key of ``smartcam.calibration.formats.ROBOTS``.
         length: unit of lengths, ``m`` or ``mm``.
         angle: unit of angles, ``rad`` or ``deg``.
-        decimals: digits behind the decimal point.
+        decimals: digits after the decimal point.
         separator: text between two values.
-        line_end: text behind an answer.
+        line_end: text after an answer.
         width: bytes that each answer has, filled with blanks; 0: as many as it needs.
         longest: bytes that an answer may have; words are cut, numbers never.
     """

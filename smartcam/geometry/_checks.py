@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_choice(value: object, among: Sequence[str], what: str) -> None:
-    """Raise (SHAPE) where an option is none of those that there are."""
+    """Raise SHAPE if an option is none of those that there are."""
     word = plain(value)  # a class of somebody's may hash and compare as it likes
     if not isinstance(word, str) or word not in among:
         known = list(among)
@@ -23,7 +23,7 @@ def check_choice(value: object, among: Sequence[str], what: str) -> None:
 
 
 def check_size(values: Any, called: str) -> None:
-    """Raise (SHAPE) where something is no size of an image: width and height, pixels."""
+    """Raise SHAPE if something is no size of an image: width and height, pixels."""
     whole = (int, np.integer)
     plain = isinstance(values, tuple | list) and len(values) == 2
     if not plain or not all(isinstance(one, whole) and one > 0 for one in values):

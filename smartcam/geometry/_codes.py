@@ -8,8 +8,8 @@ from typing import NamedTuple
 from smartcam._arguments import shown
 from smartcam.exceptions import CalibrationError
 
-MAX_TEXT_OF_VALUE = 200
-"""Characters of a value that the text of an error shows at most."""
+MAX_VALUE_CHARACTERS = 200
+"""Largest number of characters of a value that the text of an error shows."""
 
 
 class Code(enum.StrEnum):
@@ -158,7 +158,7 @@ class Code(enum.StrEnum):
     ) -> CalibrationError:
         """Return the same error; ``text`` says what was expected, and ``got`` is said behind it."""
         try:
-            came = f"{got!s:.{MAX_TEXT_OF_VALUE}}"
+            came = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - whatever a class of somebody's raises there
             came = shown(got)
         return self.refusal(f"{text}, got {came}", expected, got)

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from smartcam.geometry._rotations import Array
 
 MAX_PLACES: Final = 1000
-"""Rows, columns or layers of a pattern at most."""
+"""Largest number of rows, columns or layers of a pattern."""
 
 MIN_SINE: Final = 0.5
-"""Sine of the angle between the touched row and column at least: 30 degrees."""
+"""Least sine of the angle between the touched row and column: 30 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,11 +1,11 @@
-"""Rigid motions over arrays: one after the other, back, by small steps, and how far apart.
+"""Compute with arrays of rigid motions: compose, invert, apply small steps, compare.
 
 A motion is ``p' = R p + t``. Rotations are matrices, since that is what points are multiplied with;
 their exponential and logarithm are those of SciPy's ``Rotation``.
 
 A small step ``(w, d)`` is a rotation vector and a shift. The shift is always added to ``t``, along
-the axes of the frame that the motion leads to. The turn stands on one side of R or the other:
-``exp([w]x) R`` turns in the frame that it leads to, ``R exp([w]x)`` in the one that it comes from.
+the axes of the frame that the motion leads to. The turn is on either side of R: ``exp([w]x) R``
+turns in the frame that the motion leads to, ``R exp([w]x)`` in the one that it comes from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     Index = NDArray[np.intp] | Sequence[int] | slice | int
 
 SMALL_ANGLE = 1e-4
-"""Radians below which the first term of a series replaces a factor: it is off by 1e-9 of it."""
+"""Below this angle, radians, the first term of a series replaces a factor, with an error of
+1e-9."""
 
 
 class Rigid(NamedTuple):
@@ -54,13 +55,13 @@ class Rigid(NamedTuple):
         return len(self.translation)
 
     def __matmul__(self, other: Rigid) -> Rigid:
-        """Return this motion after another."""
+        """Return the motion of another one followed by this one."""
         # R1 (R2 p + t2) + t1 = (R1 R2) p + (R1 t2 + t1)
         turned = (self.rotation @ other.translation[..., None])[..., 0]
         return Rigid(self.rotation @ other.rotation, turned + self.translation)
 
     def inverse(self) -> Rigid:
-        """Return the motions back."""
+        """Return the inverse motions."""
         # p' = R p + t  <=>  p = R^T p' - R^T t
         back = np.swapaxes(self.rotation, -1, -2)
         return Rigid(back, -(back @ self.translation[..., None])[..., 0])
@@ -87,17 +88,17 @@ class Rigid(NamedTuple):
         return Rigid(exp_rotation(step[..., :3]) @ self.rotation, self.translation + step[..., 3:])
 
     def before(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_before` gives others."""
+        """Return the steps (..., 6) with which :meth:`turned_before` leads to other motions."""
         turn = log_rotation(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
     def after(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_after` gives others."""
+        """Return the steps (..., 6) with which :meth:`turned_after` leads to other motions."""
         turn = log_rotation(other.rotation @ np.swapaxes(self.rotation, -1, -2))
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
     def angle_to(self, other: Rigid) -> Array:
-        """Return by which angles (...) they are turned against others, radians."""
+        """Return the angles (...) between the rotations of these and other motions, radians."""
         angles: Array = np.linalg.norm(self.before(other)[..., :3], axis=-1)
         return angles
 
@@ -117,7 +118,7 @@ def cross_matrix(vectors: Array) -> Array:
 def exp_rotation(vectors: Array) -> Array:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, radians."""
     # Rodrigues: exp([w]x) = I + sin(a)/a [w]x + (1 - cos(a))/a^2 [w]x^2, a = |w|.
-    if not vectors.size:  # which SciPy before 1.13 refuses
+    if not vectors.size:  # SciPy before 1.13 refuses empty arrays
         return np.zeros((*vectors.shape, 3))
     turns = load("scipy.spatial.transform").Rotation.from_rotvec(vectors.reshape(-1, 3))
     rotations: Array = turns.as_matrix().reshape(*vectors.shape, 3)
@@ -126,7 +127,7 @@ def exp_rotation(vectors: Array) -> Array:
 
 def log_rotation(rotations: Array) -> Array:
     """Return the rotation vectors (..., 3) of rotations (..., 3, 3), of length pi at most."""
-    if not rotations.size:  # which SciPy before 1.13 refuses
+    if not rotations.size:  # SciPy before 1.13 refuses empty arrays
         return np.zeros(rotations.shape[:-1])
     turns = load("scipy.spatial.transform").Rotation.from_matrix(rotations.reshape(-1, 3, 3))
     vectors: Array = turns.as_rotvec().reshape(rotations.shape[:-1])

@@ -71,7 +71,7 @@ def as_vector(values: ArrayLike, length: int, what: str) -> Array:
 
 
 def check_finite(values: Array, what: str) -> None:
-    """Raise (NOT_FINITE) where a calibration gives no number; ``what`` says what it was to give."""
+    """Raise NOT_FINITE if a calibration gives no number; ``what`` says what it was to give."""
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
         raise not_finite(what, np.atleast_1d(values[row]).tolist())

@@ -187,7 +187,7 @@ class Stored:
         return made
 
     def _check(self, found: Mapping[str, Any], called: str) -> None:
-        """Raise where fields do not fit together, or to the others that were found."""
+        """Raise if fields do not fit together, or to the others that were found."""
 
 
 def _share(key: str) -> Callable[[Any, core_schema.ValidationInfo[Context]], Any]:
@@ -221,14 +221,14 @@ def refused(called: str, text: str, got: object) -> CalibrationError:
 
 
 def check_counts(found: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
-    """Raise (SHAPE) where a field has not as many items as another one."""
+    """Raise SHAPE if a field has not as many items as another one."""
     for name in names:
         if len(found[name]) != count:
             raise refused(called, f"{name}: expected {count}", len(found[name]))
 
 
 def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
-    """Raise (SHAPE) where a field has not as many values as others ask for."""
+    """Raise SHAPE if a field has not as many values as others ask for."""
     if values.shape != shape:
         raise refused(called, f"{name}: expected shape {shape}", values.shape)
 

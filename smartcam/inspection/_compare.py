@@ -38,7 +38,7 @@ EDGE_TOLERANCE_PX: Final = 0.75
 """Distance that an edge may be beside its taught place, in pixels."""
 
 MAX_ITERATIONS: Final = 30
-"""Steps of the alignment."""
+"""Largest number of steps of the alignment."""
 
 MIN_CORRELATION: Final = 0.5
 """Correlation of taught and seen levels from which on they are the same thing in another light."""

@@ -1,4 +1,4 @@
-"""Draw what the tools of a program saw into their picture."""
+"""Draw the findings of a program's tools into their picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLOURS: Final = {
     "region": (0, 116, 217),
     "hint": (255, 220, 0),
 }
-"""Red, green and blue of each role."""
+"""Red, green and blue of each role's marks."""
 
 _SHIFT: Final = 4  # OpenCV draws at sixteenths of a pixel
 

@@ -45,7 +45,7 @@ class Finding:
 
     Attributes:
         ok: the tool's verdict.
-        reason: why the verdict is not ok, in one sentence for people; "" where it is.
+        reason: why the verdict is not ok, in one sentence for people; "" if it is.
         values: what was found, by the names of the tool's fields, in SI units (metres, radians,
             pixels). A field that is left out has no value: 0, False, "" or NaN on the wire.
         records: values of each thing found, by the names of the tool's records.
@@ -71,7 +71,7 @@ class Inspection:
         application: number of the application.
         name: name of the application.
         ok: True if every tool's verdict is.
-        reason: why the verdict is not ok: the first tool's reason that is not; "" where all are.
+        reason: why the verdict is not ok: the first tool's reason that is not; "" if all are.
         values: the values of the layout, by field, as :meth:`Layout.build` takes them.
         findings: what each tool found, by its name, in the order they ran.
         seconds: how long each tool took, by its name.

@@ -42,7 +42,7 @@ FEW: Final = 8.0
 5 to 200 pictures of good parts, 2 % at most then have one that is left out (simulated)."""
 
 MAX_NAMED: Final = 5
-"""Pictures that a remark names; it counts the others."""
+"""Largest number of pictures that a remark names; it counts the others."""
 
 MAX_DIGITS: Final = 9
 """Decimals of a learned tolerance."""
@@ -247,7 +247,7 @@ def _spreads(number: int, *, sided: bool) -> float:
 
 
 def _left_out(left_out: Mapping[str, str]) -> str:
-    """Return the sentence about pictures that nothing was learned from; "" where there are none."""
+    """Return the sentence about pictures that nothing was learned from; "" if there are none."""
     if not left_out:
         return ""
     named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_NAMED]

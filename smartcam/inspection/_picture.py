@@ -21,7 +21,7 @@ MAX_SIDE_PX: Final = 20_000
 """Width and height that a picture may have, in pixels."""
 
 MAX_FILE_BYTES: Final = 1 << 28
-"""Bytes that a picture's file may have."""
+"""Largest number of bytes that a picture's file may have."""
 
 LIMITED_BLACK: Final = 16
 LIMITED_WHITE: Final = 235
@@ -153,7 +153,7 @@ class Picture:
 
     @cached_property
     def clipped(self) -> NDArray[np.bool_] | None:
-        """Mask of pixels with a colour that is cut off, (H, W); None where there are no colours.
+        """Mask of pixels with a colour that is cut off, (H, W); None if there are no colours.
 
         A colour is cut off at its top, and at its bottom where another one is bright: there a
         camera that mixes its colours would have less than nothing. Where the dark is black in all

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_SPOTS: Final = 1000
-"""Spots in one result."""
+"""Largest number of spots in one result."""
 
 MAX_AREA_PX: Final = 1_000_000_000
 """Largest area of a spot that can be asked for, in pixels."""

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import AnyTool, ToolSetup
 
 MAX_TOOLS: Final = 50
-"""Tools of one program."""
+"""Largest number of tools of one program."""
 
 MAX_REASON_BYTES: Final = 80
-"""Bytes of the reason in a result container; a longer one is cut there."""
+"""Largest number of bytes of the reason in a result container; a longer one is cut there."""
 
 OWN_FIELDS: Final = ("ok", "reason")
 """Fields of the program's own, which no tool may have."""
@@ -207,7 +207,7 @@ class FollowedApplication(Tool[ToolSettings]):
 
 
 def _reason(findings: Mapping[str, Finding]) -> str:
-    """Return the first reason among findings; "" where all are ok."""
+    """Return the first reason among findings; "" if all are ok."""
     for name, found in findings.items():
         if not found.ok:
             why = found.reason or "not ok"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._program import Program
 
 MAX_FILE_BYTES: Final = 1 << 22
-"""Bytes of a cell file that is taught."""
+"""Largest number of bytes of a cell file that is taught."""
 
 LINE_WIDTH: Final = 4096
 """Characters after which a written line is wrapped: none is."""

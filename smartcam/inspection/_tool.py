@@ -138,7 +138,7 @@ class Tool(ABC, Generic[S]):
 
     @property
     def records(self) -> str:
-        """Layout text of one thing found, for tools that find several; "" where there is none."""
+        """Layout text of one thing found, for tools that find several; "" if there is none."""
         return ""
 
     @property

@@ -73,7 +73,7 @@ class Reader:
     """Reads values from a container's bytes; every read that does not fit is an error.
 
     Args:
-        data: the container's bytes behind the application id.
+        data: the container's bytes after the application id.
         context: what else is known about it.
         layout: the layout the user gave, None without one.
 
@@ -375,7 +375,7 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
 
 
 def plain(interpreter: Interpreter) -> PlainInterpreter | None:
-    """Return an interpreter that :func:`run_plain` takes, None where it wants a :class:`Reader`."""
+    """Return an interpreter that :func:`run_plain` takes, None if it wants a :class:`Reader`."""
     if not isinstance(interpreter, PlainInterpreter):
         return None
     overridden = type(interpreter).interpret is not PlainInterpreter.interpret

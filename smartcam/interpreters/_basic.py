@@ -25,7 +25,7 @@ class RawInterpreter(PlainInterpreter):
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
     def read(self, data: bytes, context: Context) -> bytes:
-        """Return the bytes behind the application id."""
+        """Return the bytes after the application id."""
         return data
 
 

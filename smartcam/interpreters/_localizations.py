@@ -56,7 +56,8 @@ MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
 
 MAX_NAMES = 64
-"""Names of features that are kept as texts: an application has a handful, a peer could send any."""
+"""Largest number of names of features that are kept as texts: an application has a handful, a peer
+could send any."""
 
 # half the time of the NamedTuples' own; the cast because a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
@@ -101,7 +102,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._checks = use.checks
         self._sigmas = use.sigmas
         self._empty = bytes(self.layout.size)
-        self._names: dict[bytes, str] = {}  # of features, by what is on the wire
+        self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
 
     def read(self, data: bytes, context: Context) -> list[Localization]:
         """Return the parts in the camera's order.
@@ -217,9 +218,9 @@ class _Use(NamedTuple):
 
     Attributes:
         missing: defaults of the fields that the record lacks; they go behind its own.
-        pick: function that puts the values into the order of use; None where they are in it.
+        pick: function that puts the values into the order of use; None if they are in it.
         z: place of ``z``, which is rare; None without it.
-        scales: factors that turn the values into SI; None where they are SI.
+        scales: factors that turn the values into SI; None if they are SI.
         checks: True if unused texts and bools have to be checked, too.
         sigmas: places of the errors of poses; None without them.
     """
@@ -236,7 +237,8 @@ class _SigmaUse(NamedTuple):
     """The fields of a record that say the errors of its pose."""
 
     sigmas: tuple[tuple[int, float], ...]  # places of those in _SIGMAS, and their factors for SI
-    correlations: tuple[int | None, ...]  # places of those in _CORRELATIONS; None: it is not there
+    # places of those in _CORRELATIONS; None if it is missing
+    correlations: tuple[int | None, ...]
 
 
 @functools.lru_cache(maxsize=64)
@@ -282,7 +284,7 @@ class _Scales(NamedTuple):
 
 
 def _scales(fields: dict[str, Field]) -> _Scales | None:
-    """Return the scales, None where the values on the wire are floats in SI already."""
+    """Return the scales, None if the values on the wire are floats in SI already."""
     used = [fields.get(name) for name in ("quality", "x", "y", "theta", "z")]
     units = [UNITS[field.unit] if field and field.unit else None for field in used]
     multiply = tuple(unit.multiply if unit else 1.0 for unit in units)
@@ -297,7 +299,7 @@ def _scaled(values: Iterable[float], scales: _Scales) -> Iterable[float]:
 
 
 def _check(field: Field) -> None:
-    """Raise where a field has a type or a unit that its name cannot have."""
+    """Raise if a field has a type or a unit that its name cannot have."""
     wire = field.wire
     if field.name in _QUANTITIES:
         quantities = _QUANTITIES[field.name]

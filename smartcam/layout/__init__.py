@@ -1,16 +1,16 @@
 """The layout of a result container: which fields it holds, in which order, in which unit.
 
-A container carries no types and no names (SC manual p. 33, published); the user says what he
-configured on the camera::
+A container carries no types and no names (SC manual p. 33, published), so the user describes the
+fields that were configured on the camera::
 
-    "passed: bool, x: real32 mm, code: string[20]"      exactly one record
-    "(x: real32 mm, y: real32 mm)*"                     records to the end: a list
-    "(x: real32 mm, y: real32 mm)[32]"                  exactly 32 records
-    "n: int32, (x: real32 mm, y: real32 mm)[n]"         n records, unused ones behind them
+    "passed: bool, x: real32 mm, code: string[20]"      exactly one record "(x: real32 mm, y: real32
+    mm)*"                     records to the end: a list "(x: real32 mm, y: real32 mm)[32]"
+    exactly 32 records "n: int32, (x: real32 mm, y: real32 mm)[n]"         n records, then unused
+    ones
 
-One :class:`Layout` has many faces: values (:meth:`~Layout.parse`), bytes (:meth:`~Layout.build`),
-numpy (:attr:`~Layout.dtype`, :meth:`~Layout.parse_table`), pydantic, JSON Schema and YAML. The
-heavy ones are imported where they are first used.
+One :class:`Layout` has many uses: values (:meth:`~Layout.parse`), bytes (:meth:`~Layout.build`),
+numpy (:attr:`~Layout.dtype`, :meth:`~Layout.parse_table`), pydantic, JSON Schema and YAML. Heavy
+libraries are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class Layout:
 
     Args:
         text: the layout text; new lines are white space, ``#`` begins a comment.
-        lenient: take any byte but zero for a true bool; otherwise only 0xFF is true and only
+        lenient: whether any byte except zero is a true bool; otherwise only 0xFF is true and only
             0x00 false, as the camera sends them.
-        start: where the layout begins in ``text``; positions of mistakes count from the start of
-            ``text`` nevertheless.
+        start: index at which the layout begins in ``text``; positions of mistakes still count from
+            the start of ``text``.
 
     Raises:
-        LayoutError: a mistake in the text, with its position.
+        LayoutError: the text has a mistake; the error gives its position.
     """
 
     __slots__ = (
@@ -59,11 +59,11 @@ class Layout:
     )
 
     def __init__(self, text: str, *, lenient: bool = False, start: int = 0) -> None:
-        if not isinstance(text, str):  # what is wrong in it is told with its place
+        if not isinstance(text, str):  # errors in the text are reported with their place in it
             raise wrong_argument("layout", "a text", text)
         lenient, start = check_flag(lenient, "lenient"), check_integer(start, "start", 0, len(text))
         made = compile_text(text, start, lenient=lenient)
-        self._compiled = made  # others find it as long as this one lives
+        self._compiled = made  # the cache finds it as long as this object exists
         self._spec = made.spec
         self._text = made.text
         self._lenient = lenient
@@ -76,30 +76,31 @@ class Layout:
         # each layout has its own of these: a user may change a model, or the names of a dtype
         self._model: type[BaseModel] | None = None
         self._tables: dict[ByteOrder, TableCodec] = {}
-        # where a table is the payload and nothing else: its dtype, and what makes it
+        # for tables that are all of the payload: the dtype, and the function that makes one
         self._views: dict[ByteOrder, np.dtype[np.void]] = {}
         self._frombuffer: Any = None
 
     @classmethod
     def of(cls, described: Any, *, lenient: bool = False) -> Layout:
-        """Return the layout that a class says.
+        """Return the layout that a class describes.
 
-        ``Annotated[float, "real32 mm"]`` is a field, ``bool`` one without more,
-        ``Annotated[list[Part], "*"]`` a group of records that another class says, and comes last.
-        ``interpret_as=`` takes such a class itself and gives its objects; :meth:`build` takes them.
+        ``Annotated[float, "real32 mm"]`` is a field; ``bool`` is one by itself;
+        ``Annotated[list[Part], "*"]`` is a group of records that another class describes, and must
+        come last. ``interpret_as=`` accepts such a class and returns its objects; :meth:`build`
+        accepts the objects.
 
         Args:
             described: a dataclass, a pydantic model or a NamedTuple; ``list[Part]`` for records to
                 the end.
-            lenient: as for the layout.
+            lenient: as for :class:`Layout`.
 
         Raises:
-            LayoutError: a field has no layout text, one that is wrong (with the place), or one that
-                does not go with its type.
+            LayoutError: the layout text of a field is missing, is wrong (with the place), or does
+                not match its type.
         """
         return cls(read_class(described).text, lenient=lenient)
 
-    # -- what it is --------------------------------------------------------------------------
+    # -- properties -----------------------------------------------------------------------------
 
     @property
     def text(self) -> str:
@@ -108,7 +109,7 @@ class Layout:
 
     @property
     def lenient(self) -> bool:
-        """True if any byte but zero is a true bool."""
+        """True if any byte except zero is a true bool."""
         return self._lenient
 
     @property
@@ -118,21 +119,21 @@ class Layout:
 
     @property
     def head(self) -> tuple[Field, ...]:
-        """Fields in front of the group; empty where there is no group."""
+        """Fields before the group; empty if there is no group."""
         return self._spec.head
 
     @property
     def repeat(self) -> str | int | None:
-        """Number of times that the record stands there.
+        """Number of records.
 
-        None: exactly once. ``"*"``: to the end. A number: that often. A name: as often as this
-        field of the head says.
+        None: exactly one. ``"*"``: as many as there are up to the end. A number: that many. A name:
+        the value of this field of the head.
         """
         return self._spec.repeat
 
     @property
     def group(self) -> str | None:
-        """Name of the group, None where it has none."""
+        """Name of the group; None if it has none."""
         return self._spec.group
 
     @property
@@ -142,18 +143,18 @@ class Layout:
 
     @property
     def sequence_field(self) -> Field | None:
-        """The field marked with ``@sequence``, None without one."""
+        """The field marked with ``@sequence``; None without one."""
         index = self._sequence_index
         return None if index is None else (*self.head, *self.fields)[index]
 
     @property
     def head_size(self) -> int:
-        """Bytes in front of the first record."""
+        """Number of bytes before the first record."""
         return self._codecs["little"][0].size
 
     @property
     def size(self) -> int:
-        """Bytes of one record."""
+        """Number of bytes of one record."""
         return self._codecs["little"][1].size
 
     def __eq__(self, other: object) -> bool:
@@ -176,20 +177,21 @@ class Layout:
     # -- values ------------------------------------------------------------------------------
 
     def parse(self, payload: Payload, byte_order: ByteOrder = "little") -> Any:
-        """Return the values of a container; what they come as is the layout text's to say.
+        """Return the values of a container, in the form that the layout text defines.
 
         Args:
-            payload: the container's bytes behind the application id.
-            byte_order: order of the bytes of a number, as the camera's status says.
+            payload: the container's bytes after the application id.
+            byte_order: byte order of numbers, as in the camera's status.
 
         Returns:
-            Without a group a :class:`Record`. With a group without a name, and nothing before it
-            but a count or the sequence number, a list of records. Otherwise a record of the
-            head's fields and one more, the list, named as the group is (``records`` without a
-            name). A field with a unit is a float in SI.
+            Without a group, a :class:`Record`. With a group that has no name and only a count or
+            the sequence number before it, a list of records. Otherwise, a record of the head's
+            fields and the list, which has the name of the group (``records`` without a name). A
+            field with a unit is a float in SI.
 
         Raises:
-            InterpretationError: the payload does not fit; field, offset, expected and got.
+            InterpretationError: the payload does not fit; the error has field, offset, expected and
+                got.
         """
         head, records = self._codecs[byte_order]
         if self._spec.repeat is None:
@@ -206,7 +208,7 @@ class Layout:
         return result
 
     def parse_records(self, payload: Payload, byte_order: ByteOrder = "little") -> list[Record]:
-        """Return the records alone, whatever stands before them; one where there is no group.
+        """Return only the records, without the head; without a group there is one.
 
         Record ``i`` begins at byte ``head_size + i * size``.
 
@@ -218,10 +220,10 @@ class Layout:
         return records.read(rows, payload, head.size, what=self._record_word)
 
     def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
-        """Return the values of the same records as they are on the wire, one by one.
+        """Return the unconverted values of the same records, one record after the other.
 
-        Units are the wire's, texts are bytes as the camera sent them, bools are numbers from 0 to
-        255, which nothing has checked.
+        Units are those of the wire, texts are bytes as the camera sent them, bools are unchecked
+        numbers from 0 to 255.
 
         Raises:
             InterpretationError: the payload's size does not fit.
@@ -232,7 +234,7 @@ class Layout:
             try:
                 return records.unpack_all(data)
             except struct.error:
-                pass  # no whole records: the checks below say where
+                pass  # not whole records: the checks below find the place
         return records.unpack(data, head.size, self._count(data, head, records))
 
     def parse_table(
@@ -240,20 +242,20 @@ class Layout:
     ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
         """Return the records as a structured numpy array of one dimension, read-only.
 
-        A zero-copy view of ``payload`` where nothing is to be converted: no unit, no bool, the
-        machine's own byte order. Otherwise a copy: fields with a unit are float64 in SI, bools
-        are ``?``, the byte order is the machine's. Texts are bytes as the camera sent them
+        It is a zero-copy view of ``payload`` if nothing has to be converted: no unit, no bool, the
+        machine's own byte order. Otherwise it is a copy: fields with a unit are float64 in SI,
+        bools are ``?``, the byte order is the machine's. Texts are bytes as the camera sent them
         (``S20``), neither decoded nor cut at the first zero.
 
         Raises:
             InterpretationError: the payload does not fit, or a byte is no bool.
         """
         view = self._views.get(byte_order)
-        if view is not None and type(payload) is bytes:  # which numpy makes read-only tables of
+        if view is not None and type(payload) is bytes:  # from bytes numpy makes read-only tables
             try:
                 rows: np.ndarray[tuple[int], np.dtype[np.void]] = self._frombuffer(payload, view)
             except ValueError:
-                pass  # no whole records: the checks below say where
+                pass  # not whole records: the checks below find the place
             else:
                 if self._fixed is None or len(rows) == self._fixed:
                     return rows
@@ -264,21 +266,21 @@ class Layout:
     def parse_tables(
         self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
     ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
-        """Return the tables of several payloads, each as by :meth:`parse_table`."""
+        """Return the tables of several payloads, each as from :meth:`parse_table`."""
         view, make = self._views.get(byte_order), self._frombuffer
         if view is not None and self._fixed is None:
             try:
                 return [make(payload, view) for payload in payloads]
             except ValueError:
-                pass  # one of them is no whole records, or empty
+                pass  # one of them has not whole records, or is empty
         return [self.parse_table(payload, byte_order) for payload in payloads]
 
     def sequence(self, payload: Payload, byte_order: ByteOrder = "little") -> int | None:
         """Return the value of the ``@sequence`` field.
 
         Returns:
-            The head's, or that of the first record; None without such a field, and without
-            records where it is in the record.
+            The value in the head, or that in the first record; None without such a field, or if it
+            is in the record and there are no records.
 
         Raises:
             InterpretationError: the payload's size does not fit.
@@ -300,20 +302,20 @@ class Layout:
         slots: int | None = None,
         sequence: int | None = None,
     ) -> bytes:
-        """Return the container's bytes for ``value``: what :meth:`parse` reads back.
+        """Return the bytes of a container with ``value``, which :meth:`parse` reads back.
 
         Args:
-            value: what :meth:`parse` returns; a record may be a mapping, a :class:`Record`, a
+            value: a value as from :meth:`parse`; a record may be a mapping, a :class:`Record`, a
                 sequence of its values in order, or an object of a class (:meth:`of`). A mapping may
-                leave out the count field.
-                Values of fields with a unit are SI; integers are rounded to the wire's unit.
-            byte_order: order of the bytes of a number.
-            slots: pad with records of zeros up to this number, as the camera does.
-            sequence: value of the ``@sequence`` field; goes before the one in ``value``. A list
-                layout that has one in its head and is given none gets 0.
+                leave out the count field. Values of fields with a unit are in SI; integers are
+                rounded to the wire's unit.
+            byte_order: byte order of numbers.
+            slots: number of records up to which records of zeros are appended, as the camera does.
+            sequence: value of the ``@sequence`` field, which overrides the one in ``value``. A list
+                layout with such a field in its head uses 0 if none is given.
 
         Raises:
-            ConfigurationError: a value does not fit its field, is missing or unknown.
+            ConfigurationError: a value does not fit its field, or is missing or unknown.
         """
         head, codec = self._codecs[byte_order]
         forced = self._forced(sequence)
@@ -333,19 +335,19 @@ class Layout:
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """One record as it is on the wire: packed, little endian, bools ``u1``, texts ``S20``."""
+        """Packed dtype of one record on the wire: little endian, bools ``u1``, texts ``S20``."""
         return self.dtype_for("little")
 
     def dtype_for(self, byte_order: ByteOrder) -> np.dtype[np.void]:
-        """Return the wire's dtype of one record in a byte order."""
+        """Return the dtype of one record on the wire in a byte order."""
         return self._table(byte_order).dtype
 
     @property
     def model(self) -> type[BaseModel]:
-        """The pydantic model of what :meth:`parse` gives; units stand in the descriptions.
+        """The pydantic model of the values from :meth:`parse`, with units in the descriptions.
 
-        A ``RootModel`` of a list for list layouts. A field whose name pydantic keeps for itself
-        (``json``, ``copy``, ...) has that name as alias.
+        A ``RootModel`` of a list for list layouts. A field whose name pydantic reserves (``json``,
+        ``copy``, ...) has that name as its alias.
         """
         if self._model is None:
             from smartcam.layout._files import make_model
@@ -354,14 +356,14 @@ class Layout:
         return self._model
 
     def json_schema(self) -> dict[str, Any]:
-        """Return the JSON Schema of what :meth:`parse` gives.
+        """Return the JSON Schema of the values from :meth:`parse`.
 
-        NaN and infinity, which JSON has no word for, are null in smartcam's JSON.
+        NaN and infinity, which JSON cannot express, are null in smartcam's JSON.
         """
         return self.model.model_json_schema()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the layout as plain data, which :meth:`from_dict` takes back."""
+        """Return the layout as plain data, which :meth:`from_dict` reads."""
         from smartcam.layout._files import to_data
 
         return to_data(self._spec, lenient=self._lenient)
@@ -371,12 +373,12 @@ class Layout:
         """Return the layout that plain data describes.
 
         Args:
-            data: ``fields`` (each with ``name``, ``type`` and, where wanted, ``unit`` and
-                ``sequence``), and where wanted ``head``, ``repeat``, ``group``, ``lenient``.
+            data: ``fields`` (each with ``name``, ``type`` and optionally ``unit`` and
+                ``sequence``), and optionally ``head``, ``repeat``, ``group``, ``lenient``.
 
         Raises:
-            ConfigurationError: unknown keys or values of the wrong type.
-            LayoutError: what they say makes no layout.
+            ConfigurationError: the data have unknown keys, or values of the wrong type.
+            LayoutError: the data describe no valid layout.
         """
         from smartcam.layout._files import from_data
 
@@ -384,7 +386,7 @@ class Layout:
         return cls(text, lenient=lenient)
 
     def to_yaml(self) -> str:
-        """Return the layout as YAML, which :meth:`from_yaml` takes back.
+        """Return the layout as YAML, which :meth:`from_yaml` reads.
 
         Raises:
             MissingExtraError: PyYAML is not installed.
@@ -395,11 +397,11 @@ class Layout:
 
     @classmethod
     def from_yaml(cls, text: str) -> Layout:
-        """Return the layout of a YAML document: what :meth:`to_yaml` writes, or a layout text.
+        """Return the layout in a YAML document from :meth:`to_yaml`, or with a layout text.
 
         Raises:
-            ConfigurationError: unknown keys or values of the wrong type.
-            LayoutError: the text is neither YAML nor a layout text, or makes no layout.
+            ConfigurationError: the document has unknown keys, or values of the wrong type.
+            LayoutError: the text is neither YAML nor a layout text, or describes no valid layout.
             MissingExtraError: PyYAML is not installed.
         """
         from smartcam.layout._files import load_yaml
@@ -408,7 +410,7 @@ class Layout:
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)
 
     def _table(self, byte_order: ByteOrder) -> TableCodec:
-        """Return the codec of tables; made where one is first asked for, because of numpy."""
+        """Return the codec of tables, which is created on first use since it needs numpy."""
         if byte_order not in self._tables:
             import numpy as np
 
@@ -424,7 +426,7 @@ class Layout:
     # -- sizes -------------------------------------------------------------------------------
 
     def _count(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
-        """Return the number of records that are to be read, having checked the size."""
+        """Check the size of a payload, and return the number of records to read."""
         got = len(payload)
         count, remainder = divmod(got - head.size, codec.size)
         fixed, repeat = self._fixed, self._spec.repeat
@@ -444,11 +446,11 @@ class Layout:
     def _misfit(
         self, codec: RecordCodec, got: int, start: int, count: int | None
     ) -> InterpretationError:
-        """Return the error for a payload of the wrong length: its cut field or surplus bytes.
+        """Return the error for a payload of the wrong length: a truncated field or surplus bytes.
 
-        ``codec``: of the record (or the head) that does not fit. ``got``: bytes of the payload.
-        ``start``: where the first record begins. ``count``: of records that must be there, None for
-        any.
+        ``codec``: codec of the record (or the head) that does not fit. ``got``: number of bytes of
+        the payload. ``start``: offset of the first record. ``count``: required number of records,
+        or None for any.
         """
         full = max(0, got - start) // codec.size
         at = start + codec.size * (full if count is None else min(full, count))
@@ -490,7 +492,7 @@ class Layout:
         return {field.name: sequence}
 
     def _split(self, value: object, forced: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
-        """Return the head's values and the records."""
+        """Split a value into the head's values and the records."""
         count = self.repeat if self.repeat != "*" else None
         if self._spec.is_list:
             records = _list_of_records(value)
@@ -500,7 +502,7 @@ class Layout:
             return list(given.values()), records
         names = [*(field.name for field in self.head), self._spec.group_field]
         given = named(value, names, "")
-        records = _list_of_records(given.get(names[-1], ()))  # a missing one is told below
+        records = _list_of_records(given.get(names[-1], ()))  # a missing group is reported below
         if isinstance(count, str):
             given.setdefault(count, len(records))
         given.update({name: forced[name] for name in names if name in forced})

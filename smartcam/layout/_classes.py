@@ -1,4 +1,4 @@
-"""Classes that are layouts: a field's annotation says how it stands on the wire.
+"""Read layouts from classes, whose annotations say how each field is encoded on the wire.
 
 ::
 
@@ -8,8 +8,8 @@
         x: Annotated[float, "real32 mm"]
         parts: Annotated[list[Part], "*"]             # a group: records of another class
 
-The texts are put together and read like any layout text, so that there is one place that knows
-what a layout may be.
+The texts are joined and parsed like any layout text, so that only one module knows which layouts
+are valid.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
 Make: TypeAlias = Callable[[Any], Any]
-"""Turns what a layout's ``parse`` gives into objects of the class."""
+"""Function that makes objects of the class from the values of a layout's ``parse``."""
 
 
 class ClassLayout(NamedTuple):
@@ -46,7 +46,7 @@ class ClassLayout(NamedTuple):
 
     Attributes:
         text: the layout text.
-        make: turns what that layout's ``parse`` gives into objects of the class.
+        make: function that makes objects of the class from the values of that layout's ``parse``.
     """
 
     text: str
@@ -55,7 +55,7 @@ class ClassLayout(NamedTuple):
 
 class _Member(NamedTuple):
     name: str
-    hint: Any  # without its layout text
+    hint: Any  # the class without its layout text
     text: str | None
 
 
@@ -69,8 +69,7 @@ def read_class(kind: Any) -> ClassLayout:
     """Return the layout that a class, or a list of one, describes.
 
     Raises:
-        LayoutError: a field has no layout text, one that is wrong, or one that does not go with
-            its type.
+        LayoutError: the layout text of a field is missing, is wrong, or does not match its type.
     """
     record = _list_item(kind)
     if record is None and not _is_record(kind):
@@ -107,7 +106,7 @@ def _read_record(kind: type, *, nested: bool = False) -> ClassLayout:
 
 
 def _members(kind: type) -> list[_Member]:
-    """Return the fields of a class that are given when an object is made, in order."""
+    """Return the fields of a class that its constructor takes, in order."""
     if dataclasses.is_dataclass(kind):
         names = [field.name for field in dataclasses.fields(kind) if field.init]
     elif _is_model(kind):
@@ -129,7 +128,7 @@ def _members(kind: type) -> list[_Member]:
 
 
 def _field(kind: type, member: _Member) -> Field:
-    """Return the layout's field that a member of a class is."""
+    """Return the layout's field for a member of a class."""
     text = member.text
     if text is None:
         if member.hint is not bool:
@@ -140,7 +139,7 @@ def _field(kind: type, member: _Member) -> Field:
         raise _error(kind, member, f"expected the layout text of one field, got {text!r}")
     field = spec.fields[0]
     fitting = _types(field)
-    # a model converts by itself
+    # a model converts values by itself
     if not _is_model(kind) and member.hint not in (*fitting, Any, object):
         expected = " or ".join(one.__name__ for one in fitting)
         got = getattr(member.hint, "__name__", member.hint)
@@ -160,7 +159,7 @@ def _types(field: Field) -> tuple[type, ...]:
 
 
 def _list_item(hint: Any) -> type | None:
-    """Return the class of a list's items, None where it is no list of a class."""
+    """Return the class of a list's items; None if it is no list of a class."""
     hint = _without_metadata(hint)
     item = get_args(hint)[0] if get_origin(hint) is list else None
     return item if _is_record(item) else None
@@ -214,7 +213,7 @@ def _make_list(make: Make) -> Make:
 
 
 def _maker(kind: type, names: list[str], make_list: Make | None) -> Make:
-    """Return the maker of ``kind`` from a record, whose last field ``make_list`` makes a list."""
+    """Return a function that makes ``kind`` from a record; ``make_list`` makes its last field."""
     build = _model_maker(kind, names) if _is_model(kind) else _plain_maker(kind, names)
     if make_list is None:
         return build
@@ -254,7 +253,7 @@ def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
 
 
 def values_of(value: object) -> dict[str, Any] | None:
-    """Return the fields of an object of such a class by name, None where it is of none."""
+    """Return the fields of an object of such a class by name; None for other objects."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
     kind = type(value)

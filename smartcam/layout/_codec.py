@@ -1,8 +1,9 @@
-"""Records of a layout: from bytes to values and back, in plain Python.
+"""Convert records of a layout from bytes to values and back, in plain Python.
 
-Reading is two-speed. The fast way unpacks all records with one ``struct.Struct``, turns the rows
-into columns, converts the columns that need it, and turns them back into rows; it knows nothing of
-fields and offsets. Where it stumbles, the slow way walks the bytes in order and finds the place.
+There are two ways to read. The fast one unpacks all records with one ``struct.Struct``, turns the
+rows into columns, converts the columns that need it, and turns them back into rows; it does not
+know fields and offsets. If it fails, the slow one goes through the bytes in order and finds the
+place of the error.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ if TYPE_CHECKING:
     Rows: TypeAlias = Iterator[tuple[Any, ...]]
 
 Payload = bytes | bytearray | memoryview
-"""Types in which a container's data may come."""
+"""Types that a container's data may have."""
 
 _BOOLS = {0x00: False, 0xFF: True}
 
 
 class Record(tuple[Any, ...]):
-    """One record's values, by name and by place.
+    """The values of one record, by name and by index.
 
     A tuple with the layout's field names as attributes: ``record.x``, ``record["x"]`` and
-    ``record[0]`` are the same. A field's name goes before the tuple's own, so ``record.count``
-    is the field where the layout has one. Equal to a plain tuple of the same values.
+    ``record[0]`` are the same. A field's name overrides the tuple's own, so ``record.count`` is the
+    field if the layout has one. Equal to a plain tuple of the same values.
     """
 
     __slots__ = ()
@@ -62,11 +63,11 @@ class Record(tuple[Any, ...]):
     @overload
     def __getitem__(self, key: slice, /) -> tuple[Any, ...]: ...
     def __getitem__(self, key: SupportsIndex | slice | str, /) -> Any:
-        """Return the value of a name, at a place, or a slice as a tuple.
+        """Return the value of a name or at an index, or a slice as a tuple.
 
         Raises:
             KeyError: no field has that name.
-            IndexError: no field is at that place.
+            IndexError: no field has that index.
         """
         if isinstance(key, str):
             if key not in self._fields:
@@ -92,10 +93,11 @@ class Record(tuple[Any, ...]):
         return _make_record, (self._fields, units, tuple(self))
 
 
-@functools.lru_cache(maxsize=256)  # a class per layout; evicting one costs only its making
+# one class per layout; a class that is evicted from the cache is simply made again
+@functools.lru_cache(maxsize=256)
 def record_class(names: tuple[str, ...], units: tuple[str, ...]) -> type[Record]:
     """Return the record class with these field names and SI units, "" for none."""
-    # getters written in C; the class that brings them must live until they are taken from it
+    # getters written in C; their class must live until they are taken from it
     make: Any = namedtuple  # noqa: PYI024  names known at run time, so no checker can follow
     maker = make("Fields", names)
     attributes: dict[str, Any] = {name: vars(maker)[name] for name in names}
@@ -118,17 +120,17 @@ def _make_record(names: tuple[str, ...], units: tuple[str, ...], values: tuple[A
 
 
 class RecordCodec:
-    """Reads and writes records of one list of fields in one byte order.
+    """Reads and writes records with one list of fields, in one byte order.
 
     Args:
-        fields: the fields, packed.
-        byte_order: order of the bytes of a number.
-        lenient: take any byte but zero for a true bool.
+        fields: the fields, without padding between them.
+        byte_order: byte order of numbers.
+        lenient: whether any byte except zero is a true bool.
 
     Attributes:
         size: size of a record, bytes.
-        unpack_all: gives the values on the wire of all records of a payload; ``struct.error``
-            where they do not fill it.
+        unpack_all: function that returns the unconverted values of all records of a payload; it
+            raises ``struct.error`` unless they fill the payload.
     """
 
     def __init__(self, fields: tuple[Field, ...], byte_order: ByteOrder, *, lenient: bool) -> None:
@@ -149,20 +151,20 @@ class RecordCodec:
             if (converters := _converters(field, lenient=lenient)) is not None
         ]
         self.size: int = self._struct.size
-        # of bytes only: CPython 3.11 crashes where the garbage collector finds an iterator over a
+        # only for bytes: CPython 3.11 crashes if the garbage collector finds an iterator over a
         # memoryview that was not read to its end
         self.unpack_all: Callable[[bytes], Rows] = self._struct.iter_unpack
 
     def unpack(self, payload: bytes, offset: int, count: int) -> Rows:
-        """Return the values of ``count`` records on the wire; the caller has checked the size."""
+        """Return the unconverted values of ``count`` records; the caller has checked the size."""
         return self.unpack_all(payload[offset : offset + count * self.size])
 
     def read(self, rows: Rows, payload: Payload, offset: int, *, what: str = "") -> list[Record]:
-        """Return the records whose values on the wire are ``rows``.
+        """Return the records with the unconverted values ``rows``.
 
-        ``rows``: of :meth:`unpack` or :attr:`unpack_all`; the first is at ``offset``. ``what``
-        tells a record in an error. Raises InterpretationError: a byte that is no bool, or a text
-        that is not UTF-8.
+        ``rows`` come from :meth:`unpack` or :attr:`unpack_all`; the first is at ``offset``.
+        ``what`` names a record in errors. Raises InterpretationError if a byte is no bool, or a
+        text is not UTF-8.
         """
         if not self._converters:
             return list(map(self.make, rows))
@@ -177,9 +179,9 @@ class RecordCodec:
         return list(map(self.make, zip(*columns, strict=True)))
 
     def read_one(self, payload: Payload) -> Record:
-        """Return the record at the start; the caller has checked that it is there.
+        """Return the first record; the caller has checked that there is one.
 
-        Raises as :meth:`read`.
+        Raises the errors of :meth:`read`.
         """
         values: Sequence[Any] = self._struct.unpack_from(payload)
         if self._converters:
@@ -197,9 +199,9 @@ class RecordCodec:
         return self._singles[index].unpack_from(payload, offset + self.offsets[index])[0]
 
     def write(self, values: Sequence[Any], what: str) -> bytes:
-        """Return one record's bytes; ``values`` in the order of the fields.
+        """Return the bytes of one record; ``values`` are in the order of the fields.
 
-        Raises ConfigurationError: a value that does not fit its field; ``what`` tells the record.
+        Raises ConfigurationError if a value does not fit its field; ``what`` names the record.
         """
         wire: list[Any] = []
         for field, value in zip(self.fields, values, strict=True):
@@ -214,9 +216,10 @@ class RecordCodec:
     def take(self, value: object, what: str, forced: Mapping[str, Any]) -> list[Any]:
         """Return the values of one record in the order of the fields.
 
-        ``value``: mapping, record, or sequence of the values in order. ``what`` tells a record in
-        an error. ``forced``: values of some fields that go before those of ``value``. Raises
-        ConfigurationError: a field is missing, unknown, or there are too few or too many.
+        ``value``: mapping, record, or sequence of the values in order. ``what`` names a record in
+        errors. ``forced``: values of some fields that override those of ``value``. Raises
+        ConfigurationError if a field is missing or unknown, or if there are too few or too many
+        values.
         """
         names = [field.name for field in self.fields]
         given = named(value, names, what)
@@ -225,7 +228,7 @@ class RecordCodec:
         return [given[name] for name in names]
 
     def field_at(self, position: int) -> tuple[Field, int]:
-        """Return the field that holds byte ``position`` of a record, and where it begins."""
+        """Return the field that holds byte ``position`` of a record, and its offset."""
         index = bisect.bisect_right(self.offsets, position) - 1
         return self.fields[index], self.offsets[index]
 
@@ -250,7 +253,7 @@ class RecordCodec:
 def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
     """Return a mapping's, a record's or a sequence's values by name.
 
-    Raises ConfigurationError: it is none of these, or a sequence of another length.
+    Raises ConfigurationError if it is none of these, or a sequence of another length.
     """
     given: Any = value
     if isinstance(value, Mapping):
@@ -272,7 +275,7 @@ def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
 
 
 def check_names(given: Mapping[str, Any], names: Sequence[str], what: str) -> None:
-    """Raise ConfigurationError where ``given`` has not exactly these names."""
+    """Raise ConfigurationError unless ``given`` has exactly these names."""
     if set(given) == set(names):
         return
     missing = [name for name in names if name not in given]
@@ -294,10 +297,10 @@ def _offsets(fields: tuple[Field, ...]) -> list[int]:
 
 
 def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | None:
-    """Return the converters of one value of the wire, and of a column of them.
+    """Return the converter of a single wire value, and that of a column of values.
 
-    None where they are the same. A comprehension takes a third of the time of a function call for
-    each value.
+    A converter is None if values stay as they are. For columns, a comprehension takes a third of
+    the time of a function call per value.
     """
     if field.type == "string":
         return _text, lambda column: [raw.partition(b"\0")[0].decode() for raw in column]
@@ -322,7 +325,7 @@ def _text(raw: bytes) -> str:
 
 
 def _to_wire(field: Field, value: Any) -> Any:
-    """Return the value that ``struct`` packs; ValueError, TypeError or ArithmeticError without."""
+    """Return the value for ``struct`` to pack; raise ValueError, TypeError or ArithmeticError."""
     if field.type == "bool":
         if value not in (True, False):
             raise ValueError("not a bool")
@@ -335,7 +338,7 @@ def _to_wire(field: Field, value: Any) -> Any:
         value = _from_si(UNITS[field.unit], float(value))
     if not field.wire.is_integer:
         value = float(value)
-        struct.pack(f"<{field.wire.code}", value)  # its range is struct's to know
+        struct.pack(f"<{field.wire.code}", value)  # struct checks the range
         return value
     number = _to_integer(value, rounded=field.unit is not None)
     if not (field.wire.low or 0) <= number <= (field.wire.high or 0):
@@ -344,7 +347,7 @@ def _to_wire(field: Field, value: Any) -> Any:
 
 
 def _from_si(unit: Unit, si: float) -> float:
-    """Return the number whose SI value is ``si``, where there is one, else the nearest."""
+    """Return the number whose SI value is ``si``, or the nearest if there is none."""
     value = si * unit.divide / unit.multiply
     if math.isinf(value) and math.isfinite(si):
         raise OverflowError("out of range")

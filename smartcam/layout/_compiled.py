@@ -1,4 +1,4 @@
-"""Work a layout's text out, once for all equal layouts that are in use."""
+"""Compile a layout's text, once for all equal layouts in use."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 
 
 class CompiledLayout:
-    """The parts of a layout that follow from its text alone, not from a container; never changed.
+    """The parts of a layout that follow from its text alone; they never change.
 
     Args:
-        spec: what the text says.
+        spec: parsed form of the text.
         text: the canonical text.
-        lenient: take any byte but zero for a true bool.
+        lenient: whether any byte except zero is a true bool.
 
     Attributes:
-        spec: spec that was given.
-        text: text that was given.
+        spec: parsed form of the text.
+        text: the canonical text.
         codecs: codecs of the head and of a record, by byte order.
-        fixed: number of records, None where the container tells.
-        to_end: records, and nothing else.
+        fixed: number of records; None if it depends on the container.
+        to_end: whether the layout has only records up to the end.
         is_list: whether the value is a plain list of records.
-        record_word: what an error calls a record, "" where there is one.
-        sequence_index: index of the field with the sequence number, None without one.
+        record_word: word for a record in errors; "" if there is only one.
+        sequence_index: index of the field with the sequence number; None without one.
     """
 
     __slots__ = (
@@ -62,12 +62,12 @@ class CompiledLayout:
 _in_use: weakref.WeakValueDictionary[tuple[str, bool], CompiledLayout] = (
     weakref.WeakValueDictionary()
 )
-"""By text and ``lenient``, as long as there is a layout: under its canonical text, and under the
-one that it was first made of. So there are two for each at most."""
+"""Compiled layouts by text and ``lenient``, while a layout uses them. Each has at most two entries:
+its canonical text, and the text that it was first made from."""
 
 
 def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
-    """Return the compiled form of a layout text; keep it in a cache for the next caller.
+    """Return the compiled form of a layout text, from a cache or put into it.
 
     Args:
         text: the layout text.
@@ -75,7 +75,7 @@ def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
         lenient: True if any byte but zero is a true bool.
 
     Raises:
-        LayoutError: a mistake in the text, with its position.
+        LayoutError: the text has a mistake; the error gives its position.
     """
     key = text[start:], lenient
     found = _in_use.get(key)
@@ -83,7 +83,7 @@ def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
         spec = parse_text(text, start)
         canonical = to_text(spec), lenient
         found = _in_use.get(canonical)
-        if found is None:  # two threads may come here at once: one is as good as the other
+        if found is None:  # two threads may come here at once; either result may be used
             found = CompiledLayout(spec, canonical[0], lenient=lenient)
             _in_use[key] = _in_use[canonical] = found
     return found

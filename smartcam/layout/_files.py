@@ -1,4 +1,4 @@
-"""Layouts as plain data, YAML, pydantic models. Imported where one of them is first asked for."""
+"""Convert layouts to plain data, YAML and pydantic models; imported only when needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _Count = Annotated[int, ModelField(ge=1, le=65_535, strict=True)]
 
 
 class _FieldData(BaseModel):
-    """One field, as it stands in a file."""
+    """One field, as in a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -31,7 +31,7 @@ class _FieldData(BaseModel):
 
 
 class _LayoutData(BaseModel):
-    """A layout, as it stands in a file."""
+    """A layout, as in a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -43,7 +43,7 @@ class _LayoutData(BaseModel):
 
 
 def to_data(spec: LayoutSpec, *, lenient: bool) -> dict[str, Any]:
-    """Return ``spec`` as plain data; what has its usual value is left out."""
+    """Return ``spec`` as plain data; entries with their default value are left out."""
     data = _LayoutData.model_construct(
         head=[_field_data(field) for field in spec.head],
         fields_=[_field_data(field) for field in spec.fields],
@@ -63,9 +63,9 @@ def _field_data(field: LayoutField) -> _FieldData:
 def from_data(data: Mapping[str, Any]) -> tuple[str, bool]:
     """Return the layout text of plain data, and whether it is lenient.
 
-    The text is put together from checked words and then read like any other, so that there is one
-    place that knows what a layout may be. Raises ConfigurationError: unknown keys, or values that
-    are no words of a layout text.
+    The text is built from checked words and then parsed like any other, so that only one module
+    knows which layouts are valid. Raises ConfigurationError if there are unknown keys, or values
+    that are no words of a layout text.
     """
     try:
         checked = _LayoutData.model_validate(data)
@@ -98,7 +98,7 @@ def _checked_field(data: _FieldData) -> LayoutField:
         raise ConfigurationError(
             f"layout: field {data.name!r}: expected a unit ({', '.join(UNITS)}), got {data.unit!r}"
         )
-    # the length stays a text in the type: the layout text's reader knows its range
+    # the length is part of the type's text: the parser of layout texts checks its range
     return LayoutField(data.name, data.type, None, data.unit, data.sequence)
 
 
@@ -109,9 +109,9 @@ def dump_yaml(data: dict[str, Any]) -> str:
 
 
 def load_yaml(text: str) -> dict[str, Any] | str:
-    """Return the plain data of a YAML document, or the layout text that it is.
+    """Return the plain data in a YAML document, or the layout text in it.
 
-    Raises LayoutError: neither the one nor the other.
+    Raises LayoutError if it is neither.
     """
     try:
         loaded: Any = load(text, what="layout: YAML")
@@ -128,13 +128,13 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     given: Any = loaded
     if isinstance(loaded, str):
         return loaded
-    # "x: int32" is a YAML mapping as well; those of a file hold more than texts
+    # "x: int32" is also a YAML mapping; that of a layout file has other values than texts
     is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in given.values())
     return given if is_data else text
 
 
 def make_model(spec: LayoutSpec) -> type[BaseModel]:
-    """Return the pydantic model of what a layout's ``parse`` gives."""
+    """Return the pydantic model of the values from a layout's ``parse``."""
     record = _object_model("Record", [_member(field) for field in spec.fields])
     if spec.repeat is None:
         return record

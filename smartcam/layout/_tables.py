@@ -1,7 +1,7 @@
-"""Layouts as numpy dtypes and tables. Imported where a table is first asked for.
+"""Convert layouts to numpy dtypes and tables; imported only when a table is needed.
 
-All that depends on the layout alone is worked out when a :class:`TableCodec` is made; what is left
-for a container is a view of it, or one numpy operation for each column.
+Everything that depends only on the layout is computed when a :class:`TableCodec` is created; a
+container then takes only a view, or one numpy operation per column.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class TableCodec:
 
     Args:
         codec: codec of the same records.
-        byte_order: order of the bytes of a number.
+        byte_order: byte order of numbers.
 
     Attributes:
-        dtype: one record on the wire, packed.
-        is_view: whether a table is the payload as it is.
+        dtype: dtype of one record on the wire, packed.
+        is_view: whether a table is a view of the payload.
     """
 
     def __init__(self, codec: RecordCodec, byte_order: ByteOrder) -> None:
@@ -46,10 +46,10 @@ class TableCodec:
         self.is_view: bool = self._native == self.dtype and not self._converts
 
     def read(self, payload: Payload, offset: int, count: int, *, what: str) -> Rows:
-        """Return ``count`` records from ``offset`` on: a view where it can be, read-only.
+        """Return ``count`` records, beginning at ``offset``, read-only and if possible as a view.
 
-        The caller has checked that the ``payload`` has them. ``what`` tells a record in an error.
-        Raises InterpretationError: a byte is no bool.
+        The caller has checked that the ``payload`` has them. ``what`` names a record in errors.
+        Raises InterpretationError if a byte is no bool.
         """
         dtype = self.dtype
         # numpy refuses an empty buffer
@@ -66,7 +66,7 @@ class TableCodec:
 
     def _converted(self, wire: Rows) -> Rows:
         rows = np.empty(len(wire), self._native)
-        with np.errstate(all="ignore"):  # NaN and infinity pass, as they do one by one
+        with np.errstate(all="ignore"):  # NaN and infinity are accepted, as for single values
             for name, convert in self._columns:
                 column = wire[name]
                 rows[name] = column if convert is None else convert(column)
@@ -76,7 +76,7 @@ class TableCodec:
 def _dtype(
     fields: tuple[Field, ...], byte_order: ByteOrder, *, converted: bool = False
 ) -> np.dtype[np.void]:
-    """Return the dtype of a record on the wire, or in a table, where fields are converted."""
+    """Return the dtype of a record on the wire, or with ``converted``, in a table."""
     order = "<" if byte_order == "little" else ">"
     columns: list[tuple[str, str]] = []
     for field in fields:
@@ -94,7 +94,7 @@ def _all_bools(column: np.ndarray[Any, Any]) -> bool:
 
 
 def _converter(field: Field) -> Callable[[Any], Any] | None:
-    """Return the converter of a column of the wire's values, None where copying does it."""
+    """Return the converter of a column of wire values; None if copying is enough."""
     if field.type == "bool":
         return lambda wire: wire != 0
     if field.unit is None:

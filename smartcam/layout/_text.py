@@ -1,4 +1,4 @@
-"""The layout language: text to fields and back.
+"""Parse and write the layout language.
 
 ::
 
@@ -7,8 +7,8 @@
     field  = name ":" type [ unit ] [ "@sequence" ]
     group  = [ name ":" ] "(" field { "," field } [ "," ] ")" ( "*" | "[" number | name "]" )
 
-White space and new lines mean nothing, ``#`` begins a comment. One pass of recursive descent
-over a list of tokens; every token knows its place, so every mistake can be shown.
+White space and new lines have no meaning, ``#`` begins a comment. The parser is a single recursive
+descent over a list of tokens; every token has its place, so every mistake can be shown.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from typing import NamedTuple, NoReturn
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import InterpretationError, LayoutError
 
-MAX_TEXT = 20_000
-"""Characters of a layout text. A container holds about 64 kB; a thousand fields, each of them
-configured by hand on the camera, still fit."""
+MAX_TEXT_CHARACTERS = 20_000
+"""A layout text has at most this many characters. A container holds about 64 kB; a thousand fields,
+each configured by hand on the camera, still fit."""
 
 MAX_COUNT = 65_535
-"""Bytes of a string and number of records: more than a container of about 64 kB holds."""
+"""Largest number of bytes of a string, and of records: more than a container of about 64 kB
+holds."""
 
 SEQUENCE = "sequence"
 
 
 class WireType(NamedTuple):
-    """The form of a type on the wire.
+    """The encoding of a type on the wire.
 
     Attributes:
         code: letter of the type in ``struct``.
         numpy: numpy type without a byte order.
-        size: bytes; 0 for a string, whose length the field says.
-        low: smallest value of an integer, None for the rest.
-        high: largest value of an integer, None for the rest.
+        size: number of bytes; 0 for a string, whose length is in the field.
+        low: smallest value of an integer; None for other types.
+        high: largest value of an integer; None for other types.
     """
 
     code: str
@@ -62,7 +63,7 @@ class WireType(NamedTuple):
 
 
 def _integers(prefix: str, codes: str, kind: str) -> dict[str, WireType]:
-    """Return the integers of one, two, four and eight bytes."""
+    """Return the integer types of one, two, four and eight bytes."""
     table: dict[str, WireType] = {}
     for code, size in zip(codes, (1, 2, 4, 8), strict=True):
         values = 1 << 8 * size
@@ -83,7 +84,7 @@ TYPES: dict[str, WireType] = {
 
 
 class Unit(NamedTuple):
-    """A unit of the wire: ``value * multiply / divide`` is SI.
+    """A unit on the wire: ``value * multiply / divide`` is the value in SI.
 
     One of the two is 1 (or, for ``inch``, the product is exact), so a value is rounded once, and
     scalars and numpy columns come out the same to the last bit.
@@ -112,7 +113,7 @@ UNITS: dict[str, Unit] = {
 SI_SYMBOLS: dict[str, str] = {"length": "m", "angle": "rad", "time": "s", "pixels": "px"}
 """The symbols of the SI units that values have, by their quantity; a ratio has none."""
 
-# what people write for a type, where the spelling alone does not lead there
+# words that people write for a type, if the spelling alone does not lead to it
 _MEANT = {
     "float": "real32",
     "float32": "real32",
@@ -131,8 +132,8 @@ class Field:
     Attributes:
         name: name of the value.
         type: ``bool``, ``int8`` to ``uint64``, ``real32``, ``real64`` or ``string``.
-        length: bytes of a string, None for the other types.
-        unit: unit on the wire; the value is SI. None: taken as it comes.
+        length: number of bytes of a string; None for other types.
+        unit: unit on the wire, from which the value is converted to SI; None: no conversion.
         sequence: whether the field carries the sequence number (``@sequence``).
     """
 
@@ -144,17 +145,17 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Number of bytes on the wire."""
         return TYPES[self.type].size if self.length is None else self.length
 
     @property
     def wire(self) -> WireType:
-        """Form of the field's type on the wire."""
+        """Encoding of the field's type on the wire."""
         return TYPES[self.type]
 
     @property
     def symbol(self) -> str:
-        """The symbol of the value's unit; empty where it has none."""
+        """Symbol of the value's unit; empty if it has none."""
         return "" if self.unit is None else SI_SYMBOLS.get(UNITS[self.unit].quantity, "")
 
     @property
@@ -178,7 +179,7 @@ class LayoutSpec(NamedTuple):
     """The parsed form of a layout text.
 
     Attributes:
-        head: fields in front of the group; empty without one.
+        head: fields before the group; empty without one.
         fields: fields of a record.
         repeat: None for exactly one record, ``"*"``, a number, or the name of the count field.
         group: name of the group, None without one.
@@ -191,13 +192,13 @@ class LayoutSpec(NamedTuple):
 
     @property
     def is_list(self) -> bool:
-        """True if the value is a plain list: a group without a name, nothing else to tell."""
+        """True if the value is a plain list: an unnamed group, without other values."""
         told = (field.sequence or field.name == self.repeat for field in self.head)
         return self.repeat is not None and self.group is None and all(told)
 
     @property
     def group_field(self) -> str:
-        """Name of the list where the value is a record with a list in it."""
+        """Name of the list, if the value is a record with a list in it."""
         return self.group or "records"
 
 
@@ -212,10 +213,10 @@ def to_text(spec: LayoutSpec) -> str:
 
 
 def parse_text(text: str, start: int = 0) -> LayoutSpec:
-    """Return the fields and groups of a layout text, read from ``start`` on.
+    """Parse the fields and groups of a layout text from ``start`` on.
 
-    Raises LayoutError: with the position of the mistake in ``text``. Too long is also what its
-    canonical text, which is that of a copy and of a file, would be too long for.
+    Raises LayoutError with the position of the mistake in ``text``. A text is also too long if its
+    canonical form is, since copies and files use that form.
     """
     _check_length(text, len(text) - start, start)
     spec = _Parser(text, start).layout()
@@ -224,21 +225,21 @@ def parse_text(text: str, start: int = 0) -> LayoutSpec:
 
 
 def _check_length(text: str, length: int, start: int, form: str = "") -> None:
-    if length > MAX_TEXT:
+    if length > MAX_TEXT_CHARACTERS:
         raise LayoutError(
-            f"layout: {form}expected at most {MAX_TEXT} characters, got {length}",
+            f"layout: {form}expected at most {MAX_TEXT_CHARACTERS} characters, got {length}",
             text=text,
-            position=min(start + MAX_TEXT, len(text)),
+            position=min(start + MAX_TEXT_CHARACTERS, len(text)),
         )
 
 
 def misfit(
     field: Field, offset: int, expected: str, got: object, where: str = "", more: str = ""
 ) -> InterpretationError:
-    """Return the error of a value that cannot be what its field says.
+    """Return the error for a value that does not match its field.
 
-    ``offset``: of the value, bytes from the container's beginning. ``where`` goes before the field
-    in the text, ``more`` behind ``expected``.
+    ``offset``: place of the value, bytes from the container's beginning. In the text, ``where``
+    precedes the field and ``more`` follows ``expected``.
     """
     return InterpretationError(
         f"{where}{field.label} at offset {offset}: expected {expected}{more}, got {got}",
@@ -272,7 +273,7 @@ class _Parser:
         self._has_sequence = False
 
     def layout(self) -> LayoutSpec:
-        """Read everything."""
+        """Parse the whole text."""
         fields: list[Field] = []
         group: LayoutSpec | None = None
         while True:
@@ -358,7 +359,8 @@ class _Parser:
         token = self._take()
         if token.kind != "name":
             self._unexpected(what, token)
-        name = unicodedata.normalize("NFKC", token.text)  # as Python does with attribute names
+        # normalized, as Python does with the names of attributes
+        name = unicodedata.normalize("NFKC", token.text)
         if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
             self._unexpected(
                 "a name that can be an attribute (letters, digits, '_'; no leading '_', no Python "
@@ -411,7 +413,7 @@ class _Parser:
 
     def _number(self, token: _Lexeme, what: str) -> int:
         digits = token.text.lstrip("0")
-        # the length first: int() refuses some thousand digits with an error of its own
+        # check the length first: int() refuses some thousand digits with an error of its own
         if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
             self._unexpected(f"a number of {what} from 1 to {MAX_COUNT}", token)
         return int(digits)
@@ -465,12 +467,12 @@ class _Parser:
             self._unexpected(expected)
 
     def _unexpected(self, expected: str, token: _Lexeme | None = None) -> NoReturn:
-        """Fail at a token; default the one that comes next."""
+        """Raise the error for a token, by default the next one."""
         token = token or self._peek()
         self._fail(f"expected {expected}, got {token}", token)
 
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
-        """Fail behind a whole field: say what could have followed."""
+        """Raise the error after a whole field: say what could have followed."""
         here = self._peek()
         if here.kind == "name":
             self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)
@@ -495,6 +497,6 @@ def _show(text: str, position: int) -> str:
         f"at character {position}" if "\n" not in text else f"at line {line}, column {column + 1}"
     )
     content = text[begin : end if end >= 0 else len(text)]
-    first = max(0, column - 50)  # a window of it, where the line is long
+    first = max(0, column - 50)  # only a part of the line if it is long
     shown = "".join(char if char.isprintable() else " " for char in content[first : column + 30])
     return f"{where}\n  {shown}\n  {' ' * (column - first)}^"

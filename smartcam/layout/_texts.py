@@ -1,6 +1,6 @@
-"""Values that come as texts, put into the bytes of a layout: a spreadsheet's cells.
+"""Put values that are texts, such as a spreadsheet's cells, into the bytes of a layout.
 
-So that every interpreter reads them as it reads a container, in the layout's units.
+Then every interpreter reads them like a container, in the layout's units.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ _NUMBER = re.compile(
 
 
 def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes:
-    """Return the little-endian bytes of a layout whose fields are these texts, in order.
+    """Return the little-endian bytes of a layout whose fields have these texts, in order.
 
-    Numbers are what they are on the wire: in the field's own unit, not in SI. In a group that is
-    counted by a field, texts behind the counted records may be anything, or missing.
+    Numbers are in the field's own unit, as on the wire, not in SI. In a group that is counted by a
+    field, texts after the counted records may be anything, or missing.
 
     Args:
         layout: the fields; ``( ... )*`` and a counted group take as many records as there are
             cells for.
-        cells: the name of each cell and its text; None for one that has none.
+        cells: the name of each cell and its text; None for a cell without one.
 
     Raises:
-        InterpretationError: a text is no value of its field, or there are too few or too many.
+        InterpretationError: a text is no value of its field, or there are too few or too many
+            cells.
     """
     fields = _fields(layout, len(cells))
     used = len(fields)
@@ -62,7 +63,7 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
 
 
 def _fields(layout: Layout, count: int) -> Sequence[Field]:
-    """Return the field of each cell, where there are ``count`` cells; else InterpretationError."""
+    """Return the field of each of ``count`` cells; raise InterpretationError if they do not fit."""
     records = layout.repeat
     if not isinstance(records, int):
         left = max(0, count - len(layout.head))
@@ -79,7 +80,7 @@ def _fields(layout: Layout, count: int) -> Sequence[Field]:
 
 
 def _pack(field: Field, text: str | None) -> bytes:
-    """Return one field's bytes; ValueError, OverflowError: it is no value of the field."""
+    """Return the bytes of one field; raise ValueError or OverflowError for a wrong value."""
     if text is None:
         raise ValueError("it has no value")
     if field.type == "string":
@@ -102,7 +103,7 @@ def _pack(field: Field, text: str | None) -> bytes:
 
 
 def _real(text: str) -> float:
-    """Return a number; ValueError: it is no number, or too large."""
+    """Parse a number; raise ValueError if it is no number, or too large."""
     if not _NUMBER.fullmatch(text.strip()):
         raise ValueError("no number")
     number = float(text)
@@ -112,7 +113,7 @@ def _real(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number, which may be written with decimals that are zeros; else ValueError."""
+    """Parse an integer, perhaps with decimals that are zeros; raise ValueError for others."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None or match["whole"] is None:
         raise ValueError("no whole number")

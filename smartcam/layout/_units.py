@@ -1,6 +1,6 @@
-"""Units for people: which one a value has, and in which one it is shown.
+"""Choose the units in which people see values.
 
-A value is SI wherever a program has it. Only what people read may be in another unit.
+Inside programs values are in SI. Only texts for people may have other units.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class ShownUnits:
     """The units in which people see values.
 
     Args:
-        names: names of units, one for a quantity; of other quantities the SI unit is shown.
+        names: names of units, at most one per quantity; other quantities are shown in SI units.
 
     Raises:
-        ConfigurationError: a name is no unit, or two are of the same quantity.
+        ConfigurationError: a name is no unit, or two names have the same quantity.
     """
 
     def __init__(self, names: Iterable[str] = ()) -> None:
@@ -59,11 +59,11 @@ class ShownUnits:
             self._by_symbol[symbol] = ShownUnit(name, unit.divide / unit.multiply)
 
     def of(self, symbol: str) -> ShownUnit:
-        """Return the unit in which people see values of an SI unit; "" means no unit."""
+        """Return the unit in which people see values with an SI unit; "" means no unit."""
         return self._by_symbol.get(symbol) or ShownUnit(symbol, 1.0)
 
     def shown(self, value: object, symbol: str) -> object:
-        """Return a value in the unit that people see."""
+        """Convert a value to the unit that people see."""
         if not symbol or isinstance(value, bool) or not isinstance(value, (int, float)):
             return value
         factor = self.of(symbol).factor
@@ -71,7 +71,7 @@ class ShownUnits:
 
 
 def units_of(value: object, layout: Layout | None = None) -> Mapping[str, str]:
-    """Return the SI units of a value's fields, by their names; those without one are left out.
+    """Return the SI units of a value's fields by name; fields without a unit are left out.
 
     ``value``: a record, an object of a class that describes a layout, a list of either, or a table,
     whose units only ``layout`` knows.
@@ -87,12 +87,12 @@ def units_of(value: object, layout: Layout | None = None) -> Mapping[str, str]:
         try:
             spec = compile_text(read_class(kind).text, 0, lenient=False).spec
         except LayoutError:
-            return {}  # a class of somebody's own interpreter, which says nothing of a layout
+            return {}  # a class of another interpreter, which describes no layout
         return units_by_name(spec.head or spec.fields)
     dtype: Any = getattr(value, "dtype", None)
     return units_by_name(layout.fields) if layout and getattr(dtype, "names", None) else {}
 
 
 def units_by_name(fields: Iterable[Field]) -> dict[str, str]:
-    """Return the SI units of fields that have one, by the fields' names."""
+    """Return the SI units by field name, for fields that have one."""
     return {field.name: field.symbol for field in fields if field.symbol}

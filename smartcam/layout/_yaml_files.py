@@ -1,4 +1,4 @@
-"""YAML files of a form of ours, read from a path; a mistake is told with file, line and field."""
+"""Read smartcam's YAML files; report mistakes with file, line and field."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from smartcam._arguments import check_path, shown
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
+from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=BaseModel)
 
-_SHOWN = 20  # mistakes that are told at once
+_SHOWN = 20  # number of mistakes that are reported at once
 
 MAX_FILES_BESIDE = 1000
-"""Files of a folder among which one is looked for whose name was meant."""
+"""At most this many files of a folder are compared with a wrong file name."""
 
 
 def read_model(
@@ -39,11 +39,11 @@ def read_model(
 
     Args:
         path: path of the file.
-        what: kind of the file for errors: ``scenario``.
+        what: kind of the file for errors, such as ``scenario``.
         kind: model of the file's fields.
         such_as: name of a field, as an example for errors.
-        mistake: function that returns the place of a value that cannot work, and the reason; None
-            where all is well.
+        mistake: function that returns the place of a value that cannot work and the reason, or
+            None.
 
     Raises:
         ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
@@ -54,7 +54,7 @@ def read_model(
     named = f"{what} {path}"
     try:
         with path.open(encoding="utf-8") as stream:
-            text = stream.read(MAX_YAML_TEXT + 1)
+            text = stream.read(MAX_YAML_TEXT_CHARACTERS + 1)
     except UnicodeDecodeError as exc:
         raise ConfigurationError(f"{named}: {exc}") from exc
     except OSError as exc:
@@ -88,7 +88,7 @@ def read_model(
 
 
 def _beside(path: Path) -> list[str]:
-    """Return the names of some files in the folder where a file should be."""
+    """Return the names of some files in the folder of a missing file."""
     try:
         with os.scandir(path.parent) as entries:
             return [entry.name for entry in itertools.islice(entries, MAX_FILES_BESIDE)]
@@ -97,7 +97,7 @@ def _beside(path: Path) -> list[str]:
 
 
 def _got(item: ErrorDetails) -> str:
-    """Return an end for pydantic's error that says what came, where its text does not."""
+    """Return an addition to pydantic's error that says what came, if its text does not."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
     came: object = item["input"]
@@ -107,7 +107,7 @@ def _got(item: ErrorDetails) -> str:
 
 
 def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
-    """Return a hint at the field or word that was meant."""
+    """Return a hint which field or word was probably meant."""
     if item["type"] != "extra_forbidden":
         return hint(item, ())
     *place, _ = item["loc"]
@@ -115,7 +115,7 @@ def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
     found = [*_branches(schema, schema)]
     for part in place:
         children = [child for one in found for child in _children(schema, one, part)]
-        found = children or found  # pydantic's way has the kinds of a union in it, too
+        found = children or found  # pydantic's path also has the types of a union in it
     return hint(item, dict.fromkeys(name for one in found for name in one.get("properties", {})))
 
 
@@ -134,7 +134,7 @@ def _children(schema: Any, one: Any, part: int | str) -> list[Any]:
 
 
 def _branches(schema: Any, node: Any) -> Iterator[Any]:
-    """Give what a part of a schema may be: what it refers to, and each kind of a union."""
+    """Return the schemas that a part of a schema stands for: a reference, each type of a union."""
     if "$ref" in node:
         yield from _branches(schema, schema["$defs"][node["$ref"].rpartition("/")[2]])
     kinds = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ())]
@@ -146,7 +146,7 @@ def _branches(schema: Any, node: Any) -> Iterator[Any]:
 
 def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
     texts = [
-        # the text of a layout has a mark below it; its first line tells the position
+        # the text of a layout has a marker below it; its first line gives the position
         ": ".join([f"line {_line(root, place)}", *_field(place), text.partition("\n")[0]])
         for place, text in itertools.islice(findings, _SHOWN)
     ]
@@ -158,9 +158,9 @@ def _field(place: Sequence[int | str]) -> list[str]:
 
 
 def _line(node: Any, loc: Sequence[int | str]) -> int:
-    """Return the line of the deepest node on the way to ``loc`` that is in the file."""
+    """Return the line of the deepest node on the path to ``loc`` that is in the file."""
     for part in loc:
-        found = _child(node, part)  # pydantic's way has the kinds of faults in it, too
+        found = _child(node, part)  # pydantic's path also has the kinds of faults in it
         node = node if found is None else found
     return int(node.start_mark.line) + 1
 
@@ -174,8 +174,8 @@ def _child(node: Any, part: int | str) -> Any:
 
 
 def _refuse_twice(root: Any, named: str) -> None:
-    """Refuse a key that stands twice in one mapping; YAML would take the last in silence."""
-    seen: set[int] = set()  # aliases may make a circle
+    """Refuse a repeated key in a mapping, of which YAML would silently take the last."""
+    seen: set[int] = set()  # aliases may form a circle
     waiting = [root]
     while waiting:
         node = waiting.pop()
@@ -187,7 +187,8 @@ def _refuse_twice(root: Any, named: str) -> None:
             continue
         keys: set[str] = set()
         for key, value in cast("list[tuple[Any, Any]]", node.value):
-            if key.id != "scalar":  # whose text is as long as all that its aliases stand for
+            # its text would be as long as everything that its aliases stand for
+            if key.id != "scalar":
                 raise ConfigurationError(
                     f"{named}, line {key.start_mark.line + 1}: expected a text as a key, got a "
                     f"{key.id}"

@@ -1,4 +1,4 @@
-"""YAML that others wrote, read within bounds: a few lines may stand for millions of values."""
+"""Read YAML from others within bounds, since a few lines may stand for millions of values."""
 
 from __future__ import annotations
 
@@ -8,32 +8,34 @@ from typing import Any
 from smartcam import _extras
 from smartcam.exceptions import ConfigurationError
 
-MAX_YAML_TEXT = 1 << 23
-"""Characters of a YAML document: a container of 1 MiB as hex takes a quarter."""
+MAX_YAML_TEXT_CHARACTERS = 1 << 23
+"""A YAML document has at most this many characters: a container of 1 MiB in hex takes a quarter."""
 
 MAX_NODES = 500_000
-"""Values of a YAML document, each alias and each merged mapping counted with all that it stands
-for: 50,000 applications of a scenario. PyYAML reads this many in about 15 seconds."""
+"""A YAML document has at most this many values, where each alias and each merged mapping counts
+with everything that it stands for: that is 50,000 applications of a scenario. PyYAML reads this
+many in about 15 seconds."""
 
 MAX_DEPTH = 50
-"""Values of a YAML document that stand one in the other: ours have ten. PyYAML looks at all open
-brackets for each token, and calls itself for each of them."""
+"""Largest number of values of a YAML document are nested this deep; smartcam's files have ten
+levels. PyYAML examines all open brackets for each token, and recurses for each of them."""
 
 MAX_BITS = 64
-"""Bits of an integer at most: the largest that a container can hold.
+"""An integer has at most this many bits, as the largest in a container.
 
 Python takes seconds for the digits of much larger ones, or refuses.
 """
 
 YAML_ALSO_RAISES = (ValueError, LookupError, AttributeError, OverflowError, RecursionError)
-"""Exceptions that PyYAML raises beside its own, for a tag such as ``!!int`` without a value."""
+"""Exceptions that PyYAML raises in addition to its own, for a tag such as ``!!int`` without a
+value."""
 
 
 class BadYamlError(ConfigurationError):
-    """A document is no YAML, or goes beyond a bound.
+    """A document is no YAML, or exceeds a bound.
 
     Attributes:
-        line: where, from 1; None where that is not known.
+        line: line of the fault, from 1; None if it is not known.
     """
 
     def __init__(self, message: str, *, line: int | None = None) -> None:
@@ -44,23 +46,23 @@ class BadYamlError(ConfigurationError):
 def load(text: str, *, what: str = "YAML") -> Any:
     """Return the data of a document; None for an empty one.
 
-    ``what``: what needs PyYAML, for the error. Raises BadYamlError: it is no YAML, or goes beyond a
-    bound; MissingExtraError: PyYAML is not installed.
+    ``what``: thing that needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
+    exceeds a bound; MissingExtraError if PyYAML is not installed.
     """
     root = compose(text, what=what)
     return None if root is None else construct(root)
 
 
 def compose(text: str, *, what: str = "YAML") -> Any:
-    """Return the node that a document is, which :func:`construct` makes data of; None: empty.
+    """Return the node of a document, for :func:`construct`; None if it is empty.
 
     Raises:
-        BadYamlError: the text is no YAML, or goes beyond a bound.
+        BadYamlError: the text is no YAML, or exceeds a bound.
         MissingExtraError: PyYAML is not installed.
     """
     yaml = yaml_module(what)
-    if len(text) > MAX_YAML_TEXT:
-        raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT} at most")
+    if len(text) > MAX_YAML_TEXT_CHARACTERS:
+        raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT_CHARACTERS} at most")
     try:
         return yaml.compose(text, _loader(yaml))
     except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
@@ -68,9 +70,9 @@ def compose(text: str, *, what: str = "YAML") -> Any:
 
 
 def construct(root: Any) -> Any:
-    """Return the data of a node that :func:`compose` gave.
+    """Return the data of a node from :func:`compose`.
 
-    Raises BadYamlError: its aliases stand for too much, or a value cannot be what its tag says.
+    Raises BadYamlError if its aliases stand for too much, or a value does not match its tag.
     """
     yaml = yaml_module("YAML")
     loader = _loader(yaml)("")
@@ -84,7 +86,7 @@ def construct(root: Any) -> Any:
 
 
 def yaml_module(what: str) -> Any:
-    """Return PyYAML; MissingExtraError: it is not installed."""
+    """Return PyYAML; raise MissingExtraError if it is not installed."""
     return _extras.load("yaml", f"{what} needs")
 
 
@@ -99,9 +101,9 @@ def _told(exc: Exception) -> BadYamlError:
 
 
 def _count(node: Any, known: dict[int, int]) -> int:
-    """Return the number of values that a node stands for, the aliases in it written out.
+    """Return the number of values that a node stands for, with its aliases expanded.
 
-    Raises BadYamlError: too many, or it contains itself.
+    Raises BadYamlError if they are too many, or if the node contains itself.
     """
     if node.id == "scalar":
         return 1
@@ -109,7 +111,7 @@ def _count(node: Any, known: dict[int, int]) -> int:
     if found == 0:
         raise BadYamlError("an alias of what it stands in", line=node.start_mark.line + 1)
     if found is None:
-        known[id(node)] = 0  # under way
+        known[id(node)] = 0  # nodes that are being counted
         children = (
             node.value if node.id == "sequence" else [one for row in node.value for one in row]
         )

@@ -46,7 +46,7 @@ def open_database(path: Path, *, timeout: float) -> sqlite3.Connection:
     Each statement outside of a transaction takes effect at once.
 
     Args:
-        path: file of the database; it is made if it is not there.
+        path: file of the database; it is made if it does not exist.
         timeout: seconds that a statement waits for another process.
 
     Raises:
@@ -65,7 +65,7 @@ def open_for_reading(path: Path, *, timeout: float) -> sqlite3.Connection:
         timeout: seconds that a statement waits for another process.
 
     Raises:
-        sqlite3.Error: the file is not there, or cannot be opened.
+        sqlite3.Error: the file does not exist, or cannot be opened.
     """
     place = f"{path.absolute().as_uri()}?mode=ro"
     return sqlite3.connect(place, uri=True, timeout=timeout, factory=_Database)

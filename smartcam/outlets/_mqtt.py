@@ -36,17 +36,17 @@ MAX_HEADER_BYTES = 12
 """Bytes of a packet beside topic and text: its kind, three lengths, number and properties."""
 
 MAX_COMMANDS = 1_000
-"""Commands under way at a time, such as a trigger of each camera; more are answered with an error.
-As many wait before it is known that they are too many."""
+"""Largest number of commands under way at a time, such as a trigger of each camera; more are
+answered with an error. As many wait before it is known that they are too many."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of the messages that wait so; what comes beyond is not answered."""
+"""Largest number of bytes of the messages that wait so; what comes beyond is not answered."""
 
 MAX_COMMAND_BYTES = 1 << 16
-"""Bytes of a command's message."""
+"""Largest number of bytes of a command's message."""
 
 MAX_STATES = 10_000
-"""Cameras whose state is kept."""
+"""Largest number of cameras whose state is kept."""
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _VERBS = ("trigger", "switch")
@@ -161,7 +161,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         """Come to the broker.
 
         Raises:
-            ConfigurationError: a secret or the authority's file is not there.
+            ConfigurationError: a secret or the authority's file does not exist.
             MissingExtraError: aiomqtt is not installed.
             Exception: the broker is away, or refuses.
         """

@@ -22,10 +22,10 @@ class OutletDesk:
 
     Args:
         columns: returns names, types and units of the values of a camera's application, by its
-            layout; empty where they are not known.
-        command: does a command and returns what is answered; None where commands are not allowed.
-        cameras: returns the names of the cameras, and whether each is emulated; None where that is
-            not known.
+            layout; empty if they are not known.
+        command: does a command and returns what is answered; None if commands are not allowed.
+        cameras: returns the names of the cameras, and whether each is emulated; None if that is not
+            known.
         names: returns the names that a camera's applications have, with their numbers.
     """
 
@@ -92,7 +92,7 @@ class Outlet(ABC, Generic[SettingsT]):
         """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
-        """Return the results at the far end; None where it cannot be asked. In a thread."""
+        """Return the results at the far end; None if it cannot be asked. In a thread."""
         return None
 
     async def watch(self) -> None:

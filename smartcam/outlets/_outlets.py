@@ -251,7 +251,7 @@ _SI = {"deg": "rad", "rad": "rad", "px": "px"}
 
 
 def columns_of(interpreter: Interpreter | None) -> Sequence[Column]:
-    """Return names, types and SI units of an interpreter's values; empty where it has no layout."""
+    """Return names, types and SI units of an interpreter's values; empty if it has no layout."""
     if isinstance(interpreter, LocalizationsInterpreter):
         return LOCALIZATION
     layout = None if interpreter is None else interpreter.layout

@@ -27,13 +27,13 @@ T = TypeVar("T")
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_WAITING = 20_000
-"""Entries that wait in memory for the spool's disk."""
+"""Largest number of entries that wait in memory for the spool's disk."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes that these entries keep."""
+"""Largest number of bytes that these entries keep."""
 
 MAX_WRITTEN_TOGETHER = 500
-"""Entries of one write to the spool."""
+"""Largest number of entries of one write to the spool."""
 
 GATHER_SECONDS = 0.002
 """Seconds in which entries gather in memory before they are written together: a write is out of the
@@ -80,8 +80,8 @@ class Pump:
             they do again.
 
     Attributes:
-        trouble: reason for which nothing is delivered at the time; "" where all is well.
-        disk_trouble: reason for which nothing is spooled at the time; "" where all is well.
+        trouble: reason for which nothing is delivered at the time; "" if all is well.
+        disk_trouble: reason for which nothing is spooled at the time; "" if all is well.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Pump:
 
         Raises:
             ConfigurationError: another process has the spool.
-            sqlite3.Error: its file cannot be made.
+            sqlite3.Error: its file cannot be created.
         """
         try:
             await self._run(lambda: None)  # which opens it

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | None:
-    """Return the file of a result's picture; None where there is none below the folder.
+    """Return the file of a result's picture; None if there is none below the folder.
 
     Args:
         pattern: place of the file, with ``{camera}``, ``{application}``, ``{number}`` and
@@ -26,7 +26,7 @@ def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | No
 
 
 def records_of(value: Any) -> list[dict[str, Any]] | None:
-    """Return the records of a value, a mapping of plain values each; None where it has none."""
+    """Return the records of a value, a mapping of plain values each; None if it has none."""
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
         lists = [name for name, one in fields.items() if isinstance(one, list)]
@@ -47,4 +47,6 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
     told = cast("dict[str, dict[str, Any]]", pose)
     turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
     rest = {name: one for name, one in record.items() if name != "pose"}
-    return {**rest, **told["position"], **turned}
+    errors = (told.get("sigma") or {}).items()
+    off = {name if "_" in name else f"sigma_{name}": one for name, one in errors}
+    return {**rest, **told["position"], **turned, **off}

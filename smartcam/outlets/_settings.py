@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 MAX_OUTLETS = 64
-"""Outlets of one process; each has a thread and a file."""
+"""Largest number of outlets of one process; each has a thread and a file."""
 
 MAX_SECRET_BYTES = 4096
 

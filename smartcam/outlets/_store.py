@@ -35,7 +35,8 @@ VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
-"""Columns of an application's table; what has more stays in ``results.value`` alone."""
+"""Largest number of columns of an application's table; what has more stays in ``results.value``
+alone."""
 
 MAX_COLUMN_CHARACTERS = 100
 
@@ -304,7 +305,7 @@ class _StoreFile:
         known: dict[str, str],
         wanted: Column,
     ) -> None:
-        """Add the column of a value to those that are known, made if need be."""
+        """Add the column of a value to those that are known, created if needed."""
         name, kind, unit = wanted
         there = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)

@@ -108,9 +108,9 @@ class Spelled(NamedTuple):
     """A frame in words.
 
     Attributes:
-        message_id: id on the wire, None where the dialect has no such ids.
+        message_id: id on the wire, None if the dialect has no such ids.
         message: the message's name.
-        fields: the frame's decoded body, None where the body cannot be decoded.
+        fields: the frame's decoded body, None if the body cannot be decoded.
         data: the whole frame's bytes.
     """
 
@@ -215,6 +215,14 @@ class Dialect(ABC):
         """Return a status that another dialect has read as this one reads it."""
         return report
 
+    def data_begins(self, sender: Sender, message_id: int) -> int | None:
+        """Return the bytes of a body in front of its ``data``, which is the rest of it.
+
+        :meth:`spell` makes all else of these bytes and the body's length. None where a message has
+        no such data.
+        """
+        return None
+
     @abstractmethod
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""
@@ -292,7 +300,7 @@ class Protocol:
         detection: what a client tries that was told no dialect, the most probable first, each on a
             fresh link: dialects that begin a session alike. Default: each dialect by itself.
         emulator: ``module:attribute`` of the class of its emulated cameras, a
-            :class:`~smartcam.emulator.LineCamera` for one; "" where it brings none.
+            :class:`~smartcam.emulator.LineCamera` for one; "" if it brings none.
         greeting: what a camera says first to a client that has just come and has said nothing;
             ``b""`` if it keeps silent until it is spoken to, None if that is not known.
     """

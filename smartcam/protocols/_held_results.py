@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from smartcam.protocols._machine import Event
 
 MAX_HELD = 4096
-"""Events that may wait for a result's application: the camera answers within a round trip."""
+"""Largest number of events that may wait for a result's application: the camera answers within a
+round trip."""
 
 MAX_HELD_BYTES = 1 << 26
-"""Bytes of the results among them: four pictures of 16 MB."""
+"""Largest number of bytes of the results among them: four pictures of 16 MB."""
 
 
 @dataclass(slots=True, eq=False)

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     Script = Generator[str, str, Told]
     """Yields lines, is sent the answer to each, and returns what it found out."""
 
-READ_SIZE = 1 << 15
-"""Bytes that one read takes at most."""
+MAX_READ_BYTES = 1 << 15
+"""Largest number of bytes that one read takes."""
 
 DONE = CodeMeaning("done", Verdict.DONE)
 
@@ -138,7 +138,7 @@ class LineDialect(Dialect):
         max_line: bytes of a line, its end not counted; a longer one breaks the protocol.
         encoding: encoding of its characters.
         split: splits an answer into what it is known by, "" for nothing, and the text that is read;
-            None where answers come in order and say nothing of their request.
+            None if answers come in order and say nothing of their request.
         tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
             what :meth:`pack` makes of it. Empty where they carry none.
         at_once: requests are said without waiting for earlier answers; needs ``split``.
@@ -183,7 +183,7 @@ class LineDialect(Dialect):
         )
 
     def row(self, request: type[m.Message]) -> LineRow | None:
-        """Return the row of a request, None where the dialect has none."""
+        """Return the row of a request, None if the dialect has none."""
         return next((row for row in self.rows if row.request is request), None)
 
     def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
@@ -415,8 +415,8 @@ class LineMachine:
         self._trace = trace
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
-        self._store = memoryview(bytearray(READ_SIZE))
-        self._asked: list[_OpenRequest] = []  # in order; at most one of a kind
+        self._store = memoryview(bytearray(MAX_READ_BYTES))
+        self._asked: list[_OpenRequest] = []  # open requests in order; at most one of a kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)

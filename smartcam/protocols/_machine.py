@@ -1,8 +1,8 @@
 """The contract between a link and the protocol spoken over it, which every machine keeps.
 
 A machine takes bytes and gives events, and takes messages and gives bytes, in either role; it
-imports no socket, loop or clock. ``_framed`` has the one for frames, ``_lines`` and ``_insight``
-those for lines of text.
+imports no socket, loop or clock. ``_framed`` has the machine for frames, ``_lines`` and
+``_insight`` those for lines of text.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class State(enum.Enum):
     CONNECTED = "connected"
     """In a session."""
     DISCONNECTED = "disconnected"
-    """Disconnect was sent; what the camera had under way may still come."""
+    """Disconnect was sent; messages that were under way may still come."""
     CLOSED = "closed"
     """The peer closed the link."""
     FAILED = "failed"
@@ -39,7 +39,7 @@ class State(enum.Enum):
 
 
 class Frame(NamedTuple):
-    """One frame: message id and the bytes behind the header."""
+    """One frame: message id and the bytes after the header."""
 
     message_id: int
     payload: bytes
@@ -49,12 +49,12 @@ class Frame(NamedTuple):
 class ResultBurst:
     """Result containers of one application, one right after the other; two or more as they come.
 
-    The client's machine gives it for containers that came in one delivery, so that a camera that
-    runs free costs no object for each. Iterating gives them one by one.
+    The client's machine returns it for containers that came in one delivery, so that a free-running
+    camera costs no object for each. Iterating yields them one by one.
 
     Attributes:
         application: id of the application that sent the containers.
-        data: bytes of each container behind the application id.
+        data: bytes of each container after the application id.
         size: bytes of all data together.
     """
 
@@ -95,9 +95,10 @@ Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 class LinkMachine(Protocol):
     """The machine's side of a link in the client's role: the methods that a link calls.
 
-    Each kind of protocol brings its own: for frames, for lines of text. What comes goes in by
-    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram), and out by
-    :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
+    Each kind of protocol brings its own: for frames, for lines of text. Received bytes go in by
+    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram); they come out
+    of :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever their form on the
+    wire.
     """
 
     transport: Transport
@@ -124,11 +125,11 @@ class LinkMachine(Protocol):
 
     @property
     def pending(self) -> bytes:
-        """Bytes that came and still wait for their rest."""
+        """Received bytes of an unfinished frame."""
         ...
 
     def adopt(self, dialect: Dialect) -> None:
-        """Speak this one of :attr:`kin` from now on."""
+        """Speak this dialect of :attr:`kin` from now on."""
 
     def room(self) -> memoryview:
         """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
@@ -152,10 +153,10 @@ class LinkMachine(Protocol):
         ...
 
     def send(self, message: Message, *, answered: bool | None = None, again: bool = False) -> None:
-        """Say something; write :meth:`data_to_send` next.
+        """Queue a message; write :meth:`data_to_send` next.
 
         Raises:
-            LocalProtocolError: not now. Nothing has changed.
+            LocalProtocolError: the message is not possible now; nothing has changed.
             UnsupportedError: the dialect has no such message.
         """
 

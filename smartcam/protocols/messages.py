@@ -105,8 +105,8 @@ class Request(Message):
     """A message from client to camera.
 
     Attributes:
-        answer: the message type the camera answers with in a dialect that has it, None where it
-            never does.
+        answer: the message type the camera answers with in a dialect that has it, None if it never
+            does.
     """
 
     __slots__ = ()
@@ -180,10 +180,10 @@ class ResultContainer(Report):
         data: bytes of the values.
         cells: the values that ``data`` was put together from, where the protocol has them as
             texts. The fields of a layout are these values, in order.
-        fault: reason why the values cannot come from one inspection, None where nothing speaks
-            against it.
+        fault: reason why the values cannot come from one inspection, None if nothing speaks against
+            it.
         asked: whether the wire says that it answers a trigger of this client, the one that is under
-            way or was given up last, or that it answers none; None where the wire does not say so.
+            way or was given up last, or that it answers none; None if the wire does not say so.
     """
 
     application: Word = UNNAMED_APPLICATION

@@ -19,7 +19,7 @@ def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
     Raises:
         ConfigurationError: another recorder writes it.
         FileExistsError: the file is there already.
-        OSError: the file cannot be made.
+        OSError: the file cannot be created.
     """
     stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
     try:

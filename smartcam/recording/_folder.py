@@ -50,7 +50,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return the parts of a name; None where no recorder gives such a name."""
+        """Return the parts of a name; None if no recorder gives such a name."""
         found = _NAME.fullmatch(name)
         if found is None:
             return None
@@ -122,10 +122,11 @@ class RecordingFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files: dict[str, KnownFile] = {}
-        self._ours: dict[str, bool] = {}  # what was looked into
+        # whether each file that was examined is one of this recorder
+        self._ours: dict[str, bool] = {}
         self._lock: int | None = None
-        self._made = False  # it was there once: it is not made again
-        self._last: dict[str, datetime] = {}  # when the last file of each camera was begun
+        self._made = False  # whether the folder existed once: it is not created again
+        self._last: dict[str, datetime] = {}  # time at which the last file of each camera was begun
 
     def enter(self) -> None:
         """Make the folder where it never was, lock it and look what is in it.
@@ -135,7 +136,7 @@ class RecordingFolder:
 
         Raises:
             ConfigurationError: another recorder writes in it.
-            OSError: the folder cannot be made, or read.
+            OSError: the folder cannot be created, or read.
         """
         self.leave()
         if not self._made:

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.form import Item
 
 MAX_PICTURES: Final = 256
-"""Pictures of a camera that are kept to be found."""
+"""Largest number of pictures of a camera that are kept to be found."""
 
 MAX_PICTURE_BYTES: Final = 1 << 28
-"""Bytes that the kept pictures of a camera may have together; the last one is kept in any case."""
+"""Largest number of bytes that the kept pictures of a camera may have together; the last one is
+kept in any case."""
 
 MAX_RESULTS: Final = 1000
-"""Results of a camera that wait for a picture that comes later."""
+"""Largest number of results of a camera that wait for a picture that comes later."""
 
 
 class JudgedResult(NamedTuple):
@@ -30,7 +31,7 @@ class JudgedResult(NamedTuple):
 
     Attributes:
         result: result of the camera.
-        picture: picture that the result was made of; None where there is none.
+        picture: picture that the result was made of; None if there is none.
         told: True if the recorder was told that the two belong together, as after
             ``read_image()``; False where the picture was found by the times. Without a trigger
             of this client the times say nothing: the picture is None.

@@ -45,8 +45,8 @@ MSS = {4: 1460, 6: 1440}
 FIRST_PORT, PORTS = 49_152, 16_384
 """The ports that a system gives to clients (RFC 6335); each link takes the next."""
 
-MAX_DATAGRAM = 65_507
-"""Bytes of a UDP datagram over IPv4."""
+MAX_DATAGRAM_BYTES = 65_507
+"""Largest number of bytes of a UDP datagram over IPv4."""
 
 MAX_TIME_NS = (1 << 32) * 10**9
 """Nanoseconds since 1970 that a packet's time stays below: pcap counts seconds in 32 bits."""
@@ -81,7 +81,8 @@ def write_pcap(
         How many packets were written.
 
     Raises:
-        ConfigurationError: no such camera, or the file is there already or cannot be made.
+        ConfigurationError: there is no such camera, or the file is there already or cannot be
+            created.
         UnsupportedError: a camera is a fleet's, whose frames are its agent's.
         RecordingError: the file cannot be written to its end: the disk is full, or a frame fits
             into no packet.
@@ -189,9 +190,9 @@ class _Capture:
         outward = entry.direction == ">"
         sender, receiver = (self._client, self._camera) if outward else (self._camera, self._client)
         if not self._tcp:
-            if len(data) > MAX_DATAGRAM:
+            if len(data) > MAX_DATAGRAM_BYTES:
                 raise RecordingError(
-                    f"a frame of {len(data)} bytes, expected {MAX_DATAGRAM} at most over UDP"
+                    f"a frame of {len(data)} bytes, expected {MAX_DATAGRAM_BYTES} at most over UDP"
                 )
             yield self._datagram(sender, receiver, data)
             return

@@ -30,12 +30,12 @@ from smartcam.recording._mcap.form import (
     PICTURE_SCHEMAS,
     RecordedError,
     RecordedPicture,
-    body_of,
     camera_name,
     count_values,
     message_fields,
     optional,
 )
+from smartcam.recording._mcap.json import body_of
 from smartcam.recording._mcap.records import (
     Channel,
     CutOffError,
@@ -57,7 +57,8 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Values in the messages of a file that every file may have: ten seconds of work."""
+"""Least number of values in the messages of a file that every file may have: ten seconds of
+work."""
 
 VALUES_PER_BYTE = 100
 """Values for each byte of a larger file. Real recordings have less than one, since each message
@@ -71,11 +72,11 @@ class RecordedCamera(NamedTuple):
 
     Attributes:
         name: name of the camera.
-        url: address of the camera, without a password; "" where there was never a session.
-        protocol: name of the protocol; "" where there was never a session.
-        dialect: name of the dialect; None where none is known.
+        url: address of the camera, without a password; "" if there was never a session.
+        protocol: name of the protocol; "" if there was never a session.
+        dialect: name of the dialect; None if none is known.
         quirks: deviations from the dialect.
-        interpret_as: interpreter of the results, as text; None where the recorder was not told.
+        interpret_as: interpreter of the results, as text; None if the recorder was not told.
         facts: everything that was told, by name.
     """
 
@@ -100,13 +101,13 @@ class Recording:
         version: version of the smartcam that wrote the recording.
         cameras: the cameras in it, by name, in the order in which they appear.
         counts: numbers of items of each kind.
-        began: time of the first item, UTC; None where there is none.
+        began: time of the first item, UTC; None if there is none.
         ended: time of the last item, UTC.
         remark: "" for a whole file; otherwise where it stops being readable, and why. Of a folder
             what is to say of its files, one a line.
         files: the file itself; of a folder its files, camera by camera, each camera's in order.
-        since: items before it are left out, UTC; None where none are.
-        until: items behind it are left out, UTC; None where none are.
+        since: items before it are left out, UTC; None if none are.
+        until: items behind it are left out, UTC; None if none are.
     """
 
     path: Path
@@ -417,12 +418,12 @@ class _Scan:
     """One pass through a file."""
 
     path: Path
-    # what it says about itself; filled during the pass, as the next two
+    # facts about the file; filled during the pass, as the next two
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
-    # what it says about cameras, by their names
+    # facts about cameras, by their names
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    remark: str = ""  # where it stops being readable, and why
-    values: int = 0  # in its messages so far
+    remark: str = ""  # place and reason if the file stops being readable
+    values: int = 0  # number of values in its messages so far
     # data of the last frames, by camera and number
     bodies: LastBodies[tuple[str, int], str] = field(
         default_factory=LastBodies[tuple[str, int], str]

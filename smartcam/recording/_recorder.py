@@ -17,7 +17,7 @@ import os
 import stat
 import threading
 from datetime import UTC, datetime
-from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import smartcam
 from smartcam._arguments import check_flag, check_kind, check_path, check_text
@@ -25,7 +25,7 @@ from smartcam._extras import from_part, load
 from smartcam._forks import tell_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
-from smartcam.observers import Observer, TraceEntry
+from smartcam.observers import Observer, RawFrame, TraceEntry
 from smartcam.recording._exclusive_files import opened
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
@@ -33,24 +33,25 @@ from smartcam.recording._mcap.form import (
     FILE_METADATA,
     FORMAT,
     KINDS,
-    MAX_NAME,
+    MAX_NAME_CHARACTERS,
     MAX_PICTURE_SIZE_BYTES,
     PICTURES,
     PROFILE,
     RecordedError,
     RecordedPicture,
-    body_of,
+    bounded,
     captured_at,
     load_compress,
     message_of,
     nanoseconds,
     topic_of,
 )
+from smartcam.recording._mcap.json import FrameTexts, body_of
 from smartcam.recording._mcap.writer import McapWriter
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
     from types import TracebackType
     from typing import Self
@@ -66,11 +67,12 @@ CHUNK = 1 << 20
 """Bytes that wait before a chunk is written sooner; also the largest chunk."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes that wait for the disk before the recording gives up: a minute of a fast camera."""
+"""Largest number of bytes that wait for the disk before the recording gives up: a minute of a fast
+camera."""
 
 MAX_WAITING_PICTURE_BYTES = 1 << 26
-"""Bytes of pictures that wait for the disk before further ones are left out; one may wait however
-large it is."""
+"""Largest number of bytes of pictures that wait for the disk before further ones are left out; one
+may wait however large it is."""
 
 VIDEO_SUFFIX = ".mkv"
 """Suffix of a file that becomes a video."""
@@ -108,12 +110,16 @@ class Description(NamedTuple):
     facts: dict[str, str]
 
 
+Given: TypeAlias = "Item | RawFrame | Description"
+"""Things that the thread writes."""
+
+
 class _Written(Protocol):
     """The file or folder that the thread writes to."""
 
     def start(self) -> None: ...
 
-    def add(self, item: Item | Description, /) -> None: ...
+    def add(self, item: Given, /) -> None: ...
 
     def flush(self) -> None: ...
 
@@ -155,7 +161,7 @@ class Recorder(Observer):
         self._pictures = check_flag(pictures, "pictures", "recording")
         self._overwrite = check_flag(overwrite, "overwrite", "recording")
         self._more = threading.Condition()
-        self._items: list[Item | Description] = []
+        self._items: list[Given] = []
         self._waiting = 0  # bytes in it, without pictures
         self._waiting_pictures = 0  # bytes of pictures in it
         self._left_out: dict[str, int] = {}  # pictures since the last one, by camera
@@ -174,7 +180,7 @@ class Recorder(Observer):
 
         Raises:
             ConfigurationError: the file is there already, another recorder writes it, or it cannot
-                be made.
+                be created.
             MissingExtraError: the mcap library is not installed.
         """
         if self._thread is not None:
@@ -259,7 +265,7 @@ class Recorder(Observer):
 
     @property
     def error(self) -> RecordingError | None:
-        """Error that ended the recording before it was closed; None where there was none."""
+        """Error that ended the recording before it was closed; None if there was none."""
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:
@@ -283,6 +289,10 @@ class Recorder(Observer):
         """Keep a frame."""
         self._put(entry, len(entry.hex), "frames")
 
+    def on_raw_frame(self, frame: RawFrame) -> None:
+        """Keep a frame; the thread decodes it."""
+        self._put(frame, 2 * frame.size, "frames")
+
     def on_state(self, event: CameraEvent) -> None:
         """Keep an event."""
         self._put(event, 0, "events")
@@ -290,6 +300,10 @@ class Recorder(Observer):
     def on_result(self, result: Result) -> None:
         """Keep a result."""
         self._put(result, 4 * len(result.raw), "results")
+
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Keep results that came together."""
+        self._put_all(results, 4 * sum([len(one.raw) for one in results]), "results")
 
     def on_picture(self, result: Result, frame: Frame) -> None:
         """Keep the picture that a result was made of, unless ``pictures`` says otherwise."""
@@ -337,7 +351,10 @@ class Recorder(Observer):
         check_kind(frame, Frame, "frame", "a Frame", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")
-        name = check_text(camera, "camera", "recording", least=0, most=MAX_NAME) or frame.source
+        name = (
+            check_text(camera, "camera", "recording", least=0, most=MAX_NAME_CHARACTERS)
+            or frame.source
+        )
         made = (None, None) if result is None else (result.number, result.received_at)
         check_readable(frame)
         if (check := getattr(self._file, "check_picture", None)) is not None:
@@ -381,7 +398,7 @@ class Recorder(Observer):
             FrameFormatError: the file is no bitmap.
             MissingExtraError: the distribution of frames is not installed.
         """
-        camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME)
+        camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME_CHARACTERS)
         check_kind(image, bytes, "image", "bytes", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")
@@ -439,20 +456,23 @@ class Recorder(Observer):
         """True if less than half of the pictures wait that may wait for the disk."""
         return self._waiting_pictures < MAX_WAITING_PICTURE_BYTES // 2
 
-    def _put(self, item: Item | Description, size: int, kind: str | None = None) -> None:
+    def _put(self, item: Given, size: int, kind: str | None = None) -> None:
+        self._put_all((item,), size, kind)
+
+    def _put_all(self, items: Sequence[Given], size: int, kind: str | None) -> None:
+        """Have items of one kind written, which have so many bytes together."""
         with self._more:
             if not self._taking:
                 return
             if kind is not None:
-                self._counts[kind] += 1
+                self._counts[kind] += len(items)
             before = self._waiting
-            self._items.append(item)
-            self._waiting += size + ITEM_OVERHEAD_BYTES
-            if not before or before < CHUNK <= self._waiting:
+            self._items += items
+            self._waiting = waiting = before + size + ITEM_OVERHEAD_BYTES * len(items)
+            if not before or before < CHUNK <= waiting:
                 self._more.notify()
-            full = self._waiting > MAX_WAITING_BYTES
-        if full:
-            self._fail(f"the disk is too slow: {self._waiting >> 20} MiB wait to be written")
+        if waiting > MAX_WAITING_BYTES:
+            self._fail(f"the disk is too slow: {waiting >> 20} MiB wait to be written")
 
     # ------------------------------------------------------------------ the thread
 
@@ -519,6 +539,7 @@ class RecordingFile:
         self._channels: dict[tuple[str, str], int] = {}
         self._numbers: dict[int, int] = {}
         self._facts: dict[str, dict[str, str]] = {}
+        self._frame_texts = FrameTexts()
         self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # numbers, by data
         self._size = 0  # when it was closed
 
@@ -530,14 +551,14 @@ class RecordingFile:
         self._writer.add_metadata(FILE_METADATA, facts)
         self.flush()
 
-    def add(self, item: Item | Description) -> None:
+    def add(self, item: Given) -> None:
         """Write one thing; it is on the disk after the next :meth:`flush`."""
         match item:
+            case RawFrame():
+                text, data = self._frame_texts.text(item)
+                self._frame(item.camera, item.at, bounded(text), data)
             case TraceEntry():
-                number = self._message("frames", item.camera, item.at, item)
-                data = body_of(item)
-                if data:
-                    self._bodies.add((item.camera, data), number, len(data))
+                self._frame(item.camera, item.at, message_of("frames", item), body_of(item))
             case Result():
                 frame = self._bodies.get((item.camera, item.raw.hex()))
                 self._message("results", item.camera, item.received_at, item, frame)
@@ -603,10 +624,18 @@ class RecordingFile:
         self, kind: str, camera: str, at: datetime, item: Item, raw_from: int | None = None
     ) -> int:
         """Write a message; return its number, which is the topic's own count."""
-        channel = self._channel(camera, kind)
-        when = nanoseconds(at)
+        return self._write(kind, camera, at, message_of(kind, item, raw_from))
+
+    def _frame(self, camera: str, at: datetime, text: bytes, data: str) -> None:
+        """Write a frame; keep its data, as hex, for the result that is made of it."""
+        number = self._write("frames", camera, at, text)
+        if data:
+            self._bodies.add((camera, data), number, len(data))
+
+    def _write(self, kind: str, camera: str, at: datetime, text: bytes) -> int:
+        channel = self._channels.get((camera, kind)) or self._channel(camera, kind)
         self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
-        self._writer.add_message(channel, when, message_of(kind, item, raw_from), number)
+        self._writer.add_message(channel, nanoseconds(at), text, number)
         return number
 
     def _picture(self, picture: RecordedPicture) -> None:

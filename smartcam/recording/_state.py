@@ -13,7 +13,7 @@ from smartcam.models import (
     Status,
     StatusChanged,
 )
-from smartcam.recording._mcap.form import MAX_NAME, time_of
+from smartcam.recording._mcap.form import MAX_NAME_CHARACTERS, time_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,8 +30,8 @@ class RecordedState(NamedTuple):
     Attributes:
         camera: name of the camera.
         connected: whether there was a session.
-        application: id of the active application; None where it was not known.
-        status: status of the camera; None where it was not known.
+        application: id of the active application; None if it was not known.
+        status: status of the camera; None if it was not known.
         endian: byte order that the last status told.
         at: time of the state, UTC; None until the state is written.
     """
@@ -84,7 +84,7 @@ class RecordedState(NamedTuple):
         """
         application, status = facts.get("application"), facts.get("status")
         camera, endian = facts.get("camera", ""), facts.get("endian", "0")
-        if not 1 <= len(camera) <= MAX_NAME or endian not in {"0", "1"}:
+        if not 1 <= len(camera) <= MAX_NAME_CHARACTERS or endian not in {"0", "1"}:
             raise ValueError(f"a state of camera {camera!r:.60}, endian {endian!r:.20}")
         return cls(
             camera,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._inside import FleetAddress, RosSection
 
 TIMEOUT = 10.0
-"""Seconds for coming to the fleet, and for the first answer of a bridge."""
+"""Seconds to reach the fleet, and to get the first answer of a bridge."""
 
 
 class RosbridgeFleet(RosFleet):
@@ -51,7 +51,7 @@ class RosbridgeFleet(RosFleet):
         return sorted((one.node for one in self.nodes.values()), key=lambda one: one.full_name)
 
     async def wait_tried(self) -> None:
-        """Wait until every node has its bridge, or knows why not; bounded."""
+        """Wait, for a bounded time, until every node has its bridge or the reason why not."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TIMEOUT):
                 for node in self.bridged:
@@ -66,7 +66,7 @@ async def bridged(
     section: RosSection,
     **said: Any,
 ) -> AsyncIterator[RosbridgeFleet]:
-    """Have the cameras of a fleet that is there seen in ROS 1.
+    """Show the cameras of a running fleet in ROS 1.
 
     Args:
         bridge: the URL of the rosbridge.

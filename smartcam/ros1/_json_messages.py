@@ -68,7 +68,7 @@ class Raw:
 
 
 def ros1_name(name: str) -> str | None:
-    """Return a type's name in ROS 1 (``std_msgs/String``); None where ROS 1 has no such type."""
+    """Return a type's name in ROS 1 (``std_msgs/String``); None if ROS 1 has no such type."""
     package, _, rest = name.partition("/")
     return None if package in ONLY_ROS2 else f"{package}/{rest.rpartition('/')[2]}"
 

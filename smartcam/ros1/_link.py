@@ -1,4 +1,4 @@
-"""The WebSocket to a rosbridge, made again whenever it is lost."""
+"""Keep a WebSocket to a rosbridge, opened again whenever it is lost."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ STALLED_TIMEOUT = 10.0
 GOODBYE_TIMEOUT = 1.0
 """Seconds that a bridge gets to answer a goodbye."""
 SEND_BUFFER = 1 << 17
-"""Bytes that the system keeps for a bridge that is slow: what waits there is not the newest."""
+"""Number of bytes that the system keeps for a slow bridge: small, as waiting data grow old."""
 HEARTBEAT_INTERVAL = 10.0
-"""Seconds of silence after which it is asked whether it is there; half of them to answer."""
+"""Seconds of silence after which the bridge gets a ping; it has half of them to answer."""
 MIN_LIFETIME = 5.0
-"""Seconds that a link must have lived for the next try to come at once."""
+"""Seconds that a link must have lasted for the next attempt to be immediate."""
 MAX_MESSAGE_BYTES = 8 << 20
-"""Bytes of a message from a bridge; a longer one ends the link."""
+"""Largest number of bytes of a message from a bridge; a longer one ends the link."""
 
 
 class LinkListener(Protocol):
-    """The listener to a link."""
+    """The receiver of a link's events."""
 
     def came(self) -> None:
-        """Hear that there is a bridge: say what is to be advertised."""
+        """Take note that there is a bridge; advertise the topics to it."""
 
     def heard(self, operation: dict[str, Any]) -> None:
-        """Hear an operation; never waits."""
+        """Take an operation; never waits."""
 
     async def lost(self, was: bool) -> None:
-        """Hear that there is no bridge, and whether there was one before."""
+        """Take note that there is no bridge, and whether there was one before."""
 
 
 def checked_url(url: str) -> str:
     """Return a bridge's URL.
 
     Raises:
-        ConfigurationError: there can be no bridge.
+        ConfigurationError: the URL is not valid.
     """
     example = "ws://192.168.0.5:9090"
     try:
@@ -77,22 +77,22 @@ def _aiohttp() -> Any:
 
 
 def link_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that a link raises where it cannot be made, or breaks."""
+    """Return the errors that a link raises if it cannot be created, or breaks."""
     return OSError, TimeoutError, _aiohttp().ClientError
 
 
 async def _refuse_redirect(_session: object, _context: object, sent: Any) -> None:
-    """Go nowhere else: a bridge is where its URL says; aiohttp would follow to any place."""
+    """Refuse a redirect, which aiohttp would follow to any host: a bridge is only at its URL."""
     location = sent.response.headers.get("Location", "")
     raise ConnectionError(f"expected a WebSocket, got a redirect to {location!r:.200}")
 
 
 @contextlib.asynccontextmanager
 async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-    """Have a WebSocket to a bridge; what it has not read at the end is thrown away.
+    """Open a WebSocket to a bridge; data that it has not read at the end are dropped.
 
     Raises:
-        OSError, aiohttp.ClientError, TimeoutError: there is none.
+        OSError, aiohttp.ClientError, TimeoutError: there is no bridge.
     """
     aiohttp = _aiohttp()
     timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE_TIMEOUT)
@@ -119,15 +119,16 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
                 async with asyncio.timeout(GOODBYE_TIMEOUT):
                     await web.close()
             except link_errors():
-                pass  # it does not read, or is gone
+                pass  # the bridge does not read, or is gone
             finally:
                 if peer is not None:
                     with contextlib.suppress(OSError):
-                        peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
+                        # or waiting data would be kept for the bridge
+                        peer.shutdown(socket.SHUT_RDWR)
 
 
 async def text_of(parts: tuple[Part, ...]) -> str:
-    """Return the text of an operation; the loop has its turns with a long one."""
+    """Return the text of an operation; a long one lets the loop run in between."""
     pieces: list[str] = []
     for part in parts:
         if isinstance(part, str):
@@ -147,7 +148,7 @@ class BridgeLink:
         url: URL of the bridge.
         outbox: operations and messages to send.
         connected: whether there is a bridge now.
-        failure: reason why there is no bridge; "" where nothing has been tried.
+        failure: reason why there is no bridge; "" if nothing has been tried.
         changed: condition that is notified of each change of ``connected`` and ``failure``.
     """
 
@@ -160,7 +161,7 @@ class BridgeLink:
         self._listener, self._backoff = listener, backoff
 
     async def run(self) -> None:
-        """Keep a link until this is cancelled, or the tries are over."""
+        """Keep a link until this task is cancelled, or the attempts are over."""
         clock, short_lived = asyncio.get_running_loop().time, 0
         while True:
             for delay in self._backoff.delays(short_lived=short_lived):
@@ -184,13 +185,13 @@ class BridgeLink:
                 await self._carry(web)
         except link_errors() as exc:
             return str(getattr(exc, "os_error", exc)) or type(exc).__name__
-        except Exception as exc:  # a fault of ours: the next link may do without
+        except Exception as exc:  # a fault of smartcam: the next link may work
             logger.exception("%s ! the link", self.url)
             return f"{type(exc).__name__}: {exc}"
         return "it closed the link"
 
     async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:
-        """Read and write until one of them ends."""
+        """Read and write until either ends."""
         tasks = [asyncio.create_task(self._read(web)), asyncio.create_task(self._write(web))]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -215,7 +216,7 @@ class BridgeLink:
         return was
 
     async def end(self, failure: str = "") -> bool:
-        """End the link and forget what was to be sent by it; return True if there was a link."""
+        """End the link and drop its unsent data; return True if there was a link."""
         was = self.connected
         await self._set(connected=False, failure=failure)
         self.outbox.clear()
@@ -239,7 +240,7 @@ class BridgeLink:
             message = await web.receive()
             if message.type is kinds.TEXT:
                 self._hear(message.data)
-                await asyncio.sleep(0)  # many may have come at once
+                await asyncio.sleep(0)  # many operations may have come at once
                 await self.outbox.room()
             elif message.type is kinds.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 MAX_WAITING_OPERATIONS = 256
 """Operations that wait before nothing more is read from the bridge."""
 MAX_WAITING_BYTES = 32 << 20
-"""Bytes that the waiting messages of one topic may have together; one message may have more."""
+"""Largest number of bytes that the waiting messages of one topic may have together; one message may
+have more."""
 
 
 class Lane:
@@ -31,7 +32,8 @@ class Lane:
         self._depth = depth
         self._waiting: collections.deque[tuple[Part, ...]] = collections.deque()
         self.waiting_bytes: int = 0
-        self._last: tuple[Part, ...] | None = None  # of a latched topic, for a bridge to come
+        # last message of a latched topic, for the next bridge
+        self._last: tuple[Part, ...] | None = None
 
     def __bool__(self) -> bool:
         return bool(self._waiting)

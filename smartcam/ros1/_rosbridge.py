@@ -63,7 +63,7 @@ class RosbridgeNode(NamedNode):
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
-    parameters: None = None  # which ROS 1 has elsewhere
+    parameters: None = None  # ROS 1 keeps parameters elsewhere
 
     def __init__(
         self,
@@ -84,9 +84,9 @@ class RosbridgeNode(NamedNode):
         self._services: dict[str, RosbridgeService] = {}
         self._subscriptions: list[RosbridgeSubscription] = []
         self._running: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
-        self._new: list[RosbridgeService] = []  # that are to be advertised
-        self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
+        self._tasks: set[asyncio.Task[None]] = set()  # tasks that live as long as a link
+        self._new: list[RosbridgeService] = []  # services to be advertised
+        self._leaving: list[RosbridgeService] = []  # services to be withdrawn
         self._changing: asyncio.Task[None] | None = None
         self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
@@ -108,7 +108,7 @@ class RosbridgeNode(NamedNode):
 
     @property
     def failure(self) -> str:
-        """Reason for which the bridge is not there; "" where it is, or has not been tried."""
+        """Reason for which the bridge is not there; "" if it is, or has not been tried."""
         return self._link.failure
 
     async def wait_connected(self, timeout: float | None = None) -> None:
@@ -355,7 +355,7 @@ class RosbridgeNode(NamedNode):
             service.advertise()
 
     async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
-        """Call a service of ROS 1: what the bridge says then, None where it says nothing in time.
+        """Call a service of ROS 1: what the bridge says then, None if it says nothing in time.
 
         All that it said before was heard by then.
         """

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 MAX_CONCURRENT_CALLS = 64
-"""Calls of a service that are carried out at the same time; one beyond is refused."""
+"""Largest number of calls of a service that are carried out at the same time; one beyond is
+refused."""
 SETTLE_TIME = 0.5
 """Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
 has not handed over stays, and is then the response to a later call."""
@@ -168,6 +169,6 @@ class RosbridgeService:
 
 
 def error_field(kind: MessageType) -> str:
-    """Return the field of a response that says what went wrong, "" where it has none."""
+    """Return the field of a response that says what went wrong, "" if it has none."""
     texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
     return next((one for one in ERROR_FIELDS if one in texts), "")

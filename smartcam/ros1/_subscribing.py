@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.ros2 import MessageType, QoS
 
 MAX_WAITING_MESSAGES: Final = 1000
-"""Messages that wait for a reader at most, whatever the quality of service says."""
+"""Largest number of messages that wait for a reader, whatever the quality of service says."""
 
 
 class RosbridgeSubscription(TopicReader[object]):

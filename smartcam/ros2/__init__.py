@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from smartcam.ros2._cameras.cloud_messages import cloud_from
     from smartcam.ros2._cameras.depth_topics import DepthTopics
     from smartcam.ros2._cameras.image_messages import frame_from, pixels_from
-    from smartcam.ros2._cameras.node import CameraNode, CameraNodeOptions
+    from smartcam.ros2._cameras.node import CameraNode
+    from smartcam.ros2._cameras.options import CameraNodeOptions
     from smartcam.ros2._node.context import RosContext
     from smartcam.ros2._node.graph import RosGraph
     from smartcam.ros2._node.node import Node
@@ -54,7 +55,8 @@ if not TYPE_CHECKING:
             "_cameras.cloud_messages": "cloud_from",
             "_cameras.depth_topics": "DepthTopics",
             "_cameras.image_messages": "frame_from pixels_from",
-            "_cameras.node": "CameraNode CameraNodeOptions",
+            "_cameras.node": "CameraNode",
+            "_cameras.options": "CameraNodeOptions",
             "_node.context": "RosContext",
             "_node.graph": "RosGraph",
             "_node.node": "Node",

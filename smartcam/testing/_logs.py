@@ -46,7 +46,7 @@ ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
 camera's time (inferred)."""
 
 MAX_SHOWN_ENTRIES = 40
-"""Entries of the log that a failure shows: the last ones."""
+"""Largest number of entries of the log that a failure shows: the last ones."""
 
 LOOK_INTERVAL = 0.005
 """Seconds between two looks."""
@@ -243,7 +243,7 @@ def _fits(entry: LogEntry, expected: Expected) -> bool:
 
 
 def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) -> str | None:
-    """Return the mistake in words, None where all is there."""
+    """Return the mistake in words, None if all is there."""
     frames = [entry for entry in entries if entry.error is None]
     place = 0
     for entry in frames:

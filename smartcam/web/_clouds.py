@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_CLOUD_POINTS: Final = 1_000_000
-"""Points of a cloud that are sent to a page; a cloud of more is thinned."""
+"""Largest number of points of a cloud that are sent to a page; a cloud of more is thinned."""
 
 MAX_VIEWERS: Final = 8
 """Pages that may be open at a time; each may have a cloud of 15 MB on the way."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
 
 MAX_LOOKS: Final = 16
-"""Pictures asked for at a time: eight people, two each."""
+"""Largest number of pictures asked for at a time: eight people, two each."""
 
 MAX_KEPT: Final = 8
 """Viewers whose pictures are kept."""
@@ -48,7 +48,7 @@ MIN_REGION_SHARE: Final = 2e-3
 """Least share of the picture that a region must fill to be reported."""
 
 MAX_REGIONS: Final = 8
-"""Regions that are reported at most, the largest first."""
+"""Largest number of regions that are reported, the largest first."""
 
 T = TypeVar("T")
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_CONNECTIONS = 64
-"""Connections at a time, event streams among them. A browser opens six, a page keeps one of them
-for its events; some systems give a process 256 file descriptors."""
+"""Largest number of connections at a time, event streams among them. A browser opens six, a page
+keeps one of them for its events; some systems give a process 256 file descriptors."""
 
 HEAD_TIMEOUT = 10.0
 """Seconds within which a request's head must have come, from its first byte; the first head of a
@@ -31,8 +31,9 @@ connection from its beginning."""
 KEEP_ALIVE = 60.0
 """Seconds that a connection stays open without a request, or with an answer that nobody reads."""
 
-MAX_HEAD = 1 << 15
-"""Bytes of a request's head: about four times what a browser with many cookies sends."""
+MAX_HEAD_BYTES = 1 << 15
+"""Largest number of bytes of a request's head: about four times what a browser with many cookies
+sends."""
 
 _HEAD_END = b"\r\n\r\n"
 _BUSY = (
@@ -65,10 +66,10 @@ class Visitor(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(self, visitors: Visitors) -> None:
-        self.settled: bool = False  # whether a request that is there in whole is being answered
+        self.settled: bool = False  # whether a request that has come completely is being answered
         self._visitors = visitors
         self._acceptor = visitors.acceptor
-        self._inner: asyncio.Protocol | None = None  # None: nobody hears what comes
+        self._inner: asyncio.Protocol | None = None  # protocol that takes the bytes; None: nobody
         self._head: bytearray | None = None  # while a head is awaited: what came of it
         self._idle = False  # its first byte may take long
         self._rest: StreamReader | None = None  # a body that was refused before it had come
@@ -168,11 +169,11 @@ class Visitor(asyncio.Protocol):
         end = head.find(_HEAD_END, known)
         if end >= 0:
             self._head = None
-        if (end if end >= 0 else len(head)) > MAX_HEAD:
-            self.turn_away(f"the head of its request has more than {MAX_HEAD} bytes")
+        if (end if end >= 0 else len(head)) > MAX_HEAD_BYTES:
+            self.turn_away(f"the head of its request has more than {MAX_HEAD_BYTES} bytes")
 
 
 def visitor_of(request: web.BaseRequest) -> Visitor | None:
-    """Return the connection that a request came on; None where it is gone."""
+    """Return the connection that a request came on; None if it is gone."""
     protocol = None if request.transport is None else request.transport.get_protocol()
     return protocol if isinstance(protocol, Visitor) else None

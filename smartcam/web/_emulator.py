@@ -29,19 +29,20 @@ MAX_ENTRIES = 1000
 """Log entries that one answer tells; ``next`` says where to go on."""
 
 MAX_WAIT = 30.0
-"""Seconds that a call waits for a log entry at most."""
+"""Seconds that a call may wait for a log entry."""
 
 MAX_WAITING_CHANGES = 16
-"""Calls that may wait for a log entry at a time: with the event streams half of the places."""
+"""Largest number of calls that may wait for a log entry at a time: with the event streams half of
+the places."""
 
 LOOK_AGAIN = 0.02
 """Seconds between two looks for a log entry."""
 
 MAX_PARTS = 100
-"""Parts on a table; a result container has room for about 900 localizations."""
+"""Largest number of parts on a table; a result container has room for about 900 localizations."""
 
 MAX_NAMES = 20
-"""Names of cameras that a refusal lists."""
+"""Largest number of names of cameras that a refusal lists."""
 
 
 class EmulatorSite(Site):

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
 
     from pydantic import ValidationError
 
-MAX_SHOWN = 200
-"""Characters of what a client sent that a refusal shows."""
+MAX_SHOWN_CHARACTERS = 200
+"""Largest number of characters of what a client sent that a refusal shows."""
 
 
 @dataclass(eq=False)
@@ -21,9 +21,9 @@ class RefusedError(Exception):
     status: int  # the HTTP status code
     came: str
     expected: str
-    # for each wrong field ``field``, ``came`` and ``expected``
+    # ``field``, ``came`` and ``expected`` of each wrong field
     fields: tuple[dict[str, str], ...] = ()
-    headers: Mapping[str, str] = field(default_factory=dict[str, str])  # of the answer
+    headers: Mapping[str, str] = field(default_factory=dict[str, str])  # headers of the answer
 
     def as_json(self, tried: str) -> dict[str, Any]:
         """Return the answer's body; ``tried`` is method and path of the call."""
@@ -37,9 +37,9 @@ class RefusedError(Exception):
 
 
 def shown(value: object) -> str:
-    """Return a value as text, cut after :data:`MAX_SHOWN` characters."""
+    """Return a value as text, cut after :data:`MAX_SHOWN_CHARACTERS` characters."""
     text = repr(value)
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+    return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[:MAX_SHOWN_CHARACTERS]}..."
 
 
 _EXPECTED = {"missing": "a value", "extra_forbidden": "no such field"}

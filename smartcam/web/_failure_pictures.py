@@ -16,16 +16,16 @@ PERIOD: Final = 0.2
 """Seconds between two looks at the rows that fail."""
 
 CAMERA_PERIOD: Final = 10.0
-"""Seconds between two pictures of one camera, at least."""
+"""Seconds that must pass between two pictures of one camera."""
 
 SETTLING: Final = 0.2
 """Seconds in which a newer result would arrive that the camera had when it sent the picture."""
 
 MAX_BYTES: Final = 1 << 28
-"""Bytes that the pictures of all cameras may have together."""
+"""Largest number of bytes that the pictures of all cameras may have together."""
 
 MAX_PICTURES: Final = 10_000
-"""Pictures of all cameras that are kept."""
+"""Largest number of pictures of all cameras that are kept."""
 
 
 class FailurePictures:

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
-"""Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
+"""Log entries in one event; at ten events per second it keeps up with 2000 messages per second."""
 
 MAX_FAULTS_TOLD = 100
-"""Faults that one event reports at most."""
+"""Largest number of faults that one event reports."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
 """Looks after which the clock is told: once a second. It shows a reader that is gone, too."""

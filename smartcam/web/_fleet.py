@@ -33,7 +33,7 @@ MAX_VIEWERS: Final = 32
 """Pages of the table that may be open at one time."""
 
 MAX_CAMERAS: Final = 16
-"""Cameras that may have a page of their own open at one time."""
+"""Largest number of cameras that may have a page of their own open at one time."""
 
 LINGER: Final = 30.0
 """Seconds that a camera is followed for its own page after nobody looks at that any more."""

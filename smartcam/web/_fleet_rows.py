@@ -1,4 +1,4 @@
-"""One camera of the fleet's page: what it is, what it has sent, and its last result."""
+"""Keep the row of a camera on the fleet's page: its state, its counts, its last result."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ if TYPE_CHECKING:
     from smartcam.streams import BatchSubscription, Subscription
 
 MAX_QUEUE: Final = 64
-"""Results of a camera that may wait for a look; further ones are only counted."""
+"""Largest number of results of a camera that may wait for a look; further ones are only counted."""
 
 MAX_QUEUE_BYTES: Final = 1 << 18
-"""Bytes of them."""
+"""Largest number of bytes of these results."""
 
-MAX_KEPT: Final = 1 << 16
-"""Bytes of a result that is kept for its picture; of a longer one its length is told."""
+MAX_KEPT_BYTES: Final = 1 << 16
+"""Largest number of bytes of a result that is kept for its picture; of a longer result only the
+length is shown."""
 
 MAX_DRAWN: Final = 30
-"""Parts of a result in its picture."""
+"""Largest number of parts of a result in its picture."""
 
-MAX_TEXT: Final = 160
-"""Characters of a text in a row."""
+MAX_TEXT_CHARACTERS: Final = 160
+"""Largest number of characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
 """Seconds over which a rate is counted."""
@@ -49,15 +50,14 @@ BAD_SECONDS: Final = 60.0
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
 
 MODES: Final = ("error", "lost", "ended", "gone", "awaited", "stopped", "busy", "running")
-"""The states of a camera, the worst first.
+"""States of a camera, the worst first.
 
-A camera that has ended was taken or given up; no agent shares one that is gone; one that is
-awaited
-was never there.
+"ended": the camera was taken or given up; "gone": no agent shares it any more; "awaited": it was
+never there.
 """
 
 SI: Final = ShownUnits()
-"""The units in which values are."""
+"""Units of the values."""
 
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
 
@@ -66,11 +66,11 @@ class RowState(NamedTuple):
     """The state of a camera."""
 
     connected: bool
-    over: bool  # it was given up
+    over: bool  # whether the camera was given up
     status: Status
     application: int | None
-    reason: str  # why it is not connected
-    error: str  # the last one
+    reason: str  # reason why it is not connected
+    error: str  # last result
     agents: tuple[str, ...]
 
 
@@ -82,7 +82,7 @@ class FleetRow:
 
     Args:
         name: name of the camera.
-        ring: function that is called with the row when something of it may have changed.
+        ring: function that is called with the row when it may have changed.
         units: units that the page can show instead of SI.
 
     Attributes:
@@ -90,15 +90,15 @@ class FleetRow:
         version: version of the view at the last change of the row.
         mode: state of the camera, in a word.
         flags: names of the filters that the row passes.
-        count: number of results received since the camera is followed.
-        text: text in which a search looks.
-        rate: results in a second.
+        count: number of results received since the camera has been followed.
+        text: text that a search examines.
+        rate: results per second.
         errors: number of results that could not be read or did not come, and of lost connections.
         error: text of the last error, for as long as it is marked.
         stirred: True if the camera may have changed since the last look.
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
-        changed_at: time at which the camera was connected or lost at last, seconds since 1970.
+        changed_at: time at which the camera was last connected or lost, seconds since 1970.
         changed_seen: False if that happened before the camera was followed; the time is then that
             of the first look.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.
@@ -124,9 +124,9 @@ class FleetRow:
         self.picture_at: float = -math.inf
         self._ring = ring
         self._units = units
-        self._counted = (0, 0)  # missed, dropped
+        self._counted = (0, 0)  # numbers of missed and dropped results
         self._last: Result[Any] | None = None
-        self._layout: Layout | None = None  # of the last result
+        self._layout: Layout | None = None  # layout of the last result
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: RowState = UNKNOWN
         self._connected = False
@@ -134,10 +134,10 @@ class FleetRow:
         self._events: Subscription[CameraEvent] | None = None
         self._json: tuple[int, str] = (-1, "")
 
-    # ------------------------------------------------------------------ what it follows
+    # ------------------------------------------------------------------ following a camera
 
     def follow(self, camera: FleetCamera[Any]) -> None:
-        """Follow this object, which may take the place of one that was given up."""
+        """Follow a camera object, which may replace one that was given up."""
         if self.camera is camera:
             return
         self.leave()
@@ -147,7 +147,7 @@ class FleetRow:
             batch=True, max_queue=MAX_QUEUE, max_queue_bytes=MAX_QUEUE_BYTES
         )
         self._events = camera.events(max_queue=1)
-        # every offer rings, so nobody needs to wait for either, nor to take the events
+        # every new result or event rings, so nothing needs to wait for them
         self._results.share(_RowBell(ring))
         self._events.share(_RowBell(self.stir))
         self.stir()
@@ -165,10 +165,10 @@ class FleetRow:
         self._results = self._events = self.camera = None
         self._counted = (0, 0)
 
-    # ------------------------------------------------------------------ looks
+    # ------------------------------------------------------------------ updates
 
     async def take(self, now: float) -> collections.Counter[str]:
-        """Take what has come; return how it turned out. It does not wait."""
+        """Take the new results; return their outcomes. It does not wait."""
         outcomes: collections.Counter[str] = collections.Counter()
         stream, full = self._results, False
         while stream is not None and stream.waiting:
@@ -192,7 +192,7 @@ class FleetRow:
         return outcomes
 
     def account(self, outcomes: collections.Counter[str], now: float) -> None:
-        """Count what did not come, or was not taken: a result that nobody judged is another one."""
+        """Count results that did not come or were not taken; each has the outcome "other"."""
         if self._results is None:
             return
         said, before = self._results.statistics(), self._counted
@@ -209,10 +209,10 @@ class FleetRow:
         self.count += missed + dropped
 
     def _note(self, error: str, now: float) -> None:
-        self.error, self.error_at = error[:MAX_TEXT], now
+        self.error, self.error_at = error[:MAX_TEXT_CHARACTERS], now
 
     def refresh(self, now: float) -> tuple[bool, bool]:
-        """Look how the camera is; return whether that changed, and whether it was lost."""
+        """Update the camera's state; return whether it changed, and whether the camera was lost."""
         camera = self.camera
         connected = camera is not None and camera.connected and bool(self.agents)
         lost = self._connected and not connected
@@ -243,7 +243,7 @@ class FleetRow:
         return True, lost
 
     def _describe(self, state: RowState) -> None:
-        """Have the words for what it is."""
+        """Set the words that describe the state."""
         self.mode = self._word(state)
         self.flags = _flags(self.mode, state, bad=self.error_at is not None)
         told = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
@@ -263,14 +263,14 @@ class FleetRow:
         return "running" if state.status & Status.RUNNING else "stopped"
 
     def mark(self) -> bool:
-        """Count the rate, once a second; return whether it will change by itself."""
+        """Compute the rate once per second; return whether it will change by itself."""
         self._marks.append(self.count)
         self.rate = (self.count - self._marks[0]) / (len(self._marks) - 1)
         return self._marks[0] != self.count
 
     @property
     def failure(self) -> int:
-        """Number of the failure that the newest result is; 0 where that is no failure."""
+        """Number of the newest result as a failure; 0 if it is no failure."""
         behind = self._results is None or self._results.waiting
         return 0 if behind else self.history.last_failure
 
@@ -324,7 +324,7 @@ class FleetRow:
             "number": result.number,
             "outcome": judged(result.value),
         }
-        if len(result.raw) > MAX_KEPT:
+        if len(result.raw) > MAX_KEPT_BYTES:
             return {**told, "text": f"{len(result.raw)} bytes"}
         value = shown_value(result.value, self._layout)
         if "parts" in value:
@@ -335,24 +335,24 @@ class FleetRow:
             ]
             return {**told, "parts": parts, "parts_count": value["count"]}
         if "cut" in value:
-            return {**told, "text": value["cut"][:MAX_TEXT]}
+            return {**told, "text": value["cut"][:MAX_TEXT_CHARACTERS]}
         units = value["units"]
         lines = {"text": line_of(value["value"], units)}
         if units:
             lines["practical"] = line_of(value["value"], units, self._units)
-        return {**told, **{name: text[:MAX_TEXT] for name, text in lines.items()}}
+        return {**told, **{name: text[:MAX_TEXT_CHARACTERS] for name, text in lines.items()}}
 
 
 def _why(camera: FleetCamera[Any]) -> str:
-    """Return why a camera is not connected: what its agent says, where there is one."""
+    """Return the reason why a camera is not connected, from its agent if there is one."""
     trouble = camera.trouble
     if trouble is None:
         return ""
-    return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT]
+    return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT_CHARACTERS]
 
 
 class _RowBell(asyncio.Event):
-    """Calls somebody instead of waking one."""
+    """Calls a function instead of waking a task."""
 
     def __init__(self, ring: Callable[[], None]) -> None:
         super().__init__()
@@ -379,7 +379,7 @@ def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
     """Return a value in one line.
 
     Args:
-        value: value, as JSON has it.
+        value: value in its JSON form.
         units: SI unit of the value, or those of its fields by their names.
         shown: units in which the line shows numbers.
     """

@@ -24,19 +24,19 @@ PROTOCOL: Final = "smartcam.fleet"
 """Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
-"""Rows that may be in sight: three times those of a tall screen."""
+"""Largest number of rows that may be in sight: three times those of a tall screen."""
 
-MAX_SEARCH: Final = 100
-"""Characters of a search text at most."""
+MAX_SEARCH_CHARACTERS: Final = 100
+"""Largest number of characters of a search text."""
 
 MAX_MESSAGE_BYTES: Final = 1024
-"""Bytes of a message from a page at most."""
+"""Largest number of bytes of a message from a page."""
 
 ALIVE_INTERVAL: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
 
 QUICK_INTERVAL: Final = 0.05
-"""Seconds between two messages at least, to a page that looks here and there."""
+"""Seconds that must pass between two messages to a page that scrolls or searches."""
 
 AT_ONCE: Final = 10
 """Rows that are made JSON before other tasks of the loop have a turn."""
@@ -52,7 +52,7 @@ class RowsInSight(BaseModel):
 
     first: int = Field(default=0, ge=0, le=1_000_000)
     count: int = Field(default=40, ge=0, le=MAX_ROWS)
-    search: str = Field(default="", max_length=MAX_SEARCH)
+    search: str = Field(default="", max_length=MAX_SEARCH_CHARACTERS)
     filter: Filter = "all"
     sort: Sort = "name"
     down: bool = False
@@ -77,10 +77,10 @@ class FleetSocket(PageSocket):
         self._view = view
         self._about = about
         self._sight = RowsInSight()
-        self._moved = asyncio.Event()  # something else is in sight
-        self._looked = -1  # version of the view that was looked at
+        self._moved = asyncio.Event()  # set when other rows are in sight
+        self._looked = -1  # version of the view at the last look
         self._seen: dict[str, int] = {}  # versions of the rows that the page has
-        self._window: tuple[Any, ...] = ()  # that the page has: what is found, and which names
+        self._window: tuple[Any, ...] = ()  # window that the page has: found cameras and names
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has

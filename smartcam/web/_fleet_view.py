@@ -1,6 +1,6 @@
 """Keep the fleet's page up to date: follow a fleet once, however many look.
 
-One task looks five times a second at what rang, which costs nothing while nothing happens. Nobody
+One task looks five times per second at what rang, which costs nothing while nothing happens. Nobody
 who looks is waited for: they ask for rows in an order, and for what is newer than they know.
 """
 
@@ -28,16 +28,18 @@ PERIOD: Final = 0.2
 """Seconds between two looks, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Events of cameras between two looks; after more the whole fleet is read anew."""
+"""Largest number of events of cameras between two looks; after more the whole fleet is read
+anew."""
 
 MAX_GONE: Final = 10_000
-"""Cameras shown although nobody shares them any more; those gone longest are forgotten."""
+"""Largest number of cameras shown although nobody shares them any more; those gone longest are
+forgotten."""
 
 AT_ONCE: Final = 50
 """Rows or results that are handled before other tasks of the loop have a turn."""
 
 MAX_SIFTED_ROWS: Final = 1000
-"""Rows that are searched before other tasks of the loop have a turn."""
+"""Largest number of rows that are searched before other tasks of the loop have a turn."""
 
 BUCKET: Final = 5
 """Seconds of one bar of the outcomes."""
@@ -76,7 +78,7 @@ class RowOrder(NamedTuple):
     """Names in an order."""
 
     names: list[str]
-    version: int  # of the view, when it was made
+    version: int  # version of the view at its creation
     at: float
 
 

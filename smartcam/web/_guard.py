@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-MIN_TOKEN = 16
-"""Characters of a token at least, so that nobody guesses it; made ones have 32."""
+MIN_TOKEN_CHARACTERS = 16
+"""Least number of characters of a token, so that nobody guesses it; made ones have 32."""
 
 BEARER = "bearer."
 """Begins the protocol of a WebSocket that is a token."""
@@ -53,7 +53,7 @@ HEADERS: Mapping[str, str] = {
 class Guard:
     """The checks of one site."""
 
-    token: str | None  # what calls must carry; None: nothing, and the site listens on loopback
+    token: str | None  # token that calls must carry; None: none, and the site listens on loopback
 
     def check(self, request: web.Request, *, is_call: bool) -> None:
         """Refuse a request that does not come from the site's own pages.
@@ -98,7 +98,7 @@ def check_host(given: str, names: Collection[str] | None = None) -> None:
 
     Args:
         given: what the request has in its head.
-        names: names of this machine, in small letters, that are allowed beside loopback and any
+        names: names of this machine, in lower case, that are allowed beside loopback and any
             address; None: only names and addresses of loopback are.
 
     Raises:
@@ -146,9 +146,9 @@ def checked_token(token: str) -> str:
             carry.
     """
     signs = token.replace("-", "").replace("_", "")
-    if len(token) < MIN_TOKEN or not (signs.isascii() and signs.isalnum()):
+    if len(token) < MIN_TOKEN_CHARACTERS or not (signs.isascii() and signs.isalnum()):
         raise ConfigurationError(
-            f"web: a token has {MIN_TOKEN} letters, digits, '-' and '_' at least, "
+            f"web: a token has {MIN_TOKEN_CHARACTERS} letters, digits, '-' and '_' at least, "
             f"this one has {len(token)} characters"
         )
     return token

@@ -29,13 +29,13 @@ MAX_FAILURES: Final = 50
 """Failures that are kept; equal ones in a row are one."""
 
 MAX_PICTURES: Final = 12
-"""Pictures of failures that are kept."""
+"""Largest number of pictures of failures that are kept."""
 
 MAX_PICTURE_BYTES: Final = 1 << 25
-"""Bytes that the pictures of failures may have together."""
+"""Largest number of bytes that the pictures of failures may have together."""
 
-MAX_TEXT: Final = 300
-"""Characters that say what failed."""
+MAX_TEXT_CHARACTERS: Final = 300
+"""Largest number of characters that say what failed."""
 
 KINDS: Final = ("passed", "failed", "other", "errors")
 """Outcomes of a result, in the order of a bar's numbers."""
@@ -49,7 +49,7 @@ class Failure:
         serial: number of the failure, from 1.
         at: time of the first one, seconds since 1970.
         until: time of the last one.
-        number: number of the first result; None where there is no result.
+        number: number of the first result; None if there is no result.
         what: what failed, in words.
         count: how many there were.
     """
@@ -67,8 +67,8 @@ class ShiftHistory:
 
     Attributes:
         version: number of changes.
-        failed_since: when the first failure after the last pass came, seconds since 1970; None
-            where the last one that tells has passed.
+        failed_since: when the first failure after the last pass came, seconds since 1970; None if
+            the last one that tells has passed.
         in_a_row: number of results that failed since then.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
@@ -138,13 +138,13 @@ class ShiftHistory:
     def _tell(self, at: float, number: int | None, what: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
-        if last is not None and last.what == what[:MAX_TEXT] and not self._passed:
+        if last is not None and last.what == what[:MAX_TEXT_CHARACTERS] and not self._passed:
             last.count += 1
             last.until = at
             return
         self._passed = False
         self._serial += 1
-        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT]))
+        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT_CHARACTERS]))
 
     # ------------------------------------------------------------------ pictures
 
@@ -176,7 +176,7 @@ class ShiftHistory:
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
-        """Return the picture of a failure, None where none is kept."""
+        """Return the picture of a failure, None if none is kept."""
         return self._pictures.get(serial)
 
     # ------------------------------------------------------------------ for the page

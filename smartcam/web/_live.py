@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from smartcam.web._live_camera import ShowsCamera
 
 MAX_NEWS = 20
-"""Results in one event: at ten a second the page sees 200 a second, and is told what it missed."""
+"""Largest number of results in one event: at ten a second the page sees 200 a second, and is told
+what it missed."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
 """Looks after which clock and account are told: once a second."""

@@ -18,7 +18,7 @@ class ShowsCamera(Protocol):
     """The camera on which the live page's calls act."""
 
     control: bool  # whether the page may command the camera
-    units: PageUnits  # those that the page can show instead of SI
+    units: PageUnits  # units that the page can show instead of SI
     view: LiveView
     frames: LiveFrames
     streams: Streams

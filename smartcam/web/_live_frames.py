@@ -45,7 +45,7 @@ class LiveFrames:
         camera: returns the camera that the page shows now.
 
     Attributes:
-        pictures: pictures of its frames; None where it has none.
+        pictures: pictures of its frames; None if it has none.
     """
 
     def __init__(self, camera: Callable[[], object]) -> None:

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from smartcam.layout import Layout
 
 MAX_RESULTS = 100
-"""Results that the page can show: those before are on it no more."""
+"""Largest number of results that the page can show: those before are on it no more."""
 
-MAX_VALUE = 20_000
-"""Characters of JSON that a value may have on the page; a larger one is cut."""
+MAX_VALUE_CHARACTERS = 20_000
+"""Largest number of characters of JSON that a value may have on the page; a larger one is cut."""
 
 MAX_PARTS = 500
 """Localizations of a result that the page draws."""
 
-MAX_SHOWN_RAW = 64
-"""Bytes of a container that the page shows."""
+MAX_SHOWN_RAW_BYTES = 64
+"""Largest number of bytes of a container that the page shows."""
 
 SERIES = 300
 """Seconds of rate and latency that the page draws."""
@@ -55,8 +55,8 @@ class ShownResult(NamedTuple):
 
     serial: int  # counted from 0
     result: Result[Any] | None
-    error: str  # why a container could not be read, "" where it could
-    layout: Layout | None = None  # that of tables, which know no units
+    error: str  # why a container could not be read, "" if it could
+    layout: Layout | None = None  # layout of tables, which have no units themselves
 
     def as_json(self) -> dict[str, Any]:
         """Return the result as the page takes it."""
@@ -71,7 +71,7 @@ class ShownResult(NamedTuple):
             "received_at": result.received_at.timestamp(),
             "latency": result.latency,
             "size": len(result.raw),
-            "raw": result.raw[:MAX_SHOWN_RAW].hex(" "),
+            "raw": result.raw[:MAX_SHOWN_RAW_BYTES].hex(" "),
             **shown_value(result.value, self.layout),
         }
 
@@ -109,15 +109,15 @@ class LiveView:
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
         self.picture_error: str = ""
-        self.changed_at: float = time.time()  # when it was connected or lost at last
+        self.changed_at: float = time.time()  # time at which it was last connected or lost
         self.changed_seen: bool = False  # False: that was before it was followed
-        self.loss: str = ""  # why it is not connected, "" where it is
+        self.loss: str = ""  # why it is not connected, "" if it is
         self._end: SmartCamError | None = None  # why it will never be again
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
         self._asked = 0  # number of the failure whose picture was asked for
-        self._latencies: list[float] = []  # of this second
+        self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
 
@@ -296,7 +296,7 @@ class LiveView:
 
 
 def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
-    """Return the layout by which a camera's result was read; None where it has none."""
+    """Return the layout by which a camera's result was read; None if it has none."""
     interpreter = own_interpreter(camera, result.application)
     return None if interpreter is None else interpreter.layout
 
@@ -319,8 +319,8 @@ def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
     text = json.dumps(value)
     shown = (
         {"value": value, "units": units}
-        if len(text) <= MAX_VALUE
-        else {"cut": text[: MAX_VALUE // 10]}
+        if len(text) <= MAX_VALUE_CHARACTERS
+        else {"cut": text[: MAX_VALUE_CHARACTERS // 10]}
     )
     return {"verdicts": verdicts(value), **shown}
 

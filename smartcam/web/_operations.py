@@ -32,7 +32,7 @@ _log = logging.getLogger("smartcam.web")
 _Handler: TypeAlias = "Callable[[web.Request], Awaitable[web.StreamResponse]]"
 
 MAX_CAMERAS_LISTED = 100
-"""Cameras at most that an answer names as not connected."""
+"""Largest number of cameras that an answer names as not connected."""
 
 
 class OperationsSite(Server):

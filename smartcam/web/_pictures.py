@@ -47,8 +47,9 @@ MAX_VIEWERS: Final = 32
 PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
 
-MAX_PICTURE: Final = 1 << 24
-"""Bytes of a picture that is sent; what a camera sends as a JPEG may be of any size."""
+MAX_PICTURE_BYTES: Final = 1 << 24
+"""Largest number of bytes of a picture that is sent; what a camera sends as a JPEG may be of any
+size."""
 
 ACCOUNT_PERIOD: Final = 1.0
 """Seconds without a frame after which the page is told the account all the same."""
@@ -88,7 +89,7 @@ class SitePictures:
         self._threads: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
-        """Have what makes pictures; does nothing if it is there."""
+        """Have what makes pictures; does nothing if it exists."""
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.jpeg")
             self._presses = [Press(self._threads, self._quality) for _ in self.sources]
@@ -202,9 +203,9 @@ def _pressed(frame: Frame, quality: int) -> bytes:
     with from_part("frames", "pictures on a page need"):
         from smartcam.web._jpeg import jpeg
     data = jpeg(frame, quality)
-    if len(data) > MAX_PICTURE:
+    if len(data) > MAX_PICTURE_BYTES:
         raise FrameFormatError(
-            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE} at most",
+            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE_BYTES} at most",
             source=frame.source,
         )
     return data

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
-MAX_BODY = 1 << 18
-"""Bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
+MAX_BODY_BYTES = 1 << 18
+"""Largest number of bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
 
 READ_TIMEOUT = 10.0
 """Seconds within which a call's body must have come."""
@@ -57,23 +57,23 @@ class CallRequest:
 
     request: web.Request  # the request; its body was read
     path: Mapping[str, str]  # the variable parts of the path
-    query: Any  # the call's query, checked; None where it takes none
-    body: Any  # the call's body, checked; None where it takes none
+    query: Any  # the call's query, checked; None if it takes none
+    body: Any  # the call's body, checked; None if it takes none
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Call(Generic[C]):
     """A row of a table of calls."""
 
-    method: _Method  # of HTTP
-    path: str  # with variable parts in braces
-    about: str  # what it does and answers, for people
+    method: _Method  # HTTP method
+    path: str  # path with variable parts in braces
+    about: str  # purpose and answer, for people
     # does it, given the site and what was asked; returns the answer, or raises RefusedError. An
     # event stream returns a coroutine.
     handler: Action[C]
     query: type[BaseModel] | None = None  # the query's model; None: it takes none
     body: _Model | None = None  # the body's model; None: it takes none
-    optional: bool = False  # whether it may come without its body
+    optional: bool = False  # whether the body may be missing
     sample: str = ""  # a body, for people
 
     async def answer(self, site: C, request: web.Request) -> web.StreamResponse:
@@ -249,7 +249,7 @@ def _translated(error: web.HTTPException, prefix: str) -> RefusedError:
                 405, f"the method {error.method}", allowed, headers={"Allow": allowed}
             )
         case web.HTTPRequestEntityTooLarge():
-            return RefusedError(413, "a larger body", f"{MAX_BODY} bytes at most")
+            return RefusedError(413, "a larger body", f"{MAX_BODY_BYTES} bytes at most")
         case web.HTTPNotFound():
             return RefusedError(404, "an unknown path", f"one of those that GET {prefix} lists")
         case _:

@@ -25,18 +25,20 @@ if TYPE_CHECKING:
 SENSOR = (1280, 1024)
 """Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
 
-MAX_HEX = 512
-"""Bytes of a payload that a list of log entries shows; the entry alone has all."""
+MAX_HEX_BYTES = 512
+"""Largest number of bytes of a payload that a list of log entries shows; the entry alone has
+all."""
 
-MAX_VALUES = 2048
-"""Bytes of a result that a list of log entries shows decoded; the entry alone shows any."""
+MAX_VALUES_BYTES = 2048
+"""Largest number of bytes of a result that a list of log entries shows decoded; the entry alone
+shows any."""
 
-MAX_TOLD = 1 << 18
-"""Bytes of payload in a list of log entries, as far as they are shown, or of faults: the list ends
-there, so an answer stays a few megabytes of JSON."""
+MAX_TOLD_BYTES = 1 << 18
+"""Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
+faults: the list ends there, so an answer stays a few megabytes of JSON."""
 
 MAX_LISTED = 1000
-"""Faults that a list shows at most."""
+"""Largest number of faults that a list shows."""
 
 LOOKING = {"tangram": False, "tangram_pixels": True}
 """Generators that look at the table, and whether they tell pixels."""
@@ -118,17 +120,17 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 
 
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
-    """Return entries from a serial on as JSON and as they are: ``limit``, or :data:`MAX_TOLD`.
+    """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_TOLD_BYTES.
 
     ``next`` is the serial to go on with, ``missed`` how many are gone.
     """
     entries, count = emulator.log.since(since, limit)
     first = min(max(since, count - len(emulator.log)), count)
     told: list[dict[str, Any]] = []
-    room = MAX_TOLD
+    room = MAX_TOLD_BYTES
     for serial, entry in enumerate(entries, first):
         told.append(camera_entry(serial, entry, emulator))
-        room -= min(told[-1]["size"], MAX_VALUES)
+        room -= min(told[-1]["size"], MAX_VALUES_BYTES)
         if room <= 0:
             break
     part = {"entries": told, "next": first + len(told), "missed": max(0, first - since)}
@@ -143,7 +145,7 @@ def camera_entry(
     What is left out of a long payload, unless ``whole``, is told by ``size`` and ``wire_size``,
     and by null in place of ``values``.
     """
-    shown = None if whole else MAX_HEX * 3 - 1
+    shown = None if whole else MAX_HEX_BYTES * 3 - 1
     message, wire = entry.message, entry.wire
     values = None if message is None else _values(message, emulator, whole=whole)
     return {
@@ -155,7 +157,7 @@ def camera_entry(
         "message": None if message is None else type(message).__name__,
         "fields": {} if message is None else _fields(message, emulator.codec),
         "values": values,
-        "text": entry.text[:MAX_HEX] if isinstance(emulator, LineCamera) else None,
+        "text": entry.text[:MAX_HEX_BYTES] if isinstance(emulator, LineCamera) else None,
         "hex": entry.hex[:shown],
         "size": _size(entry.hex),
         "error": entry.error,
@@ -200,14 +202,14 @@ def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]
 
 
 def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
-    """Return a result's values as its application's layout has them, None where there is none."""
+    """Return a result's values as its application's layout has them, None if there is none."""
     if not isinstance(message, m.ResultContainer):
         return None
     if message.cells is not None:
         return {cell.cell: cell.text for cell in message.cells}
     application = emulator.application_of(message)
     layout = None if application is None else application.result_layout
-    if layout is None or (not whole and len(message.data) > MAX_VALUES):
+    if layout is None or (not whole and len(message.data) > MAX_VALUES_BYTES):
         return None
     try:
         return layout.parse(message.data, _byte_order(emulator.device))
@@ -234,8 +236,8 @@ def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any
 
 
 def _as_many(faults: Iterable[BaseFault], limit: int) -> int:
-    """Return the number of faults shown: ``limit``, or :data:`MAX_TOLD` bytes of inserted data."""
-    count, room = 0, MAX_TOLD
+    """Return the number of faults shown: ``limit``, or MAX_TOLD_BYTES of inserted data."""
+    count, room = 0, MAX_TOLD_BYTES
     for fault in faults:
         room -= len(getattr(fault, "data", None) or b"")
         if count == limit or room < 0:

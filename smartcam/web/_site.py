@@ -15,7 +15,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.web._connections import KEEP_ALIVE, Visitors
 from smartcam.web._guard import HEADERS, Guard, checked_token, new_token
 from smartcam.web._pages import page_html, read_file
-from smartcam.web._routes import MAX_BODY, middleware, routes
+from smartcam.web._routes import MAX_BODY_BYTES, middleware, routes
 from smartcam.web._streams import Streams
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class Site(Server):
     def _application(self) -> web.Application:
         guard = Guard(token=self.token)
         application = web.Application(
-            middlewares=[middleware(guard, API)], client_max_size=MAX_BODY
+            middlewares=[middleware(guard, API)], client_max_size=MAX_BODY_BYTES
         )
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_WORD_BYTES: Final = 64
-"""Bytes of what a page may say: that it wants the next one."""
+"""Largest number of bytes of what a page may say: that it wants the next one."""
 
 
 def check_websocket(request: web.Request, protocol: str, viewers: int, most: int) -> None:

@@ -1,6 +1,6 @@
 """Event streams: what happens, told to whoever listens, as server-sent events.
 
-A stream looks for news ten times a second and writes them. Nothing waits for it: while its reader
+A stream looks for news ten times per second and writes them. Nothing waits for it: while its reader
 is slow it does not look, and a reader that takes nothing at all is disconnected.
 """
 
@@ -36,7 +36,7 @@ class News(NamedTuple):
     """One event."""
 
     kind: str  # the event's name
-    data: Any  # what happened; sent as JSON
+    data: Any  # event, sent as JSON
     serial: int | None = None  # sent as the event's id; None for none
 
     def as_text(self) -> str:

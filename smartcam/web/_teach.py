@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from smartcam.inspection import Drawing, Inspection, Teaching
 
 MAX_PICTURES: Final = 200
-"""Pictures on the page; of a source the oldest one makes room."""
+"""Largest number of pictures on the page; of a source the oldest one makes room."""
 
 MAX_TOOLS: Final = 32
-"""Tools that the page may try at once."""
+"""Largest number of tools that the page may try at once."""
 
 MAX_MARKS: Final = 400
-"""Marks of a picture that the page draws."""
+"""Largest number of marks of a picture that the page draws."""
 
 MAX_POINTS: Final = 200
-"""Points of a mark that the page draws."""
+"""Largest number of points of a mark that the page draws."""
 
 SHOT_TIMEOUT: Final = 5.0
 """Seconds that a picture of the camera is waited for."""
@@ -100,7 +100,8 @@ class TeachSite(ThreadedSite):
         made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
-        self._tried: dict[int, Inspection] = {}  # by picture, by the tools that were tried last
+        # results by picture, of the tools that were tried last
+        self._tried: dict[int, Inspection] = {}
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
         """Have the thread do something.

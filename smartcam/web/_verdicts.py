@@ -9,7 +9,7 @@ from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
-"""Records of a result that are looked at for pass or fail."""
+"""Largest number of records of a result that are looked at for pass or fail."""
 
 Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 """Outcome of a result; one that tells neither good nor bad is "other"."""
@@ -54,7 +54,7 @@ def judged(value: Any) -> Outcome:
 
 
 def failing(value: Any) -> str:
-    """Return the truth values that are not as they should be, in words; "" where none is."""
+    """Return the truth values that are not as they should be, in words; "" if none is."""
     bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
     texts = []
     for one in bad:

@@ -16,8 +16,7 @@ import aiohttp
 import smartcam
 from smartcam._accepting import Places
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
-from smartcam.fleet import FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetServer, MemoryBus
 from smartcam.frames import RtspServer
 from smartcam.gateway import Gateway, GatewaySettings
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr

@@ -6,12 +6,46 @@ import re
 from typing import NamedTuple
 
 from tests import ROOT
-from tests.budgets.bus import BUS
 from tests.budgets.parser import Parser
-from tests.budgets.texts import TEXTS
-from tests.budgets.wire import WIRE
+from tests.calibration import budgets as _calibration
+from tests.depth import budgets as _depth
+from tests.emulator import budgets as _emulator
+from tests.fleet import budgets as _fleet
+from tests.frames import budgets as _frames
+from tests.gateway import budgets as _gateway
+from tests.inspection import budgets as _inspection
+from tests.interpreters import budgets as _interpreters
+from tests.layout import budgets as _layout
+from tests.makes import budgets as _makes
+from tests.outlets import budgets as _outlets
+from tests.protocols import budgets as _protocols
+from tests.recording import budgets as _recording
+from tests.ros1 import budgets as _ros1
+from tests.ros2 import budgets as _ros2
+from tests.web import budgets as _web
 
-PARSERS: dict[str, Parser] = {one.name: one for one in (*WIRE, *TEXTS, *BUS)}
+PARSERS: dict[str, Parser] = {
+    one.name: one
+    for room in (
+        _calibration,
+        _depth,
+        _emulator,
+        _fleet,
+        _frames,
+        _gateway,
+        _inspection,
+        _interpreters,
+        _layout,
+        _makes,
+        _outlets,
+        _protocols,
+        _recording,
+        _ros1,
+        _ros2,
+        _web,
+    )
+    for one in room.PARSERS
+}
 """Every parser of foreign bytes by its name."""
 
 

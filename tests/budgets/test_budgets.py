@@ -16,10 +16,10 @@ import smartcam
 from tests.budgets import counting
 from tests.budgets.__main__ import count_instructions, memory_of, wrong
 from tests.budgets.counting import MAX_FACTOR
+from tests.budgets.inputs import PAST_LOOKAHEAD
 from tests.budgets.modules import OTHERS, PARSERS_OF, reading_modules, without_place
 from tests.budgets.parser import Parser, fill
 from tests.budgets.table import EXAMPLE, PAGE, PARSERS, budgets, row
-from tests.budgets.texts import PAST_LOOKAHEAD
 from tests.fuzz.fuzz_targets import TARGETS
 
 NEGLIGIBLE_STEPS = 1500

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration import CameraModel, Checkerboard, TargetView, Transform
-from smartcam.calibration.simulation import _scenes as scenes
+from tests.calibration.inside import _scenes as scenes
 
 if TYPE_CHECKING:
     from smartcam.calibration._inside import Target

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration import CameraModel, Checkerboard, Transform, find_target
-from smartcam.calibration._homography import apply_homography, fit_homography
 from smartcam.calibration.simulation import HandEyeScene, hand_eye_scene, render
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import apply_homography, fit_homography
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration import TargetView
-    from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._inside import Target
     from smartcam.geometry._inside import Array
+    from tests.calibration.inside import Setup
 
 CAMERA = CameraModel(
     size=(1280, 960),

@@ -18,9 +18,9 @@ from smartcam.calibration import CameraModel, Checkerboard, Transform
 from smartcam.calibration._inside import Target
 from smartcam.calibration.simulation import render
 from smartcam.calibration.wizards import WizardSession, sheet_wizard
-from smartcam.calibration.wizards._journal import Journal
 from smartcam.geometry._inside import Array
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
+from tests.calibration.inside import Journal
 
 CAMERA = CameraModel(
     size=(800, 600),

@@ -20,11 +20,12 @@ from smartcam.calibration import (
     fit_corners,
     load_calibration,
 )
-from smartcam.calibration._files.store import write
-from smartcam.calibration.simulation import _scenes as scenes
 from smartcam.calibration.wizards import CalibrationService
 from smartcam.exceptions import ConfigurationError
 from smartcam.geometry._inside import Array
+from smartcam.models import PoseSigma
+from tests.calibration.inside import _scenes as scenes
+from tests.calibration.inside import write
 from tests.calibration.scenes import refused
 from tests.calibration.sheetkit import (
     CAMERA,
@@ -95,6 +96,50 @@ def test_sheet_pose_turns_with_the_part_and_the_chain_agrees() -> None:
     assert found.to_robot([]) == []
     flipped = found.to_robot(part, tool_flip=True).pose.orientation
     assert np.allclose(Rotation.from_quat(flipped).as_matrix()[:, 2], TOOL_Z, atol=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("camera", [CAMERA, STRAIGHT])
+def test_sigma_of_a_pose_is_that_of_many_sheets(camera: CameraModel) -> None:
+    lens = camera if camera is CAMERA else None
+    random = np.random.default_rng(3)
+    sigma = PoseSigma(0.2, 0.1, 2e-3, 0.5)
+    own = np.array([[0.04, 0.01, 0], [0.01, 0.01, 0], [0, 0, 4e-6]])
+    found, said = [], []
+    for seed in range(150):
+        calibration = calibrate_sheet(
+            seen(camera, 0.5, seed), touched(SIGMA, seed + 1000), camera=lens
+        )
+        u, v_up, theta = random.multivariate_normal((250.0, -200.0, 0.4), own)
+        part = localized(u, -v_up, theta)
+        one = calibration.to_robot(part._replace(pose=part.pose.with_sigma(sigma))).pose
+        turn = LIES.rotation.T @ Rotation.from_quat(one.orientation).as_matrix()
+        found.append((*one.position, np.arctan2(turn[1, 0], turn[0, 0])))
+        assert one.sigma is not None
+        said.append(one.sigma)
+    assert calibration.to_robot(part).pose.sigma is None
+    mean = [np.mean([getattr(one, name) for one in said]) for name in ("x", "y", "z", "theta")]
+    # 150 of them: a standard deviation is known to 6 %
+    np.testing.assert_allclose(mean, np.std(found, axis=0), rtol=0.2)
+
+
+def test_sigma_in_pixels_becomes_metres_of_the_robot() -> None:
+    calibration = calibrate_sheet(seen(), touched(), camera=CAMERA)
+    part = localized(300.0, 200.0)
+    assert calibration.to_robot(part).pose.sigma is None
+    sharp = part._replace(pose=part.pose.with_sigma(PoseSigma(0.0, 0.0, 0.0)))
+    known = calibration.to_robot(sharp).pose.sigma
+    covariance = calibration.covariance_at([[300.0, 200.0]])[0]
+    assert known is not None
+    assert known.z is not None
+    np.testing.assert_allclose([known.x, known.y, known.z], np.sqrt(np.diag(covariance)), rtol=1e-6)
+    half = part._replace(pose=part.pose.with_sigma(PoseSigma(0.5, 0.5, 0.01)))
+    seen_half = calibration.to_robot(half).pose.sigma
+    assert seen_half is not None
+    # half a pixel is a third of a millimetre there
+    beyond = np.sqrt(seen_half.place**2 - known.place**2)
+    assert 0.8 < beyond / (0.5 * 0.5 / 750) < 1.3
+    assert 0.009 < seen_half.theta < 0.012
 
 
 def test_sheet_with_y_as_it_is_is_refused_instead_of_mirrored() -> None:

@@ -24,7 +24,8 @@ from smartcam.calibration import (
     fit_plane,
 )
 from smartcam.calibration._plane.calibration import PlaneModel
-from smartcam.calibration._solvers import CameraPosition2D, Poses, RealWorldPosition, Solver
+from smartcam.calibration._solvers import Poses, Solver
+from tests.calibration.inside import CameraPosition2D, RealWorldPosition
 from tests.geometry.rigid import (
     angles,
     localization,

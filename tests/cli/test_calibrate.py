@@ -15,11 +15,14 @@ from typing import Any
 
 import pytest
 
-from smartcam._cli.calibrate import STALE, calibrate
 from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.emulator._inside import PIECES
 from tests.cli.commandline import closed_port, emulators, run
+from tests.cli.inside import calibrate
 from tests.processes import PATIENCE, Outcome, Process, printed_by
+
+STALE = 7
+
 
 YAW, OFFSET = math.radians(120.0), (0.5, -0.1, 0.02)
 
@@ -123,7 +126,7 @@ def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path
 
 
 def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
-    lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {}, {})
+    lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {"next": "accept"}, {})
     calibrating(url, tmp_path, lines, "--json", "--y-down").done()
     assert PlaneCalibration.load(tmp_path / "plane.json").y_down is True
     calibrating(url, tmp_path, [], "--check", "plane").failed(

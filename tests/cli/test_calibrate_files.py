@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smartcam._cli.calibrate_files import DIFFERENT
 from smartcam.calibration import CameraModel, fit_plane
 from smartcam.calibration.formats import CameraChain, write_camera_info, write_cameras
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
 from tests.calibration.lens.test_drawing import hand, pair
 from tests.cli.commandline import run
+
+DIFFERENT = 7
+
 
 POSES = spread_poses(lenskit.LEFT, 10)
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam._cli.calibrate import calibrate
 from smartcam._extras import load
 from smartcam.calibration import (
     CameraModel,
@@ -26,11 +25,13 @@ from smartcam.calibration import (
 )
 from smartcam.calibration.formats import write_camera_info
 from smartcam.calibration.simulation import render
+from smartcam.calibration.wizards import PictureFolder
 from smartcam.emulator import EmulatedInSight
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameSink, StreamFormat, find_format
 from smartcam.registry import FRAMES
 from tests.cli.commandline import closed_port, emulators, run
+from tests.cli.inside import calibrate
 from tests.frames.drivers import ShowingDriver, frame
 from tests.processes import Outcome, Process, printed_by
 
@@ -137,10 +138,7 @@ def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) ->
 def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
     tmp_path: Path, files: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from smartcam.calibration.wizards import _pictures as pictures
-
-    monkeypatch.setattr(pictures, "DEADLINE", 0.3)
-    monkeypatch.setattr(pictures.PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
+    monkeypatch.setattr(PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
     lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
     done = calibrating(tmp_path, lines, "--wizard", "sheet", *files)
     assert done.code == 130
@@ -156,10 +154,7 @@ def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(
     tmp_path: Path, files: list[str]
 ) -> None:
-    lines = [
-        *answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {"x": 1.0}),
-        {"do": "abort"},
-    ]
+    lines = [*answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {"x": 1.0}), {"do": "abort"}]
     done = calibrating(tmp_path, lines, "--wizard", "hand-eye", *files)
     assert [line.get("step") for line in done.lines] == [
         "about", "rulers", "view-1", "view-1", None,

@@ -13,8 +13,7 @@ from smartcam._cli import demo_tower
 from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
 from smartcam._cli.options import Options
 from smartcam.depth import ColourRange
-from smartcam.depth._inside import BLOCK, FOCAL, TowerTable, WoodenBlock, laid, to_robot
-from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA
+from smartcam.depth._inside import BLOCK, TowerTable, WoodenBlock, laid, to_robot
 from smartcam.exceptions import FrameFormatError
 from tests.cli.commandline import run
 
@@ -128,23 +127,6 @@ def test_how_a_block_lies_in_the_gripper_is_how_it_lies_on_the_tower() -> None:
 
 
 # ---------------------------------------------------------------------- the simulation itself
-
-
-def test_simulated_depth_has_the_noise_and_holes_that_it_says() -> None:
-    table = TowerTable(4)
-    table.blocks.append(WoodenBlock(0.4, 0.0, math.pi / 2, size=(0.2, 0.1, 0.06)))
-    (depth,) = table.look((0.4, 0.0, 0.6)).depth
-    for region, true in ((np.s_[10:60, 10:630], 0.6), (np.s_[200:280, 250:390], 0.54)):
-        there = depth[region][depth[region] > 0] * 1e-3
-        sigma = math.hypot(true**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA, 1e-3 / math.sqrt(12))
-        assert there.mean() == pytest.approx(true, abs=1e-3)  # the camera is not quite there
-        assert there.std() == pytest.approx(sigma, rel=0.05)
-        assert 0.003 < (depth[region] == 0).mean() < 0.02
-    # the second camera does not see what the block hides: to its left
-    shadow = FOCAL * BASELINE * (1 / 0.54 - 1 / 0.6)
-    empty = (depth[200:280] == 0).mean(axis=0)
-    assert np.count_nonzero(empty > 0.9) == pytest.approx(shadow, abs=1.5)
-    assert np.flatnonzero(empty > 0.9).max() < 320
 
 
 def test_simulated_block_is_where_its_corners_are_seen() -> None:

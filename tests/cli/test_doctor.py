@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from smartcam.doctor import _state_checks
 from tests.cli.commandline import (
     BUSY,
     CONNECT,
@@ -28,7 +27,8 @@ from tests.cli.commandline import (
     run,
     run_as_far_as,
 )
-from tests.processes import PATIENCE, Outcome, Process
+from tests.doctor.doctorkit import be_patient
+from tests.processes import Outcome, Process
 
 GET_CLOCK = bytes.fromhex("50535642 00000000 32000000")
 NOON = bytes.fromhex(
@@ -50,8 +50,7 @@ RUNNING = bytes.fromhex("50535642 08000000 12000000 80000000 00000000")
 @pytest.fixture(autouse=True)
 def _slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have as much asked on a slow machine, and nothing said of that."""
-    monkeypatch.setattr(_state_checks, "QUERIES_WITHIN", PATIENCE)
-    monkeypatch.setattr(_state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE)
+    be_patient(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import re
 import signal
 import socket
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from smartcam._cli import find as command
 from smartcam._cli.find import fleet_lines, telling
 from smartcam.doctor import FoundPort
-from smartcam.doctor import _search as library
 from smartcam.doctor._inside import CameraSearch
+from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run
 from tests.doctor.findkit import NETWORK, filtered, free_port
@@ -66,15 +67,18 @@ def opened(server: socket.socket) -> bool:
 
 
 def test_bounds_of_options_are_those_of_the_library() -> None:
-    bounds = (
-        "DEFAULT_ADDRESSES",
-        "MAX_ADDRESSES",
-        "MAX_OPEN_CONNECTIONS",
-        "MAX_OPENINGS_PER_SECOND",
-        "MAX_SECONDS",
-    )
-    for name in bounds:
-        assert getattr(command, name) == getattr(library, name)
+    given = inspect.signature(CameraSearch).parameters["max_addresses"].default
+    assert given == command.DEFAULT_ADDRESSES
+    most: dict[str, Any] = {
+        "max_addresses": command.MAX_ADDRESSES,
+        "at_once": command.MAX_OPEN_CONNECTIONS,
+        "rate": command.MAX_OPENINGS_PER_SECOND,
+        "timeout": command.MAX_SECONDS,
+    }
+    CameraSearch([f"{NETWORK}2"], **most)
+    for name, value in most.items():
+        with pytest.raises(ConfigurationError, match=name):
+            CameraSearch([f"{NETWORK}2"], **{name: value + 1})
 
 
 def test_find_prints_a_table_and_how_it_went(port: int) -> None:

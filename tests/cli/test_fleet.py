@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from smartcam import _zenoh
-from smartcam.doctor import _state_checks
 from smartcam.recording import load_recording
 from tests.cli.commandline import (
     DISCONNECT,
@@ -29,7 +28,8 @@ from tests.cli.commandline import (
 from tests.cli.test_calibrate import ABOUT, TOUCHES, as_lines, calibrating
 from tests.cli.test_doctor import checks
 from tests.cli.test_live import page_of, wait_for
-from tests.processes import PATIENCE, Process, free_port
+from tests.doctor.doctorkit import be_patient
+from tests.processes import Process, free_port
 
 FLEET = """\
 fleet: plant
@@ -165,9 +165,7 @@ def test_calibrate_a_camera_of_a_fleet(fleet: str, tmp_path: Path) -> None:
 
 
 def test_doctor_examines_a_camera_of_a_fleet(fleet: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        _state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE
-    )  # of this machine nothing is said
+    be_patient(monkeypatch)
     done = run("doctor", f"{fleet}/line1/text", "--trigger", "--count", "2").done()
     assert [check for severity, check in checks(done)] == [
         *("notice", "bus", "agent", "session", "reservation", "status", "application"),
@@ -318,10 +316,7 @@ def test_serve_schema_is_that_of_fleet_files() -> None:
     [
         ("cameras:\n  line1/cam3: {ulr: 'bvs://a'}\n", ["line 2", "cameras.line1/cam3.ulr"]),
         ("cameras:\n  Line1: {url: 'bvs://a'}\n", ["line 2", "'Line1'"]),
-        (
-            "fleet: plant\ncameras:\n  a: {}\n",
-            ["line 3", "url, emulated, software"],
-        ),
+        ("fleet: plant\ncameras:\n  a: {}\n", ["line 3", "url, emulated, software"]),
         ("cameras: [\n", ["line "]),
     ],
 )

@@ -19,19 +19,12 @@ import pytest
 
 from smartcam._cli.frame_measure import measure
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames import (
-    FoundSource,
-    Frame,
-    FrameSink,
-    Moment,
-    StreamFormat,
-    find_format,
-)
+from smartcam.frames import FoundSource, Frame, FrameSink, Moment, StreamFormat, find_format
 from smartcam.frames import open as open_frames
-from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.registry import FRAMES
 from tests.cli.commandline import run
 from tests.frames.drivers import ShowingDriver
+from tests.frames.pictures import stripes, write_stamp
 from tests.processes import PATIENCE, Process
 
 codecs = pytest.importorskip("imagecodecs", reason="needs the extra frames")

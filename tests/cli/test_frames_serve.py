@@ -22,7 +22,6 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames import FrameAddress, FrameSource, StreamFormat, find_format
 from smartcam.registry import FRAMES
 from smartcam.web import FramesSite
-from smartcam.web._pictures import PROTOCOL
 from tests.cli.commandline import run
 from tests.frames.drivers import ScriptedDriver, scripted
 from tests.processes import PATIENCE, Process
@@ -265,13 +264,13 @@ async def test_terminal_is_told_who_looks_once_a_second_at_most(
         telling = asyncio.create_task(frames_serve._tell_viewers(site, None))
         url = f"{site.api}/api/sources/1/pictures"
         for _ in range(3):  # who comes and goes within a second is not told
-            async with session.ws_connect(url, protocols=[PROTOCOL]):
+            async with session.ws_connect(url, protocols=["smartcam.frames"]):
                 pass
         await asyncio.sleep(1.5)
         assert capsys.readouterr().err == ""
         async with (
-            session.ws_connect(url, protocols=[PROTOCOL]),
-            session.ws_connect(url, protocols=[PROTOCOL]),
+            session.ws_connect(url, protocols=["smartcam.frames"]),
+            session.ws_connect(url, protocols=["smartcam.frames"]),
         ):
             await asyncio.sleep(5)
             (line,) = capsys.readouterr().err.splitlines()

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.recording import _recorder as recorder
 from smartcam.recording import load_recording
-from smartcam.recording._folders import writer as folder_writer
 from tests.cli.commandline import emulators, run
 from tests.fleet.fleetkit import NumberedCamera
 from tests.processes import Process, wait_until
-from tests.recording.folderkit import files, recording, runs
+from tests.recording.folderkit import files, recording, runs, write_often
 from tests.recording.folderkit import until as until_true
 
 FLEET = """\
@@ -86,8 +84,7 @@ def _until_written(folder: Path, count: int, file: int) -> None:
 @pytest.fixture
 async def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give a folder with four files or more of a camera that runs free."""
-    monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
-    monkeypatch.setattr(recorder, "CHUNK", 1000)  # many to a file, however slow the machine is
+    write_often(monkeypatch)
     async with NumberedCamera(rate=400) as box, recording(tmp_path, box.url, size=6000):
         await until_true(lambda: len(files(tmp_path)) >= 5)
     return tmp_path / "rec"
@@ -112,11 +109,7 @@ def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None
     kept = runs(load_recording(paths[1]))
     assert len(kept) < len(whole[1])
     assert kept or len(whole[1]) < 10  # of a few, none may stand before the damage
-    assert runs(found) == [
-        *whole[0],
-        *kept,
-        *itertools.chain(*whole[3:]),
-    ]
+    assert runs(found) == [*whole[0], *kept, *itertools.chain(*whole[3:])]
     with Process("smartcam", "replay", str(folder), "--loop") as played:
         url = played.read_until(b"\n").split()[0]
         rest = [*whole[0], *kept, *itertools.chain(*whole[3:])]

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from smartcam import Result
-from smartcam._client.correlation import NUMBER_STEP
 from smartcam.models import Localization
 from tests.cli.commandline import (
     ACTIVE_21,
@@ -132,7 +131,7 @@ def test_trigger_count_prints_as_many_results(url: str) -> None:
     assert [result["number"] for result in results] == [1, 2, 3, 4, 5]
     first = results[0]["sequence"]
     steps = [(first - result["sequence"]) % (1 << 31) for result in results]
-    assert steps == [i * NUMBER_STEP for i in range(5)]
+    assert steps == [i * 1000 for i in range(5)]
 
 
 @pytest.mark.parametrize(("command", "application"), [("trigger", "2"), ("watch", "5")])

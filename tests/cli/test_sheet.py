@@ -16,7 +16,7 @@ from smartcam.calibration import (
     make_sheet,
     target_from_data,
 )
-from smartcam.calibration._printing.sheets import Rays
+from smartcam.calibration._inside import on_paper
 from tests.cli.commandline import run
 
 BOARD = ("sheet", "checkerboard", "--columns", "9", "--rows", "6", "--square", "25")
@@ -102,8 +102,10 @@ def test_sheet_of_each_kind_takes_its_options(
 
 def test_sheet_of_rays_is_described_too(tmp_path: Path) -> None:
     run("sheet", "rays", "--page", "200x300", "-o", "r.pdf", "--describe", "r.json").done()
-    assert (tmp_path / "r.pdf").read_bytes() == make_sheet(Rays(), page="200x300").pdf()
-    assert (tmp_path / "r.json").read_text() == '{"kind": "rays", "diameter": 0.02}\n'
+    text = '{"kind": "rays", "diameter": 0.02}\n'
+    assert (tmp_path / "r.json").read_text() == text
+    same = make_sheet(on_paper(json.loads(text)), page="200x300")
+    assert (tmp_path / "r.pdf").read_bytes() == same.pdf()
 
 
 def test_sheet_that_does_not_fit_says_by_how_much_and_writes_nothing(tmp_path: Path) -> None:

@@ -9,8 +9,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, TypeVar
 
+import pytest
+
 import smartcam
 from smartcam import Backoff, Camera, ConnectionLostError
+from smartcam._client import polling
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.models import Statistics
 from smartcam.observers import Observer, TraceEntry
@@ -29,6 +32,11 @@ BoxT = TypeVar("BoxT", HandmadeCamera, HandmadeBid, EmulatedCamera)
 
 SHORT = 0.05
 """Seconds of a timeout that is meant to fire."""
+
+
+def ask_again_after(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Have a client repeat a question that has no answer after so long."""
+    monkeypatch.setattr(polling, "REPEAT_AFTER", seconds)
 
 
 def hear(camera: Camera, data: bytes) -> None:

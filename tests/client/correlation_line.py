@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from smartcam import Status
-from smartcam._client.correlation import (
+from smartcam._client.correlation import SentTrigger
+from tests.client.inside import (
     Correlation,
     Debt,
     EvidenceByAnswer,
     EvidenceByFence,
     EvidenceByStatus,
     Match,
-    SentTrigger,
     TriggerEvidence,
 )
 

@@ -29,9 +29,9 @@ from smartcam.calibration import MovingCamera, PlaneCalibration, Transform, chai
 from smartcam.emulator import EmulatedCamera, TablePose, TableScene
 from smartcam.emulator._inside import PIECES
 from smartcam.interpreters import Context, Reader
-from smartcam.interpreters._basic import RecordInterpreter
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.models import Calibration
+from smartcam.registry import INTERPRETERS
 from tests.client.clientkit import balance, by_hand, emulated, steps
 
 CORNERS = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2]])
@@ -336,7 +336,9 @@ def test_calibration_with_values_that_never_are_localizations_is_refused(spec: A
 
 
 async def test_calibration_takes_an_interpreter_made_from_a_built_in_one() -> None:
-    class Parts(RecordInterpreter):
+    record: Any = INTERPRETERS.load("record")
+
+    class Parts(record):  # type: ignore[misc]
         def interpret(self, reader: Reader) -> object:
             return LocalizationsInterpreter().read(reader.data, reader.context)
 

@@ -12,18 +12,16 @@ from hypothesis import strategies as st
 import smartcam
 from smartcam import Status
 from smartcam._client._inside import Interpretation
-from smartcam._client.correlation import (
-    FEWEST_NUMBERS,
-    MAX_OWED,
-    NUMBER_STEP,
-    Correlation,
-    Debt,
-    Match,
-)
-from smartcam._client.interpretation import MAX_NUMBER
 from smartcam.protocols.messages import ResultContainer
 from tests.client.correlation_line import READY, WORKING, Line, after_one, ready
+from tests.client.inside import Correlation, Debt, Match
 from tests.insides import inside
+
+FEWEST_NUMBERS = 64
+MAX_NUMBER = 2_147_483_647
+MAX_OWED = 1 << 10
+NUMBER_STEP = 1000
+
 
 OURS = Match("triggered")
 LATE = Match("late")

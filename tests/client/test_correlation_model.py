@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from smartcam import Status
-from smartcam._client.correlation import MAX_OWED
-from smartcam._client.interpretation import MAX_NUMBER
 from tests.client.correlation_line import READY, WORKING, Line
+
+MAX_NUMBER = 2_147_483_647
+MAX_OWED = 1 << 10
+
 
 STOPPED = Status(0)
 SENSOR = 0

@@ -11,9 +11,7 @@ from typing import Any
 
 import pytest
 
-from smartcam._client import handshake
 from smartcam._client._inside import Session, Try
-from smartcam._client.handshake import establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -22,13 +20,13 @@ from smartcam.exceptions import (
     RemoteProtocolError,
 )
 from smartcam.models import Status
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame
 from smartcam.protocols import BVS, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
+from tests.client.inside import establish, handshake
 from tests.handmade import (
     BUSY,
     CONNECT,
@@ -52,6 +50,7 @@ from tests.handmade import (
     scripted,
     until,
 )
+from tests.machines import THESIS
 
 RUNNING = m.StatusReport(status=Status(0x280))
 ANSWERS = [m.ConnectAnswer(version=1), RUNNING, m.QueryAnswer(application=21)]
@@ -199,10 +198,11 @@ async def test_establish_newer_version_is_a_warning(caplog: pytest.LogCaptureFix
 
 
 async def test_establish_hands_the_trace_every_frame() -> None:
-    entries: list[TraceEntry] = []
+    frames: list[RawFrame] = []
     async with scripted(good) as listener:
-        session = await establish(settings(listener.port), entries.append)
+        session = await establish(settings(listener.port), frames.append)
         await session.link.close(LIMIT)
+    entries = [one.entry() for one in frames]
     assert [(entry.direction, entry.message) for entry in entries] == [
         (">", "Disconnect"),
         (">", "Connect"),

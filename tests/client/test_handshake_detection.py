@@ -12,15 +12,17 @@ from typing import Any
 
 import pytest
 
-from smartcam._client import handshake
 from smartcam._client._inside import Session
-from smartcam._client.handshake import DETECTION_TIMEOUT, establish
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectFailedError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings
+from tests.client.inside import establish, handshake
 from tests.handmade import CONNECT_ANSWER, HOST, LIMIT, Peer, datagrams, scripted, until
+
+DETECTION_TIMEOUT = 0.5
+
 
 IDLE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 

@@ -17,8 +17,6 @@ import pytest
 
 import smartcam
 from smartcam import Camera, ConnectionLostError, FrameError, ResponseTimeoutError, Result
-from smartcam._client.link import Link
-from smartcam.protocols._framed import frame_age
 from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import Rule, SplitBytes
 from tests.client.camera_by_hand import (
@@ -33,7 +31,9 @@ from tests.client.camera_by_hand import (
     words,
 )
 from tests.client.clientkit import FAST, SHORT, SOON, balance, bid_by_hand, by_hand, gone, steps
+from tests.client.inside import Link
 from tests.handmade import until
+from tests.protocols.frame_times import give_frames
 
 HEADER = 12
 """Bytes of a frame's header."""
@@ -255,7 +255,7 @@ async def test_false_length_of_a_status_ends_the_link_at_its_header(dialect: str
 async def test_false_length_of_a_result_ends_the_link_when_others_come(
     dialect: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frame_age, "HINT_TIME", 0.0)
+    give_frames(monkeypatch, HINT_TIME=0.0)
     async with by_hand(box={"dialect": dialect}, reconnect=FAST) as (box, camera):
         results = camera.results()
         losing = asyncio.create_task(lost(camera))
@@ -273,8 +273,7 @@ async def test_false_length_of_a_result_ends_the_link_when_others_come(
 async def test_frame_that_trickles_ends_the_link(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in {"HINT_TIME": 0.0, "FRAME_TIME": 0.0, "FRAME_RATE": float("inf")}.items():
-        monkeypatch.setattr(frame_age, name, value)
+    give_frames(monkeypatch, HINT_TIME=0.0, FRAME_TIME=0.0, FRAME_RATE=float("inf"))
     box_of: Any = {"dialect": kind} if kind != "bid" else {}
     opening: Any = by_hand if kind != "bid" else bid_by_hand
     async with opening(box=box_of, reconnect=FAST) as (box, camera):

@@ -10,13 +10,14 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 
 from smartcam._client import link as connection
-from smartcam._client.link import Chunk, Link, open_link
+from smartcam._client.link import open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
-from smartcam.observers import TraceEntry
+from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
+from tests.client.inside import Chunk, Link
 from tests.handmade import (
     BUSY,
     CONNECT,
@@ -52,7 +53,7 @@ async def server() -> AsyncIterator[Listener]:
 async def open_to(
     port: int,
     transport: Transport = Transport.TCP,
-    trace: Callable[[TraceEntry], None] | None = None,
+    trace: Callable[[RawFrame], None] | None = None,
 ) -> Link:
     return await open_link(
         BVS, [HANDBOOK], transport, HOST, port, name="cell 1", max_length=1 << 20, trace=trace
@@ -60,7 +61,7 @@ async def open_to(
 
 
 async def session(
-    server: Listener, trace: Callable[[TraceEntry], None] | None = None
+    server: Listener, trace: Callable[[RawFrame], None] | None = None
 ) -> tuple[Link, Peer]:
     """Return a link with a session, and its other end."""
     link = await open_to(server.port, trace=trace)
@@ -478,9 +479,16 @@ async def test_drain_ends_with_the_link(server: Listener) -> None:
 # ---------------------------------------------------------------------- trace
 
 
+class Entries(list[TraceEntry]):
+    """Frames of a trace, decoded."""
+
+    def take(self, frame: RawFrame) -> None:
+        self.append(frame.entry())
+
+
 async def test_trace_has_frames_of_both_directions_and_broken_bytes(server: Listener) -> None:
-    entries: list[TraceEntry] = []
-    link, peer = await session(server, entries.append)
+    entries = Entries()
+    link, peer = await session(server, entries.take)
     link.send(m.Query())
     peer.write(QUERY_ANSWER + RESULT + bytes.fromhex("50535642 01000000 77000000 ff") + b"noise")
     assert len(await take(link, 4)) == 4
@@ -505,11 +513,11 @@ async def test_trace_has_frames_of_both_directions_and_broken_bytes(server: List
 
 async def test_trace_of_kin_is_in_the_words_of_the_one_that_answers(server: Listener) -> None:
     """An answer to Connect that has a code is not shown as a version."""
-    entries: list[TraceEntry] = []
+    entries = Entries()
     kin = BVS.tries(Transport.TCP)[0]
     assert [one.label for one in kin] == ["b16", "bid", "b16 with quirk code"]
     link = await open_link(
-        BVS, kin, Transport.TCP, HOST, server.port, name="c", max_length=99, trace=entries.append
+        BVS, kin, Transport.TCP, HOST, server.port, name="c", max_length=99, trace=entries.take
     )
     peer = await server.accept()
     link.send(m.Connect())
@@ -525,8 +533,8 @@ async def test_trace_of_kin_is_in_the_words_of_the_one_that_answers(server: List
 
 
 async def test_trace_body_that_does_not_fit_has_no_fields(server: Listener) -> None:
-    entries: list[TraceEntry] = []
-    link, peer = await session(server, entries.append)
+    entries = Entries()
+    link, peer = await session(server, entries.take)
     peer.write(bytes.fromhex("50535642 02000000 12000000 8002"))
     (failed,) = await take(link, 1)
     assert isinstance(failed, LinkFailed)
@@ -640,8 +648,8 @@ async def test_udp_queue_full_drops_and_counts(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("how", ["the camera closes", "the client gives up"])
 async def test_trace_shows_what_is_left_of_an_unfinished_frame(server: Listener, how: str) -> None:
-    entries: list[TraceEntry] = []
-    link, peer = await session(server, entries.append)
+    entries = Entries()
+    link, peer = await session(server, entries.take)
     peer.write(STATUS[:15])
     await until(lambda: len(link.machine.pending) == 15)
     if how == "the camera closes":

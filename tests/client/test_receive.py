@@ -10,12 +10,13 @@ import pytest
 
 import smartcam
 from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
-from smartcam._client import handshake, link
+from smartcam._client import link
 from smartcam._client.doorbell import Doorbell
 from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
 from tests.client.clientkit import balance, by_hand
+from tests.client.inside import handshake
 from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted, until
 
 # ---------------------------------------------------------------------- what comes early
@@ -31,7 +32,7 @@ from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer,
 async def test_camera_that_floods_while_a_session_is_made_ends_the_attempt(
     begins: bytes, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(handshake, "MAX_EARLY", 100_000)
+    monkeypatch.setattr(handshake, "MAX_EARLY_BYTES", 100_000)
     written: list[int] = []
 
     async def talk(peer: Peer, number: int) -> None:

@@ -25,7 +25,6 @@ from smartcam import (
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
-from smartcam._client.link import Chunk
 from smartcam.interpreters import Interpreter, Reader
 from smartcam.models import SubscriberStatistics
 from smartcam.protocols import messages as m
@@ -40,6 +39,7 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
 )
 from tests.client.clientkit import FENCED, SHORT, balance, by_hand, cancelled, emulated, steps
+from tests.client.inside import Chunk
 from tests.handmade import until
 from tests.insides import inside
 

@@ -29,7 +29,6 @@ from smartcam import (
     TriggerTimeoutError,
     WrongApplicationError,
 )
-from smartcam._client.link import Chunk
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
     BUSY,
@@ -61,6 +60,7 @@ from tests.client.clientkit import (
     quiet,
     steps,
 )
+from tests.client.inside import Chunk
 from tests.handmade import until
 from tests.insides import inside
 from tests.timed_loop import spend

@@ -12,9 +12,9 @@ import pytest
 import smartcam
 from smartcam import Camera, ConnectionClosedError, ConnectionLostError, InterpretationError, Status
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator._application import LOCALIZATIONS
 from smartcam.interpreters import Context, PlainInterpreter
 from tests.client.clientkit import SOON, balance, cancelled, gone
+from tests.emulator.builtins import LOCALIZATIONS
 from tests.handmade import until
 from tests.insides import inside
 

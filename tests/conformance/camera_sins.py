@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from smartcam.emulator import _client_link as client_link
+from smartcam.emulator._inside import ClientLink
 from smartcam.models import Status
 from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
@@ -127,7 +127,7 @@ def takes(change: Callable[[Emulator, Any, bytes], bytes]) -> Callable[[Emulator
     return do
 
 
-_take = client_link.ClientLink._take
+_take = ClientLink._take
 
 
 def open_to_bytes(self: Any, data: bytes) -> None:

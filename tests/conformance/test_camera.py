@@ -18,7 +18,7 @@ from smartcam.conformance.camera._judging import judge_item
 from smartcam.conformance.camera._results import Check, CheckOutcome
 from smartcam.conformance.camera._session_under_test import CameraUnderTest
 from smartcam.emulator import Quirks, Scenario
-from smartcam.emulator import _client_link as client_link
+from smartcam.emulator._inside import ClientLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -101,7 +101,7 @@ def judged() -> Iterator[Judged]:
         ),
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(client_link.ClientLink, "_take", camera_sins.open_to_bytes)
+        patch.setattr(ClientLink, "_take", camera_sins.open_to_bytes)
         yield Judged(cases)
 
 
@@ -270,8 +270,8 @@ UNDESCRIBED = [
 def test_judge_answer_that_no_setting_describes_is_told(
     name: str, sin: Any, dialect: str, came: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(client_link.ClientLink, "_take", camera_sins.open_to_bytes)
-    monkeypatch.setattr(client_link.ClientLink, "dismiss", lambda *_: None)
+    monkeypatch.setattr(ClientLink, "_take", camera_sins.open_to_bytes)
+    monkeypatch.setattr(ClientLink, "dismiss", lambda *_: None)
     (report,) = judge_all([Case({"dialect": dialect}, (name,), sin, IMPATIENT)])
     finding = report[name]
     assert finding.outcome is CheckOutcome.UNDESCRIBED

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 import smartcam
-from smartcam._client import polling
 from smartcam.conformance._dialects import EVERY_DIALECT
 from smartcam.conformance.client import CHECKS, SCENES, CommandClient, FunctionClient, Task, perform
 from smartcam.conformance.client._checks import Grade
 from smartcam.conformance.client._report import ClientFinding, judge
 from smartcam.conformance.client._runs import ClientRun
 from smartcam.conformance.client._tasks import Client
+from tests.client.clientkit import ask_again_after
 from tests.conformance.pace import at_any_pace, is_first, slowed
 from tests.conformance.plain_client import plain_client
 
@@ -73,7 +73,7 @@ KINDS = [*itertools.product(EVERY_DIALECT, ("tcp", "udp"))]
 
 @at_any_pace
 async def test_checks_of_our_own_client_find_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(polling, "REPEAT_AFTER", slowed(0.5))  # it asks again what seems lost
+    ask_again_after(monkeypatch, slowed(0.5))  # what seems lost
     room, client = asyncio.Semaphore(AT_ONCE), FunctionClient(ours)
     found = await asyncio.gather(*(findings(client, *kind, room=room) for kind in KINDS))
     assert dict(zip(KINDS, found, strict=True)) == {kind: [] for kind in KINDS}

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from smartcam.depth import SpatialFilter, TemporalFilter, fill_holes
 from smartcam.depth._cleaning import _widened, as_metres
-from smartcam.depth._inside import TowerTable, WoodenBlock
-from smartcam.depth._simulation import FINE, _jumps, _TableRays
+from smartcam.depth._inside import FOCAL, TowerTable, WoodenBlock
+from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA, FINE, _jumps, _TableRays
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 NEAR, FAR, SIGMA = 0.45, 0.50, 0.002
@@ -170,8 +170,7 @@ def test_pixels_that_share_their_noise_are_told(iterations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"alpha": 0}, {"alpha": 1.1}, {"alpha": math.nan}, {"delta": 0}, {"delta": math.inf}],
+    "wrong", [{"alpha": 0}, {"alpha": 1.1}, {"alpha": math.nan}, {"delta": 0}, {"delta": math.inf}]
 )
 def test_average_that_is_none_is_told(wrong: dict[str, float]) -> None:
     for kind in (SpatialFilter, TemporalFilter):
@@ -387,3 +386,20 @@ def test_wrong_way_of_filling_is_told() -> None:
     for reach in (0, 17):
         with pytest.raises(ConfigurationError, match="reach: expected 1 to 16"):
             fill_holes(step(), reach=reach)
+
+
+def test_simulated_depth_has_the_noise_and_holes_that_it_says() -> None:
+    table = TowerTable(4)
+    table.blocks.append(WoodenBlock(0.4, 0.0, math.pi / 2, size=(0.2, 0.1, 0.06)))
+    (depth,) = table.look((0.4, 0.0, 0.6)).depth
+    for region, true in ((np.s_[10:60, 10:630], 0.6), (np.s_[200:280, 250:390], 0.54)):
+        there = depth[region][depth[region] > 0] * 1e-3
+        sigma = math.hypot(true**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA, 1e-3 / math.sqrt(12))
+        assert there.mean() == pytest.approx(true, abs=1e-3)  # the camera is not quite there
+        assert there.std() == pytest.approx(sigma, rel=0.05)
+        assert 0.003 < (depth[region] == 0).mean() < 0.02
+    # the second camera does not see what the block hides: to its left
+    shadow = FOCAL * BASELINE * (1 / 0.54 - 1 / 0.6)
+    empty = (depth[200:280] == 0).mean(axis=0)
+    assert np.count_nonzero(empty > 0.9) == pytest.approx(shadow, abs=1.5)
+    assert np.flatnonzero(empty > 0.9).max() < 320

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import CameraModel, StereoCalibration, Transform, calibrate_stereo
 from smartcam.calibration._inside import rectify
-from smartcam.calibration._stereo.rectification import _parallel
 from smartcam.calibration.formats import CameraChain, write_camera_info
 from smartcam.depth import StereoDepth, StereoMatcher, read_camera_infos
 from smartcam.depth._pair import CalibratedPair, _spread, scaled
@@ -51,11 +50,7 @@ def lens(size: tuple[int, int], focal: float) -> CameraModel:
 TURN = np.array(cv2.Rodrigues(np.array([0.02, -0.03, 0.015]))[0], dtype=np.float64)
 RIGHT_LEFT = Transform("right", "left", TURN, np.array([-0.12, 0.003, 0.002]))
 LEFT, RIGHT = lens(SIZE, 210.0), lens(SIZE, 215.0)
-CHAIN = CameraChain(
-    cameras=(LEFT, RIGHT),
-    transforms=(RIGHT_LEFT,),
-    names=("left", "right"),
-)
+CHAIN = CameraChain(cameras=(LEFT, RIGHT), transforms=(RIGHT_LEFT,), names=("left", "right"))
 ROOM = Room((1.6, 0.2, 0.1), 0.9, detail=0.04)
 
 
@@ -327,7 +322,8 @@ def test_the_sigma_of_the_calibration_is_in_that_of_the_depth() -> None:
             exp_rotation(off[:3]) @ RIGHT_LEFT.rotation,
             RIGHT_LEFT.translation + off[3:],
         )
-        turns, projections, _ = _parallel(left, right, wrong, 0.0, SIZE)
+        flattened = rectify(left, right, wrong, size=SIZE)
+        turns, projections = flattened.rotations, flattened.projections
         columns = []
         for side, camera in enumerate((left, right)):
             flat = np.column_stack([camera.directions(seen[side]), np.ones(4)])
@@ -392,10 +388,7 @@ def test_sizes_lenses_and_maps_go_together() -> None:
 
 @pytest.mark.parametrize(
     ("translation", "said"),
-    [
-        ([0.12, 0, 0], "right of the right one"),
-        ([0, -0.12, 0], "above or below it"),
-    ],
+    [([0.12, 0, 0], "right of the right one"), ([0, -0.12, 0], "above or below it")],
 )
 def test_cameras_that_are_not_side_by_side_are_refused(translation: list[float], said: str) -> None:
     other = Transform("right", "left", np.eye(3), np.array(translation))

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from smartcam._extras import load
 from smartcam.depth import Disparity, StereoMatcher
-from smartcam.depth._subpixel import MIN_COARSE_SIGMA_PX
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from tests.depth.scenes import Scene, plane, step
+
+MIN_COARSE_SIGMA_PX = 0.5
+
 
 ALOE = Path("/usr/share/doc/opencv-doc/examples/data")
 """Place of the pair in Debian's package opencv-doc."""

@@ -5,10 +5,14 @@ from __future__ import annotations
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
-from smartcam.doctor import Finding, examine
+from smartcam.doctor import Finding, _state_checks, examine
+from tests.processes import PATIENCE
 
 if TYPE_CHECKING:
-    from smartcam.doctor._findings import Exit, Severity
+    import pytest
+
+    from smartcam.doctor._findings import Severity
+    from tests.doctor.inside import Exit
 
 STEP = 1.0
 """Seconds of a step that is not meant to run out."""
@@ -18,6 +22,12 @@ SHORT = 0.2
 
 WATCH = 0.05
 """Seconds that a camera is watched."""
+
+
+def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have as much asked on a slow machine, and nothing said of that."""
+    monkeypatch.setattr(_state_checks, "QUERIES_WITHIN", PATIENCE)
+    monkeypatch.setattr(_state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE)
 
 
 async def examined(url: str, **options: Any) -> list[Finding]:

@@ -13,7 +13,6 @@ import smartcam
 from smartcam import doctor
 from smartcam.doctor import Finding, examine
 from smartcam.doctor._context import Examination
-from smartcam.doctor._findings import Exit
 from smartcam.doctor._inside import summary
 from smartcam.doctor._timing import Figures, figures
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, faults
@@ -22,6 +21,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from tests.doctor.doctorkit import WATCH, errors, examined, of, severities
+from tests.doctor.inside import Exit
 from tests.handmade import until
 
 QUICK = [

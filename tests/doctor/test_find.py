@@ -13,18 +13,11 @@ import smartcam
 from smartcam import Backoff, ConfigurationError
 from smartcam.doctor import FoundPort, _search
 from smartcam.doctor._inside import CameraSearch
-from smartcam.doctor._opening import MAX_SAID, Opened, is_own
+from smartcam.doctor._opening import MAX_SAID_BYTES, Opened, is_own
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Protocol, Transport
 from smartcam.registry import PROTOCOLS
-from tests.doctor.findkit import (
-    NETWORK,
-    RefusesAtOnce,
-    TakenAtOnce,
-    filtered,
-    free_port,
-    listening,
-)
+from tests.doctor.findkit import NETWORK, RefusesAtOnce, TakenAtOnce, filtered, free_port, listening
 from tests.handmade import until
 
 if TYPE_CHECKING:
@@ -104,7 +97,7 @@ async def test_clients_at_work_notice_nothing() -> None:
             "7": ((), "other"),
         }
         assert [one.urls for one in found[2:3]] == [(f"insight://{NETWORK}3:{port}",)]
-        assert len(found[-1].said) == MAX_SAID
+        assert len(found[-1].said) == MAX_SAID_BYTES
         for (client, results, one), had, session in zip(works, before, sessions, strict=True):
             assert len(results) > had > 0, "it has worked before and meanwhile"
             assert results == list(range(1, len(results) + 1)), "each trigger has had its result"

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from smartcam._client.link import MAX_REST
 from smartcam.doctor._inside import Trial, trials
 from smartcam.doctor._probing import MAX_FRAMES, ways
 from smartcam.emulator import EmulatedCamera
@@ -221,7 +220,7 @@ async def test_bytes_without_end_are_bounded() -> None:
         found = await tried(f"bvs://{HOST}:{listener.port}?dialect=b16")
     ((text, data),) = broken(found[0])
     assert text.startswith("60004 bytes that make no whole frame")
-    assert len(bytes.fromhex(data)) == MAX_REST
+    assert len(bytes.fromhex(data)) == 256
 
 
 async def test_frames_of_a_flood_are_bounded_and_counted() -> None:

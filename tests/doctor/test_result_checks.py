@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from smartcam.doctor import Finding
-from smartcam.doctor._findings import Exit
 from smartcam.doctor._result_checks import MAX_ROWS, PLAUSIBLE, DumpRow, aligned
 from smartcam.emulator import Application, EmulatedCamera, faults
 from smartcam.layout import Layout
 from tests import ROOT
 from tests.doctor.doctorkit import errors, examined, of, severities
+from tests.doctor.inside import Exit
 
 
 async def read(layout: str, values: Any, interpret_as: str | None, **more: Any) -> list[Finding]:

@@ -11,12 +11,12 @@ import pytest
 
 import smartcam
 from smartcam.doctor import examine
-from smartcam.doctor._findings import Exit
 from smartcam.emulator import EmulatedCamera, faults
 from smartcam.emulator._inside import BaseFault
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import _rules as rules
+from smartcam.testing import proxy as rules
 from tests.doctor.doctorkit import SHORT, errors, examined, of, severities
+from tests.doctor.inside import Exit
 from tests.handmade import (
     CONNECT_ANSWER,
     HOST,

@@ -10,8 +10,8 @@ from smartcam.emulator import ManualClock, faults
 from smartcam.emulator._inside import DelayLine, Ending, Transmission
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
 from smartcam.protocols import Frame
-from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._inside import HANDBOOK, Framer
+from tests.machines import THESIS
 
 
 class Line:

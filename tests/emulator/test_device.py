@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator._bvs.device import Mode
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -93,7 +92,7 @@ REQUESTS: list[m.Message] = [
 def test_requests_before_connect_are_ignored(message: m.Message) -> None:
     device = make(connected=False)
     assert say(device, message) == []
-    assert device.mode is Mode.STOPPED
+    assert device.mode.value == "stopped"
     assert device.next_number == 0
     assert device.clock_time.year == 1970
     assert device.next_event_in() is None
@@ -310,7 +309,7 @@ def test_device_free_running_from_the_beginning_runs_at_once() -> None:
 def test_switch_says_busy_then_status_then_answer() -> None:
     device = make()
     assert say(device, switch(4)) == ["[busy]"]
-    assert device.mode is Mode.SWITCHING
+    assert device.mode.value == "switching"
     device.tick(0.099)
     assert heard(device) == []
     device.tick(0.001)
@@ -350,7 +349,7 @@ def test_switch_quirk_allow_while_running_stops_it(active: int) -> None:
     assert say(device, switch(4)) == ["[busy]"]
     device.tick(1.0)
     assert heard(device) == ["[]", "switched 0 4"]
-    assert device.mode is Mode.STOPPED
+    assert device.mode.value == "stopped"
 
 
 def test_switch_goes_on_without_the_client() -> None:
@@ -508,7 +507,7 @@ def test_reboot_ends_the_session_and_comes_up_clean() -> None:
     device.tick(29.0)
     assert device.rebooting
     device.tick(1.0)
-    assert device.mode is Mode.STOPPED
+    assert device.mode.value == "stopped"
     assert device.status == Status.OVERHEAT
     assert device.next_number == 0
     assert say(device, m.Connect(), m.Query()) == ["hello 1", "[hot]", "active 9"]

@@ -6,11 +6,10 @@ import re
 from typing import TYPE_CHECKING
 
 from smartcam.emulator import load_scenario
-from smartcam.emulator._application import BUILTIN_APPLICATIONS
-from smartcam.emulator._generators import generator_names
-from smartcam.protocols._inside import StatusCode
-from smartcam.protocols._insight.words import COMMANDS, AnswerForm
+from smartcam.protocols._inside import StatusCode, words
 from tests import ROOT
+from tests.emulator.builtins import BUILTIN_APPLICATIONS
+from tests.emulator.inside import generator_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,15 +62,15 @@ def rows(first: str) -> list[list[str]]:
 def test_command_table_has_every_command() -> None:
     shown = [(row[0], row[1], row[3], row[4]) for row in rows("command")]
     assert shown == [
-        (row.mnemonic, row.title, row.form.value, row.mode.value) for row in COMMANDS.values()
+        (row.mnemonic, row.title, row.form.value, row.mode.value) for row in words.COMMANDS.values()
     ]
     grades = {row[0]: row[-1] for row in rows("command")}
-    assert grades == {name: row.source.split(": ")[1] for name, row in COMMANDS.items()}
+    assert grades == {name: row.source.split(": ")[1] for name, row in words.COMMANDS.items()}
 
 
 def test_code_and_form_tables_are_complete() -> None:
     assert [int(row[0]) for row in rows("code")] == [code.value for code in StatusCode]
-    assert [row[0] for row in rows("form")] == [form.value for form in AnswerForm]
+    assert [row[0] for row in rows("form")] == [form.value for form in words.AnswerForm]
 
 
 def test_every_source_that_is_named_is_in_the_list() -> None:

@@ -16,8 +16,8 @@ from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MESSAGES
 from smartcam.protocols._inside import HANDBOOK
+from tests.machines import MESSAGES
 
 EXAMPLES: list[dict[str, Any]] = [
     {"kind": "delay", "seconds": 0.5, "overtaken": True},

@@ -11,6 +11,7 @@ import smartcam.sync
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, Scenario
 from smartcam.emulator._generators import _FOUND
 from smartcam.emulator._inside import check_options, emulated_class, find_generator
+from smartcam.emulator._line_codec import _LineForm
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
 from smartcam.protocols import BVS
 from smartcam.registry import GENERATORS, PROTOCOLS
@@ -128,3 +129,21 @@ def test_generator_that_is_broken_costs_only_its_own_name(
 def test_generator_that_is_unknown_names_the_known_ones() -> None:
     with pytest.raises(ConfigurationError, match="tangram"):
         find_generator("tangrm")
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "fields"),
+    [
+        ("HELLO", "HELLO", {}),
+        ("HELLO", "HELLO!", None),
+        ("C {a} {b}", "C 1 2 3", {"a": "1 2", "b": "3"}),
+        ("C {a} {b} END", "C 1 2 END", {"a": "1", "b": "2"}),
+        ("C {a} {b} END", "C" + " 1" * 2000, None),
+        ("{a}aa{b}aa", "aaa", None),
+        ("{a}{b}", "xy", {"a": "xy", "b": ""}),
+    ],
+)
+def test_line_is_read_as_its_row_writes_it(
+    line: str, text: str, fields: dict[str, str] | None
+) -> None:
+    assert _LineForm.of(line).read(text) == fields

@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator._application import BUILTIN_APPLICATIONS
-from smartcam.emulator._client_link import MAX_INPUT
-from smartcam.emulator._links import TcpListener, _TcpLink
+from smartcam.emulator._client_link import MAX_INPUT_BYTES
+from smartcam.emulator._links import TcpListener
 from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
@@ -22,11 +21,13 @@ from smartcam.models import Status
 from smartcam.protocols import Frame, Machine, Role
 from smartcam.protocols import Transport as CarriedBy
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MESSAGES, THESIS
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
+from tests.emulator.builtins import BUILTIN_APPLICATIONS
 from tests.emulator.camera_wire import RawClient, UdpClient
+from tests.emulator.inside import _TcpLink
 from tests.handmade import until
+from tests.machines import MESSAGES, THESIS
 
 if TYPE_CHECKING:
     from smartcam.emulator._client_link import Trace
@@ -218,7 +219,7 @@ class Owner:
         return nullcontext()
 
     def make_machine(self, transport: CarriedBy, trace: Trace) -> Machine:
-        return Machine(HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT, trace=trace)
+        return Machine(HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT_BYTES, trace=trace)
 
     def arrived(self, link: ClientLink) -> None:
         pass
@@ -289,7 +290,7 @@ def test_link_any_bytes_in_any_chunks_give_the_same_messages(
         deliver(cut, rest)
     assert one.messages == other.messages
     assert one.messages[0] == m.Connect()
-    assert whole.machine.buffered == cut.machine.buffered < MAX_INPUT
+    assert whole.machine.buffered == cut.machine.buffered < MAX_INPUT_BYTES
 
 
 def test_link_every_split_point_of_a_conversation() -> None:

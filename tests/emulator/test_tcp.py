@@ -12,12 +12,14 @@ from typing import Any, cast
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator._client_link import MAX_INPUT
-from smartcam.emulator._links import FIRST_READ_BYTES, MAX_READ_BYTES
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
 from tests.handmade import until
+
+FIRST_READ_BYTES = 1 << 10
+MAX_INPUT = 64 << 10
+MAX_READ_BYTES = 64 << 10
 
 
 @pytest.fixture

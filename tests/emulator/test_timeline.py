@@ -486,3 +486,27 @@ async def test_real_clock_is_the_loops() -> None:
     clock.call_at(clock.now, called.set)
     async with asyncio.timeout(5):
         await called.wait()
+
+
+class _Count:
+    """A value that counts how often it is compared."""
+
+    compared = 0
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __hash__(self) -> int:
+        return hash(self.number)
+
+    def __eq__(self, other: object) -> bool:
+        _Count.compared += 1
+        return bool(isinstance(other, _Count) and self.number == other.number)
+
+
+def test_scenario_ids_are_compared_once_each() -> None:
+    from smartcam.emulator._scenario.scenario import _first_double
+
+    _Count.compared = 0
+    assert _first_double(_Count(number) for number in range(5000)) is None
+    assert _Count.compared < 5000

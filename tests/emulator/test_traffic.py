@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 
 from smartcam.emulator import EmulatedCamera, LogEntry
-from smartcam.emulator._client_link import MAX_INPUT
+from smartcam.emulator._client_link import MAX_INPUT_BYTES
 from smartcam.emulator._traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, TrafficLog
 from smartcam.exceptions import FrameError, ResponseTimeoutError
 from smartcam.protocols import Frame
@@ -128,7 +128,7 @@ def test_log_holds_no_more_memory_than_it_says(reads: bool) -> None:
     try:
         traffic = TrafficLog(HANDBOOK)
         for number in range(500):
-            frame = Frame(0x20, number.to_bytes(4, "little") + bytes(MAX_INPUT - 4))
+            frame = Frame(0x20, number.to_bytes(4, "little") + bytes(MAX_INPUT_BYTES - 4))
             traffic.add(0.0, PEER, m.Sender.CAMERA, frame)
             if reads and not number % 50:
                 list(traffic.entries)
@@ -144,16 +144,16 @@ def test_log_holds_no_more_memory_than_it_says(reads: bool) -> None:
 
 async def test_log_of_large_frames_is_bounded_on_the_wire() -> None:
     async with EmulatedCamera() as emulator, await TcpClient.open(emulator) as client:
-        large = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x77, 0, 0, 0])
+        large = wire.MAGIC + MAX_INPUT_BYTES.to_bytes(4, "little") + bytes([0x77, 0, 0, 0])
         for _ in range(200):
-            client.send(large + bytes(MAX_INPUT))
+            client.send(large + bytes(MAX_INPUT_BYTES))
         await emulator.wait_received(0x77, count=200)
         log = emulator.log
         entries, count = log.since(0)
         assert log.size <= MAX_BYTES
         assert log.pushed_out == count - len(entries) > 0
         frame, reason = entries[-2:]
-        assert frame.hex == bytes(MAX_INPUT).hex(" ")
+        assert frame.hex == bytes(MAX_INPUT_BYTES).hex(" ")
         assert reason.error is not None
 
 

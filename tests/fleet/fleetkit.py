@@ -8,16 +8,16 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Self
 
 from smartcam import Backoff
+from smartcam._client._inside import TriggerRequest
 from smartcam._zenoh import BusLink
 from smartcam.emulator import Application, EmulatedCamera, Run
-from smartcam.fleet import FleetCamera
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
+from smartcam.fleet import FleetCamera, MemoryBus
+from smartcam.fleet._agent.shared import Carrier
 from smartcam.fleet._frames.camera_frames import FramesOf
 from smartcam.fleet._inside import Bus, Keys, ZenohEnd
-from smartcam.fleet._program.program import Program
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
+from tests.fleet.inside import Agent, MemoryEnd, Program
 from tests.processes import free_place
 
 FLEET = "plant"
@@ -165,6 +165,11 @@ class Plant:
         """Give so many open cameras, each of a program of its own."""
         async with contextlib.AsyncExitStack() as stack:
             yield [await stack.enter_async_context(self.camera(**options)) for _ in range(count)]
+
+
+def trigger_request() -> TriggerRequest:
+    """Return a program's request that nobody has numbered."""
+    return TriggerRequest(Carrier(), None, 1, True)
 
 
 def end_of(camera: FleetCamera[Any]) -> MemoryEnd:

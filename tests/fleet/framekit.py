@@ -7,12 +7,20 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Any
 
+import pytest
+
 from smartcam.fleet import FleetCamera
+from smartcam.fleet._file.fleet_file import FramesEntry
 from smartcam.fleet._frames.camera_frames import SharedFrames
-from smartcam.frames import FrameSource
+from smartcam.frames import FrameDriver, FrameSource
 from tests.fleet.fleetkit import NAME, Plant, until
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.timed_loop import TimedLoop
+
+
+def give_source(monkeypatch: pytest.MonkeyPatch, driver: FrameDriver) -> None:
+    """Have the sources of a fleet file be a driver's."""
+    monkeypatch.setattr(FramesEntry, "source", lambda *_: FrameSource(driver, stall=None))
 
 
 class FramePlant(Plant):

@@ -7,13 +7,11 @@ from typing import Any
 
 from smartcam import Camera, SmartCamera
 from smartcam._zenoh import BusLink
-from smartcam.fleet import FleetCamera
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetCamera, MemoryBus
 from smartcam.fleet._inside import Bus, Keys, ZenohEnd
-from smartcam.fleet._program.program import Program
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
+from tests.fleet.inside import Agent, Program
 from tests.processes import free_place
 
 FLEET = "plant"

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from random import Random
 
-from smartcam.fleet._bus.bus import Data, MemoryBus, MemoryEnd
+from smartcam.fleet import MemoryBus
+from tests.fleet.inside import Data, MemoryEnd
 
 Fate = Callable[[str, bytes], Sequence[float]]
 """Tells after how many seconds each copy of something said arrives; none: it is lost."""

@@ -19,11 +19,10 @@ from typing import Any
 import smartcam
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._file.standby import Standby
 from smartcam.fleet._inside import Keys, ZenohEnd
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
+from tests.fleet.inside import Agent, Standby
 
 
 class Partner:

@@ -11,8 +11,7 @@ import pytest
 
 import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera
-from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.protocols import messages as m
 from tests.fleet.fleetkit import until
 from tests.processes import free_place
@@ -21,8 +20,8 @@ from tests.timed_loop import TimedLoop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from smartcam.fleet._bus.bus import Publisher
     from smartcam.fleet._inside import Bus
+    from tests.fleet.inside import Publisher
 
 PREFIX = "smartcam/plant"
 NAME = "line1/cam3"

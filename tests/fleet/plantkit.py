@@ -13,6 +13,7 @@ from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
 from smartcam.fleet._inside import ZenohEnd, make_certificates
 from smartcam.fleet._security.access import access_control
+from smartcam.fleet._security.door import Door
 from tests.fleet.fleetkit import PATIENCE
 from tests.processes import free_port
 
@@ -79,3 +80,17 @@ def plant_file(folder: Path, name: str = "line1", **more: Any) -> FleetFile:
 def url_of(port: int, certificates: Path, camera: str = CAMERA, host: str = "localhost") -> str:
     """Return a fleet URL."""
     return f"fleet+tls://{host}:{port}/{camera}?certificates={certificates}"
+
+
+@contextlib.asynccontextmanager
+async def router_end(place: str, certificates: str) -> AsyncIterator[None]:
+    """Be the router at a place, with a door."""
+    end = ZenohEnd(BusLink((place,), (), certificates), {"access_control": access_control()})
+    await end.open(PATIENCE)
+    door = Door(frozenset({int(place.rpartition(":")[2])}), end.linked)
+    door.open()
+    try:
+        yield
+    finally:
+        door.close()
+        await end.close()

@@ -10,8 +10,8 @@ import pytest
 import smartcam.fleet
 from smartcam._zenoh import BusLink
 from smartcam.fleet._inside import ZenohEnd, read_identity
-from smartcam.fleet._security import renewal as _renewal
 from tests.fleet.fleetkit import PATIENCE, until
+from tests.fleet.inside import renewal as _renewal
 from tests.fleet.plantkit import certified, plant_file
 
 pytest.importorskip("rosbags", reason="needs the extra ros2")

@@ -13,11 +13,13 @@ from typing import Any
 import pytest
 
 from smartcam.fleet import Fleet, FleetCamera
-from smartcam.fleet._agent.host import RESULTS_INTERVAL
 from smartcam.models import Result, SubscriberStatistics
 from smartcam.streams import Subscription
 from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, end_of, until
 from tests.fleet.lossy_bus import LossyBus, as_said, chance_of
+
+RESULTS_INTERVAL = 0.002
+
 
 RATE = 1000.0
 """Results in a second."""

@@ -16,8 +16,7 @@ import pytest
 
 from smartcam import fleet
 from smartcam.exceptions import SmartCamError
-from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer, MemoryBus
 from tests.fleet.fleetkit import NAME, Plant, end_of, until
 from tests.timed_loop import TimedLoop
 

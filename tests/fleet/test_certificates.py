@@ -16,8 +16,9 @@ from smartcam._accepting import is_loopback
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
+from smartcam.fleet._bus.address import CERTIFICATE_FILES
 from smartcam.fleet._inside import MadeCertificate, ZenohEnd, make_certificates, read_identity
-from smartcam.fleet._security.certificates import context
+from smartcam.fleet._security.certificates import MAX_BYTES, context
 
 YEAR = timedelta(days=365)
 
@@ -229,3 +230,10 @@ def test_roles_want_tls_alone(tmp_path: Path) -> None:
 def test_loopback() -> None:
     assert all(map(is_loopback, ("127.0.0.1", "127.3.2.1", "[::1]", "localhost")))
     assert not any(map(is_loopback, ("0.0.0.0", "[::]", "10.0.0.1", "localhost.plant", "")))  # noqa: S104
+
+
+def test_certificate_of_more_than_a_megabyte_is_refused(tmp_path: Path) -> None:
+    for name in CERTIFICATE_FILES:
+        (tmp_path / name).write_bytes(bytes(MAX_BYTES + 1))
+    with pytest.raises(ConfigurationError, match=f"expected {MAX_BYTES} bytes at most"):
+        read_identity(tmp_path)

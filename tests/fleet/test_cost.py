@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING
 import pytest
 
 from smartcam.emulator import Application, EmulatedCamera
-from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._agent.host import CATCH_UP, STATUS_DELAY
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import FleetAddress
-from smartcam.fleet._program.program import Program
 from smartcam.settings import CameraSettings
+from tests.fleet.inside import Program
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
     from smartcam.models import Status
+
+CATCH_UP = 0.2
+STATUS_DELAY = 0.005
+
 
 NAME = "line1/cam3"
 TRIGGERS = 10

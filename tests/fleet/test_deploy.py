@@ -11,14 +11,13 @@ from typing import Any
 
 import pytest
 import yaml
-from click.testing import CliRunner
 
-from smartcam._cli.smartcam import command
 from smartcam.fleet import load_fleet
 from smartcam.fleet._operations import metric_families as families
 from smartcam.fleet._operations import metrics
 from smartcam.fleet._operations.trigger_counts import OUTCOMES
 from tests import ROOT
+from tests.cli.commandline import run
 
 DEPLOY = ROOT / "deploy"
 
@@ -56,7 +55,7 @@ def test_commands_in_unit_and_containers_are_ours() -> None:
     for words in commands:
         name, *rest = words
         options = [word.partition("=")[0] for word in rest if word.startswith("--")]
-        shown = CliRunner().invoke(command, [name, "--help"]).output
+        shown = run(name, "--help").out
         assert "Usage" in shown
         for option in options:
             assert option in shown, words

@@ -37,11 +37,11 @@ from smartcam.fleet import (
     FleetEvent,
     FleetFile,
     FleetServer,
+    MemoryBus,
 )
-from smartcam.fleet._bus.bus import Handle, MemoryBus, MemoryEnd
-from smartcam.fleet._program.program_name import in_words
 from smartcam.makes import EmulatedIfm
 from tests.client.clientkit import cancelled
+from tests.fleet.inside import Handle, MemoryEnd, in_words
 from tests.handmade import until
 
 LOOK = {"application": 21, "interpret_as": "text: string[20]"}

@@ -11,12 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._program.caller import MAX_DRIFT_RATIO, Caller
 from smartcam.frames import FrameSource
 from smartcam.frames import open as open_frames
 from smartcam.frames._inside import read_stamp
 from tests.fleet.fleetkit import PATIENCE
+from tests.fleet.inside import Caller
 from tests.processes import free_place
+
+MAX_DRIFT_RATIO = 0.0001
+
 
 WAYS = st.floats(0.0, 0.2)
 

@@ -15,6 +15,8 @@ from smartcam.exceptions import CameraBusyError, NotRunningError, TriggerTimeout
 from smartcam.fleet import FleetCamera
 from tests.fleet.fleetkit import NAME, Plant
 from tests.frames.gige.camera import Camera, camera, number_in
+from tests.frames.rtsp_client import camera as rtsp
+from tests.frames.rtsp_client.test_parameters import with_parameters
 from tests.handmade import until
 from tests.timed_loop import TimedLoop
 
@@ -128,3 +130,21 @@ async def test_a_camera_without_frames_has_no_features() -> None:
     async with Plant() as plant, plant.camera() as one:
         with pytest.raises(UnsupportedError, match="has no frames"):
             await one.frame_source().__aenter__()
+
+
+@pytest.mark.real_time
+async def test_parameters_of_an_rtsp_camera_are_features_on_the_bus() -> None:
+    there = with_parameters(await rtsp.pictures())
+    async with (
+        rtsp.camera_on(there) as where,
+        Plant(frames=lambda: smartcam.frames.open(f"rtsp://{where}")) as plant,
+        plant.camera() as one,
+        one.frame_source() as source,
+    ):
+        assert await source.features["zoom"].get() == "2"
+        assert await source.features["zoom"].set(4) == "4"
+        assert (await source.features["serial"].describe()).value == "A17 b"
+        with pytest.raises(FrameSourceError, match="'serial': it can only be read"):
+            await source.features["serial"].set("B")
+        with pytest.raises(UnsupportedError, match="cannot list its parameters"):
+            await source.features.describe()

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._bus.bus import Data, MemoryEnd
 from smartcam.fleet._frames import collector as _frame_collector
 from smartcam.fleet._frames.collector import FrameCollector, Incoming
 from smartcam.fleet._frames.features import feature_fields, read_feature
@@ -31,6 +30,7 @@ from smartcam.frames import Feature
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
+from tests.fleet.inside import Data, MemoryEnd
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.fleet.partner import partner
 from tests.frames.drivers import frame

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 import smartcam.fleet
-from smartcam.fleet import FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetServer, MemoryBus
 from tests.fleet.fleetkit import Plant
 
 CAMERA = "line1/cam1"

@@ -9,8 +9,8 @@ from random import Random
 
 import pytest
 
-from smartcam.fleet._agent.gate import Gate
 from tests.client.clientkit import steps
+from tests.fleet.inside import Gate
 from tests.handmade import until
 
 

@@ -11,13 +11,11 @@ import pytest
 
 from smartcam.emulator import faults
 from smartcam.exceptions import ConnectionLostError, ReservationLostError, SmartCamError
-from smartcam.fleet import FleetCamera, ReservationLost
-from smartcam.fleet._bus.bus import MemoryBus
-from smartcam.fleet._bus.wire import decode, decode_order, encode
-from smartcam.fleet._program.program_name import ProgramName, in_words
+from smartcam.fleet import FleetCamera, MemoryBus, ReservationLost
 from smartcam.protocols import messages as m
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, PATIENCE, Plant, end_of, until
+from tests.fleet.inside import ProgramName, decode, decode_order, encode, in_words
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.fleet.test_standby import Pair
 

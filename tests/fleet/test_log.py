@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from smartcam.fleet._bus.log import AgentLog, Feed
+from smartcam.fleet._bus.log import Feed
+from tests.fleet.inside import AgentLog
 
 
 class Things(NamedTuple):

@@ -10,13 +10,11 @@ import pytest
 
 from smartcam import Backoff
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
-from smartcam.fleet._file.standby import Standby
+from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import Keys
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, until
+from tests.fleet.inside import Agent, MemoryEnd, Standby
 
 QUICK = Backoff(initial=0.05, maximum=0.2, jitter=0.0)
 STANDS_BY = Standby.model_validate({})

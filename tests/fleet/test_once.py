@@ -17,12 +17,11 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import FleetFile
-from smartcam.fleet._bus.log import AgentLog
-from smartcam.fleet._bus.wire import decode, decode_order, decode_outcome
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
+from tests.fleet.inside import AgentLog, decode, decode_order, decode_outcome
 from tests.fleet.lossy_bus import LossyBus, as_said, only
 
 

@@ -15,7 +15,7 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ReservationLostError
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import MemoryBus
 from tests import ROOT
 from tests.fleet.plainkit import (
     COUNTER,

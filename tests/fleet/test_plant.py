@@ -12,14 +12,13 @@ import pytest
 from smartcam import Result
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, RemoteProtocolError
-from smartcam.fleet import Fleet, FleetServer
+from smartcam.fleet import Fleet, FleetServer, MemoryBus
 from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
-from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
 from smartcam.fleet._inside import Keys
 from smartcam.fleet._program import fleet as _fleet
 from smartcam.fleet._program.exchange import Exchange
-from smartcam.fleet._program.program_name import in_words
 from tests.fleet.fleetkit import PATIENCE, until
+from tests.fleet.inside import MemoryEnd, in_words
 from tests.fleet.test_fleet import HELLO, file
 from tests.processes import free_place
 

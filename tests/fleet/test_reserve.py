@@ -13,10 +13,9 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     TriggerTimeoutError,
 )
-from smartcam.fleet._agent.gate import Gate
-from smartcam.fleet._program.program_name import in_words
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
+from tests.fleet.inside import Gate, in_words
 from tests.fleet.lossy_bus import LossyBus, as_said, only
 
 

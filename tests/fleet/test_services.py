@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import EmulatedCamera
-from smartcam.fleet._json import plain as _plain
 from smartcam.protocols import messages as m
+from tests.fleet.inside import plain as _plain
 from tests.fleet.plainkit import (
     COUNTER,
     LOCALIZATIONS,

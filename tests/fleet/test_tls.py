@@ -23,12 +23,12 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._bus import zenoh as _zenoh
-from smartcam.fleet._bus.wire import encode
 from smartcam.fleet._inside import read_identity
-from smartcam.fleet._security import renewal as _renewal
 from smartcam.models import Disconnected, Reconnected
 from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, until
+from tests.fleet.inside import encode
+from tests.fleet.inside import renewal as _renewal
+from tests.fleet.inside import zenoh as _zenoh
 from tests.fleet.plantkit import CAMERA, certified, plant_file, short_lived, url_of
 from tests.processes import free_place
 

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import pytest
 
 from smartcam.exceptions import ResponseTimeoutError
-from smartcam.fleet._program.camera import ASK_AGAIN
 from tests.fleet.fleetkit import Plant
 from tests.fleet.lossy_bus import LossyBus, only
+
+ASK_AGAIN = 2.0
 
 
 class Losing:

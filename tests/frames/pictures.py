@@ -13,6 +13,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.frames import Frame, Moment, find_format
+from smartcam.frames._pixels.formats import PIXEL_FORMATS
 from smartcam.frames._synthetic import stripes, write_stamp
 
 if TYPE_CHECKING:
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+__all__ = ["stripes", "write_stamp"]
+
+RAW_FORMATS = [one.name for one in PIXEL_FORMATS if not one.compressed]
+"""Names of the formats without compression."""
 
 WIDTH, HEIGHT = 320, 64
 

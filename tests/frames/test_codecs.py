@@ -194,7 +194,7 @@ def test_any_depth_picture_comes_back(
 def test_size_of_a_jpegxl_is_read_in_every_form(size: tuple[int, int]) -> None:
     for dtype, name in ((np.uint8, "Mono8"), (np.uint16, "Mono16")):
         encoded = pictures.to_jpegxl(frame_of(np.zeros(size[::-1], dtype), name))
-        assert pictures._jpegxl_size(encoded) == size
+        assert pictures.jpegxl_size(encoded) == size
 
 
 @pytest.mark.parametrize("codec", ["png", "jpegxl"])

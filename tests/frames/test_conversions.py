@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ import pytest
 from smartcam import frames
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, find_format
-from smartcam.frames._codecs.pictures import to_png
+from smartcam.frames._codecs.pictures import to_jpegxl, to_png
 from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
 from smartcam.frames._pixels.formats import PIXEL_FORMATS
 from smartcam.frames._pixels.layouts import SampleLayout
 from smartcam.frames._video.frames import from_video
 from tests.frames.pictures import frame_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 av = pytest.importorskip("av")
 
@@ -335,7 +339,7 @@ def from_rgb(video: Any) -> Any:
 @pytest.mark.parametrize(
     "name", [one.name for one in PIXEL_FORMATS if isinstance(one.layout, SampleLayout)]
 )
-async def test_png_that_is_written_is_read(tmp_path: Path, name: str) -> None:
+async def test_what_is_written_is_read(tmp_path: Path, name: str) -> None:
     found = find_format(name)
     layout, top = found.layout, 2**found.depth
     assert isinstance(layout, SampleLayout)
@@ -351,9 +355,57 @@ async def test_png_that_is_written_is_read(tmp_path: Path, name: str) -> None:
             data=data, format=found, stride=found.stride(WIDTH),
         )  # fmt: skip
     (tmp_path / "x.png").write_bytes(to_png(frame).data)
-    for place in (tmp_path / "x.png", tmp_path / "*.png"):
+    (tmp_path / "x.jxl").write_bytes(to_jpegxl(frame).data)
+    for place in (tmp_path / one for one in ("x.png", "*.png", "x.jxl", "*.jxl")):
         back = await first_frame(place)
         wanted = frame.rgb() if name.endswith("_limited") else frame.array()
         if name in ("BGR8", "BGRa8"):
             wanted = wanted[..., [2, 1, 0, *range(3, wanted.shape[2])]]
         assert np.array_equal(back.array(), wanted)
+
+
+async def test_jpegxl_is_converted_and_stands_beside_other_pictures(tmp_path: Path) -> None:
+    colours = np.random.default_rng(6).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    frame = frame_of(colours, "RGB8")
+    (tmp_path / "1.png").write_bytes(to_png(frame).data)
+    (tmp_path / "2.jxl").write_bytes(to_jpegxl(frame_of(255 - colours, "RGB8")).data)
+    async with frames.open(f"{tmp_path}#pace=none") as source:
+        seen = [one.array() async for one in source.reader()]
+    assert [np.array_equal(*one) for one in zip(seen, (colours, 255 - colours), strict=True)]
+    for name, wanted in (("Mono8", frame.grey()), ("BGR8", colours[..., ::-1])):
+        there = 255 - (await first_frame(Path(f"{tmp_path}/2.jxl#format={name}"))).array()
+        assert np.abs(there.astype(int) - wanted).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("file", "data", "said"),
+    [
+        ("cut.jxl", lambda whole: whole[:-20], "expected a whole picture"),
+        ("none.jxl", lambda _: b"GIF89a", "expected a JPEG XL"),
+        ("empty.jxl", lambda _: b"", "expected a JPEG XL"),
+        (
+            "named.bin",
+            lambda whole: whole,
+            "expected video that FFmpeg decodes here, got piped jpegxl",
+        ),
+        ("array.npy", lambda _: b"\x93NUMPY", "cannot be read: Invalid data"),
+    ],
+)
+async def test_file_that_is_none_says_what_it_is(
+    tmp_path: Path, file: str, data: Callable[[bytes], bytes], said: str
+) -> None:
+    whole = to_jpegxl(frame_of(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "RGB8")).data
+    (tmp_path / file).write_bytes(data(bytes(whole)))
+    with pytest.raises(FrameFormatError, match=said):
+        await first_frame(tmp_path / file)
+
+
+async def test_file_of_another_codec_says_why(tmp_path: Path) -> None:
+    """A TIFF of 32-bit floats is everyday, and FFmpeg does not read it."""
+    head = struct.pack("<2sHI", b"II", 42, 8)
+    tags = {256: 4, 257: 4, 258: 32, 259: 1, 262: 1, 273: 200, 277: 1, 278: 4, 279: 64, 339: 3}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, one) for tag, one in tags.items())
+    body = head + struct.pack("<H", len(tags)) + entries + bytes(4)
+    (tmp_path / "floats.tif").write_bytes(body.ljust(200, b"\0") + np.ones(16, "<f4").tobytes())
+    with pytest.raises(FrameFormatError, match=r"it ended without one: .*[Ii]nvalid data"):
+        await first_frame(tmp_path / "floats.tif")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import pickle
 import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -51,6 +52,31 @@ async def test_every_frame_comes_back_at_once_with_what_is_known_of_it(codecs: C
         assert read_stamp(got.grey()) == (number, number * 1000)
         assert got.format.name == "I420_full"
         assert np.abs(got.grey().astype(int) - stamped(number)).mean() < 3
+
+
+async def test_pictures_stay_as_they_were_while_the_decoder_goes_on(codecs: Codecs) -> None:
+    """A picture's planes are the decoder's own until somebody asks for its bytes."""
+    encoder, decoder = codecs.h264_encoder(keyint=KEYINT, crf=18), codecs.h264_decoder()
+    got = [await decoder.decode(await encoder.encode(drawn(one))) for one in range(3 * KEYINT)]
+    frames = [one for one in got if one is not None]
+    assert len(frames) == len(got)
+    seen = [frame.grey().copy() for frame in frames]
+    asked = frames[1]
+    assert asked.array().nbytes == len(asked.data) >= WIDTH * HEIGHT * 3 // 2
+    assert asked.data is asked.data
+    sent = pickle.loads(pickle.dumps(frames[3]))  # noqa: S301 - our own
+    copies = [asked, replace(frames[2], lost=1), sent]
+    for frame, grey in zip((*frames, *copies), (*seen, *seen[1:4]), strict=True):
+        assert not frame.grey().flags.writeable
+        assert np.array_equal(frame.grey(), grey)
+        assert np.array_equal(frame.format.planes(frame.data, *_size_of(frame))[0], grey)
+    assert [read_stamp(one.grey()) for one in frames] == [
+        (number, number * 1000) for number in range(3 * KEYINT)
+    ]
+
+
+def _size_of(frame: Frame) -> tuple[int, int, int]:
+    return frame.width, frame.height, frame.stride
 
 
 async def test_no_frame_but_the_first_is_large(codecs: Codecs) -> None:

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from smartcam import frames
 from smartcam.emulator import EmulatedInSight
-from smartcam.emulator._insight.image import bitmap
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.frames import Moment
 from smartcam.frames._inside import read_bitmap
@@ -104,16 +103,6 @@ async def test_picture_that_is_no_bitmap_is_told(monkeypatch: pytest.MonkeyPatch
 
 
 # bitmaps
-
-
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 1 << 30))
-def test_grey_bitmap_comes_back(width: int, height: int, seed: int) -> None:
-    pixels = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
-    data = bitmap(pixels)
-    assert (read_bitmap(data) == pixels).all()
-    for length in (0, 20, 53, len(data) - 1):
-        with pytest.raises(FrameFormatError):
-            read_bitmap(data[:length])
 
 
 def made(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from smartcam import frames
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames._inside import read_stamp
-from smartcam.frames._synthetic import stripes, write_stamp
+from tests.frames.pictures import stripes, write_stamp
 
 pytestmark = pytest.mark.usefixtures("no_leaks")
 

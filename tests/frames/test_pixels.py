@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameFormatError, MissingExtraError
 from smartcam.frames import find_format
+from smartcam.frames._inside import Planes, YuvPairs
 from smartcam.frames._pixels import compiled
 from smartcam.frames._pixels.colours import MATRICES as COLOUR_MATRICES
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
-from smartcam.frames._pixels.layouts import Planes, YuvPairs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,6 +22,7 @@ from smartcam.exceptions import (
     MissingExtraError,
 )
 from smartcam.frames import Codecs, Moment
+from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._inside import read_stamp
 from smartcam.frames._streaming.rtp.packets import SenderReport
 from smartcam.frames._streaming.rtp.reception import ntp_time
@@ -556,6 +557,57 @@ def test_pieces_do_not_matter(way: str) -> None:
 def test_a_thumbnail_is_no_picture_of_its_own() -> None:
     with_one = THUMBNAIL + PICTURES[1][2:]
     assert list(PictureCutter().feed(with_one)) == [with_one]
+
+
+def strays(picture: bytes, marker: int, more: bytes) -> bytes:
+    """Return a picture with bytes before a segment of its head that belong to none."""
+    place = picture.index(bytes((0xFF, marker)))
+    return picture[:place] + more + picture[place:]
+
+
+@pytest.mark.parametrize("more", [b"\0", b"\x01\x02\x03", b"\xff\0", b"--b\r\n", bytes(2000)])
+@pytest.mark.parametrize("marker", [0xDB, 0xC0, 0xDA])
+def test_stray_bytes_in_a_head_belong_to_the_picture(marker: int, more: bytes) -> None:
+    """As webcams send them, and decoders pass over them."""
+    sent = [strays(one, marker, more) for one in PICTURES]
+    whole = b"".join(b"--b\r\n\r\n" + one + b"\r\n" for one in sent)
+    for size in (1, 7, 1000, len(whole)):
+        cutter = PictureCutter()
+        got = [
+            one
+            for place in range(0, len(whole), size)
+            for one in cutter.feed(whole[place : place + size])
+        ]
+        assert (got, cutter.damaged) == (sent, 0)
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_a_head_that_is_cut_short_takes_nothing_of_the_next_picture(said: bool) -> None:
+    """The length of its last segment may lead into the next picture, wherever that is cut."""
+    shown = {grey_of(one) for one in PICTURES}
+    for size in range(2, PICTURES[0].index(b"\xff\xda") + 20):
+        cutter, cut = PictureCutter(), PICTURES[0][:size]
+        sent = b"".join(
+            b"\r\n--b\r\n" + (length(one) if said else b"\r\n") + one
+            for one in (cut, *PICTURES[1:4])
+        )
+        got = list(cutter.feed(sent))
+        assert {grey_of(one) for one in got} <= {*shown, None}
+        assert got[-2:] == PICTURES[2:4]
+
+
+def grey_of(picture: bytes) -> bytes | None:
+    """Return the brightness of a picture; None: the decoder refuses it."""
+    try:
+        return decode_jpeg(picture, "GRAY", (WIDTH, HEIGHT), "MJPEG").pixels.tobytes()
+    except FrameFormatError:
+        return None
+
+
+def test_a_head_of_strays_alone_is_no_picture() -> None:
+    cutter = PictureCutter()
+    assert not list(cutter.feed(b"\xff\xd8" + b"a" * 5000))
+    assert cutter.damaged == 1
 
 
 def test_what_is_cut_short_is_counted_and_the_next_one_comes() -> None:

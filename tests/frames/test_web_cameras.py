@@ -84,6 +84,8 @@ async def camera(
         (b'Multipart/x-mixed-replace; boundary="b"', b"Connection: close\r\n"),
         (b"multipart/x-mixed-replace", b""),
         (b"multipart/mixed", b""),
+        (b"video/x-motion-jpeg", b""),
+        (b"video/x-mjpeg", b"Transfer-Encoding: chunked\r\n"),
     ],
 )
 async def test_cameras_of_all_kinds_are_read(kind: bytes, more: bytes) -> None:
@@ -173,6 +175,33 @@ async def test_chunks_that_are_none_are_told(line: bytes) -> None:
             await frames.open(f"http://127.0.0.1:{port}/").__aenter__()
 
 
+@pytest.mark.parametrize(
+    "before", [b"HTTP/1.1 100 Continue\r\n\r\nHTTP/1.1 200 OK", b"HTTP/1.0 206 Partial Content"]
+)
+async def test_other_first_lines_are_understood(before: bytes) -> None:
+    head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+    before += head[len(b"HTTP/1.1 200 OK") :]
+    async with camera(before) as url, frames.open(url) as source:
+        assert read_stamp((await source.newest()).grey()) is not None
+
+
+async def test_webcams_with_stray_bytes_before_a_marker_are_read() -> None:
+    head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+
+    def wrapped(picture: bytes) -> bytes:
+        place = picture.index(b"\xff\xdb")
+        return PARTS["as it should be"](picture[:place] + b"\0" + picture[place:])
+
+    async with (
+        camera(head, wrapped) as url,
+        frames.open(url) as source,
+        source.reader() as reader,
+    ):
+        for _ in range(3):
+            assert read_stamp((await anext(reader)).grey()) is not None
+        assert reader.statistics().lost == 0
+
+
 PARTED = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
 JPEG_PART = b"--b\r\nContent-Type: image/jpeg\r\n"
 BAD = {
@@ -194,6 +223,11 @@ BAD = {
         "expected a picture, got no bytes for 0.5 s",
     ),
     "bytes of nothing": (PARTED + b"x" * 3_000_000, "bytes came that belong to no picture"),
+    "packed": (
+        HEAD % (b"multipart/x-mixed-replace; boundary=b", b"Content-Encoding: gzip\r\n"),
+        "expected bytes as they are, got Content-Encoding: gzip",
+    ),
+    "nothing but beginnings": (b"HTTP/1.1 102 Processing\r\n\r\n" * 9, "102 Processing"),
     "not found": (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "404 Not Found"),
     "no HTTP": (b"\xde\xad" * 100_000, "it gives no answer that can be understood"),
     "silence": (b"", "expected an answer, got none within 0.5 s"),

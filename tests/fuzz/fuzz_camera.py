@@ -10,17 +10,16 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator._application import BUILTIN_APPLICATIONS
-from smartcam.emulator._bvs.behaviour import behaviour_of
-from smartcam.emulator._bvs.device import Mode
+from smartcam.emulator import Application, Quirks
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, CODES, THESIS
 from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, ResultCode
+from tests.emulator.builtins import BUILTIN_APPLICATIONS
+from tests.emulator.parts import made_device
 from tests.fuzz.fuzz_input import Choices
+from tests.machines import B16, BID, CODES, THESIS
 
 DIALECTS = (HANDBOOK, THESIS, B16, BID, B16.with_quirks(["code"]))
 QUIRKS = (
@@ -57,16 +56,12 @@ class Camera:
     def __init__(
         self, dialect: FramedDialect, quirks: Quirks, active: int, *, running: bool
     ) -> None:
-        behaviour = behaviour_of(dialect, quirks)
-        self.device = Device(
-            APPLICATIONS.values(),
-            active=active,
-            quirks=quirks,
-            running=running,
-            behaviour=behaviour,
+        self.device = made_device(
+            APPLICATIONS.values(), dialect, quirks, active=active, running=running
         )
         policy = dataclasses.replace(
-            POLICIES_ON_A_BAD_FRAME[quirks.bad_frame], tells=behaviour.tells_bad_messages
+            POLICIES_ON_A_BAD_FRAME[quirks.bad_frame],
+            tells=self.device.behaviour.tells_bad_messages,
         )
         self.dialect = dialect
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)
@@ -107,7 +102,7 @@ class Camera:
                 assert (self.status.status, self.status.endian) == (device.status, device.endian)
         if device.connected:
             assert bool(device.status & Status.RUNNING) == device.running
-            assert device.status & Status.BUSY or device.mode is not Mode.SWITCHING
+            assert device.status & Status.BUSY or device.mode.value != "switching"
         due = device.next_event_in()
         assert due is None or due >= 0
 
@@ -140,7 +135,7 @@ class Camera:
             case m.ClockAnswer():
                 assert 1 <= message.month <= 12
             case m.QueryAnswer(code=ResultCode.BUSY, application=0):
-                assert self.device.mode is Mode.SWITCHING
+                assert self.device.mode.value == "switching"
             case m.QueryAnswer() | m.SwitchAnswer():
                 assert message.application in APPLICATIONS
             case m.Acknowledgement(code=code) if self.dialect.has(type(message)):

@@ -8,14 +8,13 @@ fills them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from unittest import mock
 
 from smartcam.exceptions import FrameError
 from smartcam.protocols import Frame, HeaderLayout, Machine
-from smartcam.protocols._framed import framing
 from smartcam.protocols._inside import Framer
 from tests.fuzz.fuzz_input import Choices
 from tests.machines import DIALECTS
+from tests.protocols.frame_times import small_reads
 
 HEADERS = (
     *(dialect.header for dialect in DIALECTS),
@@ -28,9 +27,7 @@ MAX_READ = 128
 
 def check(data: bytes) -> None:
     """Cut a stream into frames by chunks and compare with what :func:`expected` finds in it."""
-    with mock.patch.multiple(
-        framing, MIN_OWN_BUFFER_BYTES=32, FIRST_READ=16, MAX_READ_BYTES=MAX_READ
-    ):
+    with small_reads(FIRST_READ=16, MAX_READ_BYTES=MAX_READ):
         check_framer(data)
 
 

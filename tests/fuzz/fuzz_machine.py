@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from itertools import pairwise
-from unittest import mock
 
 from smartcam.exceptions import (
     FrameError,
@@ -32,12 +31,11 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed import framing
-from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._inside import POLICIES, Event, Policy
 from tests.fuzz.fuzz_framing import write
 from tests.fuzz.fuzz_input import Choices, check_decoding
-from tests.machines import DIALECTS, EXAMPLES, one_by_one
+from tests.machines import DIALECTS, EXAMPLES, TRANSITIONS, one_by_one
+from tests.protocols.frame_times import small_reads
 
 OWN_POLICY = None
 CHOSEN_POLICIES = (
@@ -196,7 +194,7 @@ class Link:
 
 def check(data: bytes) -> None:
     """Drive a machine through the steps of ``data``."""
-    with mock.patch.object(framing, "MIN_OWN_BUFFER_BYTES", 32):
+    with small_reads():
         check_machine(data)
 
 

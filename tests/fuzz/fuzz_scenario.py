@@ -14,15 +14,14 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smartcam.emulator import Device, ManualClock, Scenario, load_scenarios
-from smartcam.emulator._scenario.timeline import Timeline
+from smartcam.emulator import Device, Scenario, load_scenarios
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
+from tests.emulator.parts import course
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Generator
 
-    from smartcam.emulator.faults import Fault
 
 GREEDY = (b"slots", b"&")
 """Words that can make much of little; only with these is memory measured, which takes time."""
@@ -94,21 +93,3 @@ def check_timeline(scenario: Scenario) -> None:
     """Its timeline runs, and does so again in the same way."""
     first, second = course(scenario), course(scenario)
     assert first == second
-
-
-def course(scenario: Scenario) -> list[tuple[float, str]]:
-    """Return what happens in half a second, and on every command."""
-    clock = ManualClock()
-    happened: list[tuple[float, str]] = []
-
-    def inject(do: Sequence[Fault]) -> None:
-        happened.extend((clock.now, fault.kind) for fault in do)
-
-    cues = scenario.timeline[:20]
-    timeline = Timeline(cues, clock=clock, seed=scenario.seed, inject=inject)
-    timeline.start()
-    for command in sorted({cue.command for cue in cues if cue.command is not None}):
-        timeline.command(command)
-    clock.advance(0.5)
-    timeline.stop()
-    return happened

@@ -9,12 +9,12 @@ import tomllib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from smartcam.emulator._application import BUILTIN_APPLICATIONS, LOCALIZATIONS
 from smartcam.exceptions import LayoutError
 from smartcam.layout import Layout
 from smartcam.protocols import Role, State, Transport
 from smartcam.protocols import messages as m
 from tests import ROOT
+from tests.emulator.builtins import BUILTIN_APPLICATIONS, LOCALIZATIONS
 from tests.fuzz.fuzz_interpreters import SPECS
 from tests.machines import DIALECTS
 

@@ -10,12 +10,12 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.emulator._generators import generator_names
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout._inside import TYPES, UNITS
 from smartcam.protocols import BVS
-from smartcam.protocols._bvs import B16, MESSAGES
 from smartcam.protocols._inside import MessageId
+from tests.emulator.parts import generator_names
+from tests.machines import B16, MESSAGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -32,7 +32,8 @@ class Target(NamedTuple):
         max_length: bytes of an input at most.
         share: of ``--runs``, in proportion to the others: the fast ones get more.
         words: what its inputs are made of, for whoever changes them.
-        shares: ``texts`` where it stands with others in ``fuzz_texts``, as ``cells``.
+        shares: ``texts`` where it stands with others in ``fuzz_texts``; the whole name of a module
+            of a room's tests.
     """
 
     name: str
@@ -71,7 +72,8 @@ class Target(NamedTuple):
 
     def load(self) -> Callable[[bytes], None]:
         """Return its check, which raises where it finds something."""
-        module = importlib.import_module(f"tests.fuzz.fuzz_{self.shares or self.name}")
+        name = self.shares or self.name
+        module = importlib.import_module(name if "." in name else f"tests.fuzz.fuzz_{name}")
         check: Callable[[bytes], None] = getattr(
             module, f"check_{self.name}" if self.shares else "check"
         )
@@ -176,9 +178,9 @@ TARGETS = {
         Target("layout_file", 256, 2, _LAYOUT + _YAML + _LAYOUT_FILE, shares="texts"),
         Target("address", 96, 22, _ADDRESS, shares="texts"),
         Target("spec", 128, 22, _SPEC + _LAYOUT, shares="texts"),
-        Target("cell_file", 512, 2, _CELL + _YAML, shares="cells"),
-        Target("gs1", 96, 22, _GS1, shares="cells"),
-        Target("program_result", 160, 6, _NUMBERS, shares="cells"),
+        Target("cell_file", 512, 2, _CELL + _YAML, shares="tests.inspection.fuzz_cells"),
+        Target("gs1", 96, 22, _GS1, shares="tests.inspection.fuzz_cells"),
+        Target("program_result", 160, 6, _NUMBERS, shares="tests.inspection.fuzz_cells"),
     )
 }
 """Every target by name, in the order in which they run."""

@@ -15,22 +15,18 @@ from typing import Any
 
 import pytest
 
-import smartcam.layout._compiled as compiled_module
-import smartcam.layout._yaml_files as scenario_module
 from smartcam.emulator import Device
 from smartcam.inspection import Teaching
-from smartcam.inspection._camera import eyes
-from smartcam.inspection._read import gs1
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
-from smartcam.layout._text import parse_text
 from smartcam.protocols import FramedDialect, LineMachine, Machine
 from smartcam.protocols._inside import Framer
 from smartcam.settings import Address
 from tests import ROOT
-from tests.fuzz import fuzz_cells
 from tests.fuzz.fuzz_seeds import seeds
 from tests.fuzz.fuzz_targets import CORPUS, FINDINGS, KNOWN, TARGETS, Target, describe, known
+from tests.inspection import fuzz_cells
+from tests.layout.mistakes import CUTS_TEXTS, cannot_tell_lines
 
 SEED = 20_240_229
 CHANGED = {"cell_file": 40, "scenario": 60, "layout_file": 60, "camera": 60, "layout": 200}
@@ -151,14 +147,14 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "makes": (LineMachine, "_take", divide_by_zero),
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (LocalizationsInterpreter, "_check_numbers", lambda *_: None),
-    "scenario": (scenario_module, "_line", divide_by_zero),
+    "scenario": cannot_tell_lines(divide_by_zero),
     "camera": (Device, "_report", lambda *_: None),
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
     "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
     "cell_file": (Teaching, "_check_written", lambda *_: 1 / 0),
-    "gs1": (fuzz_cells, "elements", lambda text: gs1.elements(text)[:1]),
-    "program_result": (eyes, "MAX_REASON_BYTES", 90),
-    "spec": (compiled_module, "parse_text", lambda text, start: parse_text(text[start:])),
+    "gs1": (fuzz_cells, "elements", fuzz_cells.first_element),
+    "program_result": (fuzz_cells.EYES, "MAX_REASON_BYTES", 90),
+    "spec": CUTS_TEXTS,
 }
 """A mistake for each target: what is replaced, and by what."""
 

@@ -132,12 +132,17 @@ class PlacedPart:
     size: float = field(default=70.0, compare=False)
 
 
-def shares(shape: tuple[int, ...], parts: Sequence[PlacedPart], blur: float) -> Array:
-    """Return the light of parts (H, W), 0 for the background; exact to about 0.001 pixels."""
+def shares(
+    shape: tuple[int, ...], parts: Sequence[PlacedPart], blur: float, samples: int = SAMPLES
+) -> Array:
+    """Return the light of parts (H, W), 0 for the background; exact to about 0.001 pixels.
+
+    ``samples``: along each side of a pixel.
+    """
     canvas = np.zeros(shape)
     for part in parts:
-        corner, fine = _samples(part, blur)
-        own, light = _pixels(fine)
+        corner, fine = _samples(part, blur, samples)
+        own, light = _pixels(fine, samples)
         low = max(corner[0], 0), max(corner[1], 0)
         high = min(corner[0] + len(own), shape[1]), min(corner[1] + len(own), shape[0])
         if high[0] <= low[0] or high[1] <= low[1]:
@@ -151,11 +156,12 @@ def shares(shape: tuple[int, ...], parts: Sequence[PlacedPart], blur: float) -> 
     return canvas
 
 
-def slopes(shape: tuple[int, ...], part: PlacedPart, blur: float) -> Array:
+def slopes(shape: tuple[int, ...], part: PlacedPart, blur: float, samples: int = SAMPLES) -> Array:
     """Return the derivatives of a part's light (4, H, W) by its x, y, angle and scale."""
-    corner, fine = _samples(part, blur)
-    down, across = np.gradient(fine[..., 1].astype(float) * SAMPLES)
-    u, v = (one - at for one, at in zip(_places(corner, len(fine)), (part.x, part.y), strict=True))
+    corner, fine = _samples(part, blur, samples)
+    down, across = np.gradient(fine[..., 1].astype(float) * samples)
+    places = _places(corner, len(fine), samples)
+    u, v = (one - at for one, at in zip(places, (part.x, part.y), strict=True))
     ways = (
         -across,
         -down,
@@ -164,7 +170,7 @@ def slopes(shape: tuple[int, ...], part: PlacedPart, blur: float) -> Array:
     )
     found = np.zeros((4, *shape))
     for one, way in zip(found, ways, strict=True):
-        (small,) = _pixels(way[..., None])
+        (small,) = _pixels(way[..., None], samples)
         rows, columns = (
             slice(corner[1], corner[1] + len(small)),
             slice(corner[0], corner[0] + len(small)),
@@ -173,33 +179,35 @@ def slopes(shape: tuple[int, ...], part: PlacedPart, blur: float) -> Array:
     return found
 
 
-def _places(corner: tuple[int, int], count: int) -> list[Array]:
-    at = (np.arange(count, dtype=np.float32) + 0.5) / SAMPLES - 0.5
+def _places(corner: tuple[int, int], count: int, samples: int) -> list[Array]:
+    at = (np.arange(count, dtype=np.float32) + 0.5) / samples - 0.5
     return list(np.meshgrid(at + corner[0], at + corner[1]))
 
 
-def _samples(part: PlacedPart, blur: float) -> tuple[tuple[int, int], NDArray[np.float32]]:
+def _samples(
+    part: PlacedPart, blur: float, samples: int
+) -> tuple[tuple[int, int], NDArray[np.float32]]:
     """Return the first pixel of a part, and at its samples how much is of the part, and light."""
     reach = math.ceil(part.size * part.scale + 5 * blur + 4)
     corner = math.floor(part.x) - reach, math.floor(part.y) - reach
-    u, v = _places(corner, (2 * reach + 1) * SAMPLES)
+    u, v = _places(corner, (2 * reach + 1) * samples, samples)
     cos, sin = math.cos(part.angle) / part.scale, math.sin(part.angle) / part.scale
     u, v = u - np.float32(part.x), v - np.float32(part.y)
     x, y = cos * u + sin * v, cos * v - sin * u
     light = np.zeros(u.shape, np.float32)
     own = np.zeros(u.shape, np.float32)
     for shape in part.shapes:
-        share = (shape.inside(x, y) * part.scale * SAMPLES + 0.5).clip(0, 1).astype(np.float32)
+        share = (shape.inside(x, y) * part.scale * samples + 0.5).clip(0, 1).astype(np.float32)
         light += share * (np.float32(shape.level) - light)
         own = np.maximum(own, share)
-    blurred = cv2.GaussianBlur(np.dstack([own, light]), (0, 0), blur * SAMPLES)
+    blurred = cv2.GaussianBlur(np.dstack([own, light]), (0, 0), blur * samples)
     return corner, np.asarray(blurred, np.float32)
 
 
-def _pixels(fine: NDArray[np.generic]) -> Array:
+def _pixels(fine: NDArray[np.generic], samples: int) -> Array:
     """Return the means over pixels, (K, H, W), of samples (H, W, K)."""
-    side = len(fine) // SAMPLES
-    means = fine.reshape(side, SAMPLES, side, SAMPLES, -1).mean(axis=(1, 3), dtype=np.float64)
+    side = len(fine) // samples
+    means = fine.reshape(side, samples, side, samples, -1).mean(axis=(1, 3), dtype=np.float64)
     return np.moveaxis(means, 2, 0)
 
 

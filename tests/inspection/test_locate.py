@@ -28,7 +28,7 @@ from smartcam.layout import Layout
 from smartcam.registry import INTERPRETERS
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
-from tests.proofs.locate import PartSearch, locate
+from tests.inspection.proofs.locate import PartSearch, locate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -165,9 +165,10 @@ def test_model_is_the_same_from_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"version": 2}, "version"),
+        ({"version": 1}, "version"),
         ({"kind": "else"}, "kind"),
         ({"segments": []}, "segments"),
+        ({"moves": [[0.0] * 6] * 12}, "moves"),
         ({"levels": [[0], [9999]]}, "levels"),
         ({"fold": -1}, "fold"),
         ({"outline": [[0, 0], [20000, 0], [0, 20000]]}, "pixels at most"),

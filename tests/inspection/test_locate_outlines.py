@@ -14,7 +14,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import PartModel, Picture, TeachingError, TeachingTrouble
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, photograph, shares
-from tests.proofs.locate import PartSearch, locate
+from tests.inspection.proofs.locate import PartSearch, locate
 
 ezdxf: Any = pytest.importorskip("ezdxf", reason="needs the extra inspection")
 

@@ -1,10 +1,18 @@
-"""Errors of measuring against the Cramer-Rao bound: the short form of `tests.proofs.calipers`."""
+"""Errors against the Cramer-Rao bound: the short form of `tests.inspection.proofs.calipers`."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.proofs.calipers import Case, CircleCase, EdgeCase, Light, LineCase, WidthCase, judged
+from tests.inspection.proofs.calipers import (
+    Case,
+    CircleCase,
+    EdgeCase,
+    Light,
+    LineCase,
+    WidthCase,
+    judged,
+)
 
 SHORT = [
     EdgeCase(name="edge"),

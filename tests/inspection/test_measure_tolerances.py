@@ -11,7 +11,8 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import Finding
-from smartcam.inspection._learning import GOOD_SHARE, Lesson, learned
+from smartcam.inspection._inside import learned
+from smartcam.inspection._learning import GOOD_SHARE, Lesson
 from smartcam.inspection._measure.tolerances import Tolerance
 
 

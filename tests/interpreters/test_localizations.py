@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.interpreters import Context, Reader, resolve, run
-from smartcam.interpreters._localizations import MAX_NAMES
 from smartcam.models import Localization
+
+MAX_NAMES = 64
+
 
 PART = struct.Struct("<50sfifff")
 

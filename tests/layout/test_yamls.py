@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from smartcam.calibration.formats._plain import load_yaml as load_plain
-from smartcam.emulator import EmulatedCamera, load_scenarios
-from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.emulator import EmulatedCamera, load_scenario, load_scenarios
+from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
+from smartcam.layout import _yaml_files as yaml_files
 from smartcam.layout import _yamls as yamls
 from smartcam.layout._inside import BadYamlError, load
-
-
-def laughs(levels: int) -> str:
-    """Return lists of ten of the one before."""
-    rows = [
-        f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, levels)
-    ]
-    return "\n".join(["a0: &a0 [1, 2]", *rows])
-
-
-def merges(levels: int) -> str:
-    """Return mappings, each merged of the one before, twice."""
-    rows = [
-        f"m{level}: &m{level}\n  <<: [*m{level - 1}, *m{level - 1}]\n  k{level}: 1"
-        for level in range(1, levels)
-    ]
-    return "\n".join(["m0: &m0 {x: 1}", *rows])
+from tests.layout.bombs import laughs, merges
 
 
 @pytest.mark.parametrize("text", [laughs(30), merges(40), laughs(9), "- a\n" * 6000])
@@ -44,7 +29,7 @@ def test_load_of_a_bomb_is_refused_with_its_line(
 
 def test_load_of_too_long_a_text_is_refused() -> None:
     with pytest.raises(BadYamlError, match="8388609 characters, expected 8388608 at most"):
-        load(" " * (yamls.MAX_YAML_TEXT + 1))
+        load(" " * (yamls.MAX_YAML_TEXT_CHARACTERS + 1))
 
 
 @pytest.mark.parametrize(
@@ -124,32 +109,35 @@ def test_layout_bombs_are_refused(text: str) -> None:
         Layout.from_yaml(text)
 
 
-def test_calibration_formats_bombs_are_refused() -> None:
-    for text in (laughs(30), merges(40)):
-        with pytest.raises(CalibrationError) as told:
-            load_plain(text)
-        assert told.value.code == "MALFORMED"
+def test_scenario_with_many_mistakes_tells_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    meant = yaml_files._meant
+
+    def counted(*given: Any) -> str:
+        asked.append(given)
+        return meant(*given)
+
+    monkeypatch.setattr(yaml_files, "_meant", counted)
+    path = tmp_path / "a.yaml"
+    path.write_text("".join(f"no{n}: 1\n" for n in range(500)))
+    with pytest.raises(ConfigurationError, match="no0"):
+        load_scenario(path)
+    assert len(asked) == 20
 
 
-class _Count:
-    """A value that counts how often it is compared."""
-
-    compared = 0
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __hash__(self) -> int:
-        return hash(self.number)
-
-    def __eq__(self, other: object) -> bool:
-        _Count.compared += 1
-        return bool(isinstance(other, _Count) and self.number == other.number)
+@pytest.mark.parametrize(
+    "text", ["[" * 1000, "{a: " * 1000, "- " * 1000, "\n".join(" " * n + "a:" for n in range(1000))]
+)
+def test_yaml_nested_too_deep_says_where(text: str) -> None:
+    with pytest.raises(
+        BadYamlError, match=f"nested too deep: expected {yamls.MAX_DEPTH} "
+    ) as caught:
+        load(text)
+    assert caught.value.line is not None
 
 
-def test_scenario_ids_are_compared_once_each() -> None:
-    from smartcam.emulator._scenario.scenario import _first_double
-
-    _Count.compared = 0
-    assert _first_double(_Count(number) for number in range(5000)) is None
-    assert _Count.compared < 5000
+def test_yaml_nested_as_deep_as_it_may_be_is_read() -> None:
+    text = "[" * (yamls.MAX_DEPTH - 1) + "1" + "]" * (yamls.MAX_DEPTH - 1)
+    assert str(load(text)) == text

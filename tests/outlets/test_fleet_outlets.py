@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.fleet import FleetServer, load_fleet
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
 from smartcam.outlets import StoreQuestion
 from smartcam.outlets._inside import read_store

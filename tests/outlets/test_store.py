@@ -16,6 +16,7 @@ import pytest
 
 from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.models import PoseSigma
 from smartcam.outlets import OutletDesk, OutletEntry, Outlets, StoreQuestion
 from smartcam.outlets._inside import columns_of, read_store
 from smartcam.registry import OUTLETS
@@ -245,10 +246,13 @@ async def test_a_localization_is_a_row_with_its_pose(tmp_path: Path) -> None:
     }
     parts = Interpretation("localizations", lenient=False, y_down=False)
     part = {"feature_id": "bolt", "quality": 0.9, "photo_index": 1, "pose": pose}
-    await written(store(tmp_path, columns_of(parts.interpreter(7))), entry(1, [part, part]))
-    assert rows(tmp_path, "SELECT record, feature_id, x, y, qw FROM app_7") == [
-        (0, "bolt", 0.1, 0.2, 1.0),
-        (1, "bolt", 0.1, 0.2, 1.0),
+    sigma = PoseSigma(1e-4, 2e-4, 1e-3, 0.5)._asdict()
+    told = {**part, "pose": {**pose, "sigma": sigma}}
+    await written(store(tmp_path, columns_of(parts.interpreter(7))), entry(1, [part, told]))
+    names = "record, feature_id, x, y, qw, sigma_x, sigma_theta, correlation_xy"
+    assert rows(tmp_path, f"SELECT {names} FROM app_7") == [  # noqa: S608 - of this test
+        (0, "bolt", 0.1, 0.2, 1.0, None, None, None),
+        (1, "bolt", 0.1, 0.2, 1.0, 1e-4, 1e-3, 0.5),
     ]
 
 

@@ -26,7 +26,6 @@ from typing import Any, Literal, NamedTuple
 import smartcam
 from smartcam import Backoff, Camera, LinkError, ResponseTimeoutError, Status
 from smartcam.emulator import EmulatedCamera, Run
-from smartcam.emulator._bvs.device import Mode
 from smartcam.protocols import messages as m
 from smartcam.streams import Subscription
 from tests.client.clientkit import balance
@@ -522,7 +521,7 @@ async def _check_client(bench: Bench, call: Call, checks: Checks) -> None:
 async def _check_state(bench: Bench, call: Call) -> None:
     """Assert that client and camera agree about application and run state."""
     camera, device = bench.camera, bench.box.device
-    while device.processing or device.mode in {Mode.SWITCHING, Mode.REBOOTING}:  # noqa: ASYNC110
+    while device.processing or device.mode.value in {"switching", "rebooting"}:  # noqa: ASYNC110
         await asyncio.sleep(0)
     await camera.wait_connected()
     async with inside(camera)._lock.hold(BOUND):  # behind every way back

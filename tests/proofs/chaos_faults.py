@@ -13,7 +13,7 @@ from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.models import Status
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import _rules as rules
+from smartcam.testing import proxy as rules
 
 CAMERA_MESSAGES = ("StatusReport", "ResultContainer", "QueryAnswer", "SwitchAnswer", "ClockAnswer")
 CLIENT_MESSAGES = ("Trigger", "SetSequenceNumber", "Query", "Stop", "Start", "SwitchApplication")
@@ -89,7 +89,7 @@ def _good_link(victim: Victim) -> None:
 
 
 def _bad_datagrams(victim: Victim, chance: Random) -> None:
-    way = chance.choice(rules.DIRECTIONS)
+    way: Literal["up", "down"] = chance.choice(("up", "down"))
     seed, share = chance.randrange(1000), chance.uniform(0.02, 0.3)
     chosen: rules.Rule = chance.choice(
         [

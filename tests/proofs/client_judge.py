@@ -27,8 +27,6 @@ from smartcam import (
     StatusChanged,
 )
 from smartcam.emulator import EmulatedCamera, LogEntry, Run
-from smartcam.emulator._bvs.device import Mode
-from smartcam.emulator._traffic import Log
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ResultCode
@@ -94,8 +92,9 @@ class RecordedCamera(CameraModel):
         self.pass_time(max(0, ticks))
         return self
 
-    def read(self, log: Log) -> None:
+    def read(self, box: EmulatedCamera) -> None:
         """Take what was said out of a camera's log."""
+        log = box.log
         assert len(log) < (log.maxlen or 0), "something may have gone by"
         while log:
             entry = log.popleft()
@@ -387,7 +386,7 @@ class ClientJudge:
         self.begin("next_result", registered(), errors)
 
     def _act(self, does: Callable[[], object], is_noted: Callable[[float], object]) -> None:
-        self.model.read(self.box.log)
+        self.model.read(self.box)
         does()
         is_noted(self.loop.time())
 
@@ -430,7 +429,7 @@ class ClientJudge:
         """Wait until nobody is in between; whether client and camera are there then."""
         self.run(asyncio.sleep(5.0))  # whatever is under way ends in it
         self._settle_calls()
-        if self.box.device.mode in {Mode.SWITCHING, Mode.REBOOTING} or self.calls:
+        if self.box.device.mode.value in {"switching", "rebooting"} or self.calls:
             return False
         camera = self.camera
         # a way back that failed is told to the next command
@@ -455,7 +454,7 @@ class ClientJudge:
 
     def _settle_calls(self) -> None:
         """Judge every call that has ended."""
-        self.model.read(self.box.log)
+        self.model.read(self.box)
         for call in [call for call in self.calls if call.task.done()]:
             self.calls.remove(call)
             if call.kind == "trigger" and (call.task.cancelled() or call.task.exception()):

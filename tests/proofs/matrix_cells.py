@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 from smartcam import exceptions as e
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.testing.proxy import _rules as rules
+from smartcam.testing import proxy as rules
 from tests.proofs.books import LINK_LOST, TRIGGER_OUTCOMES
 from tests.proofs.matrix_world import (
     AWAY,

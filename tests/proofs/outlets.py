@@ -386,13 +386,25 @@ def _says_more(camera: str, entry: Entry, found: dict[str, Arrived], damaged: bo
             continue
         tells_damage = "damaged" in (one.error or "") or "is gone" in (one.error or "")
         last = one.epoch, one.number
-        if one.camera == "" and (
-            one.epoch == entry[0] or (one.epoch > entry[0] and tells_damage >= damaged)
-        ):
+        if one.camera == "" and one.epoch == entry[0]:
+            return True
+        there = tells_damage >= damaged or _stands_there(one, camera, entry, found)
+        if one.camera == "" and one.epoch > entry[0] and there:
             return True
         if one.camera == camera and (entry < last or (one.epoch == entry[0] and last <= entry)):
             return True
     return False
+
+
+def _stands_there(gap: Arrived, camera: str, entry: Entry, found: dict[str, Arrived]) -> bool:
+    """Return True if a gap came where an entry is missing: gaps of several starts may be one."""
+    came = [*found.values()]
+    place = came.index(gap)
+    sides = [
+        [(one.epoch, one.number) for one in side if (one.camera, one.kind) == (camera, "result")]
+        for side in (came[:place], came[place:])
+    ]
+    return all(one < entry for one in sides[0]) and all(one > entry for one in sides[1])
 
 
 # ---------------------------------------------------------------------- cells

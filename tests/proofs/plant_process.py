@@ -22,13 +22,10 @@ from typing import Any
 
 import smartcam.fleet
 from smartcam import Disconnected, Reconnected, Result
-from smartcam._zenoh import BusLink
 from smartcam.exceptions import InputContainerError, SmartCamError
 from smartcam.fleet import Fleet, FleetCamera
-from smartcam.fleet._inside import ZenohEnd
-from smartcam.fleet._security.access import access_control
-from smartcam.fleet._security.door import Door
 from tests.fleet.fleetkit import FAST, LAYOUT, PATIENCE, NumberedCamera
+from tests.fleet.plantkit import router_end
 from tests.proofs.chaos_soak import resident
 from tests.proofs.fleet_storm import WITH_INPUT, call
 from tests.proofs.plant_pace import Pace
@@ -122,15 +119,9 @@ async def cameras(count: int, host: str = "127.0.0.1") -> None:
 
 async def router(place: str, certificates: str) -> None:
     """Be the router."""
-    link = BusLink((place,), (), certificates)
-    end = ZenohEnd(link, {"access_control": access_control()})
-    await end.open(PATIENCE)
-    door = Door(frozenset({int(place.rpartition(":")[2])}), end.linked)
-    door.open()
-    say(ready=True)
-    await told_to_end()
-    door.close()
-    await end.close()
+    async with router_end(place, certificates):
+        say(ready=True)
+        await told_to_end()
 
 
 @dataclass

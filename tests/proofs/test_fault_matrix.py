@@ -20,7 +20,7 @@ from smartcam.emulator import faults as f
 from smartcam.observers import TraceEntry
 from smartcam.protocols import BVS
 from smartcam.protocols._inside import ResultCode
-from smartcam.testing.proxy import _rules as rules
+from smartcam.testing import proxy as rules
 from tests.proofs import fault_matrix
 from tests.proofs.books import BookKeeper, ClientEar
 from tests.proofs.fault_matrix import Runner, cells, is_apart, sample

@@ -452,7 +452,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
 
     @invariant()
     def all_is_well(self) -> None:
-        self.model.read(self.box.log)
+        self.model.read(self.box)
         self._settle_calls()
         if self.camera is None:
             return

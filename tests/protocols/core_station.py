@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import pytest
 
-from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator._bvs.behaviour import behaviour_of
+from smartcam.emulator import Application, Quirks
 from smartcam.exceptions import LocalProtocolError, UnsupportedError
 from smartcam.protocols import LinkFailed, Machine, Role, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import POLICIES, Event
+from tests.emulator.parts import made_device
 from tests.machines import BY_LABEL, one_by_one
 from tests.protocols.camera_model import CameraModel, Options
 from tests.protocols.core_model import LIMIT, WIRES, CameraEnd, ClientEnd, framed, meaning, surplus
@@ -213,9 +213,7 @@ class Station:
         quirks = Quirks(
             reboot_time=0.3, overtriggered_time=0.1, input_queue_depth=2, **options._asdict()
         )
-        self.device = Device(
-            APPLICATIONS, quirks=quirks, behaviour=behaviour_of(BY_LABEL[dialect], quirks)
-        )
+        self.device = made_device(APPLICATIONS, BY_LABEL[dialect], quirks)
         self.lines: list[Line] = []
         self.served: Line | None = None
         self._drop = drop  # what happens to a line that the camera lets go of

@@ -24,10 +24,9 @@ from smartcam.protocols import (
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import UNDOCUMENTED
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy
-from tests.machines import CODE, NO_ID
+from tests.machines import B16, BID, CODE, NO_ID, THESIS
+from tests.protocols.inside import UNDOCUMENTED
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 TCP, UDP = Transport.TCP, Transport.UDP

@@ -8,10 +8,21 @@ import pytest
 
 from smartcam.protocols import BVS, FramedDialect, HeaderLayout, Protocol, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, MESSAGES, THESIS
 from smartcam.protocols._inside import DEFAULT_PORT, HANDBOOK, MessageId
 from smartcam.registry import PROTOCOLS
-from tests.machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, label
+from tests.machines import (
+    B16,
+    BID,
+    BIG_ENDIAN_NUMBER,
+    CODE,
+    DIALECTS,
+    MESSAGES,
+    NO_ID,
+    THESIS,
+    camera,
+    client,
+    label,
+)
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
 

@@ -10,10 +10,18 @@ from smartcam.exceptions import MessageError, ProtocolError
 from smartcam.models import Status
 from smartcam.protocols import FramedDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._framed.constructs import FieldView, frame_view
 from smartcam.protocols._inside import HANDBOOK, Framer, view_fields
-from tests.machines import BIG_ENDIAN_NUMBER, DIALECTS, EVERYTHING, EXAMPLES, label
+from tests.machines import (
+    B16,
+    BID,
+    BIG_ENDIAN_NUMBER,
+    DIALECTS,
+    EVERYTHING,
+    EXAMPLES,
+    THESIS,
+    label,
+)
 from tests.strategies import messages, over, streams
 
 CAMERA = m.Sender.CAMERA

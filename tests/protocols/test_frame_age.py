@@ -8,11 +8,10 @@ from smartcam.exceptions import FrameError
 from smartcam.models import Status
 from smartcam.protocols import FramedDialect, LinkFailed, Machine, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, THESIS
-from smartcam.protocols._framed.dialect import MAX_SURPLUS
+from smartcam.protocols._framed.dialect import MAX_SURPLUS_BYTES
 from smartcam.protocols._framed.frame_age import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event
-from tests.machines import DIALECTS, camera, client, label
+from tests.machines import B16, DIALECTS, THESIS, camera, client, label
 from tests.strategies import over
 
 RESULT, UNKNOWN = 0x20, 0x77
@@ -67,7 +66,7 @@ def test_length_far_beyond_the_documented_one_is_refused_at_the_header(
     dialect: FramedDialect, number: int, lengths: range
 ) -> None:
     longest = lengths.stop - 1
-    assert longest - MAX_SURPLUS in range(2, 33)
+    assert longest - MAX_SURPLUS_BYTES in range(2, 33)
     assert read(client(dialect), dialect.header.pack(number, longest), 0.0) == []
     head = dialect.header.pack(number, longest + 1)
     for body in (b"", bytes(longest + 1)):
@@ -84,7 +83,7 @@ def test_messages_with_a_documented_length_are_all_but_the_result_container() ->
 
 @pytest.mark.parametrize("pieces", [1, 2])
 def test_length_within_the_slack_is_accepted_and_counted(pieces: int) -> None:
-    made, data = client(), HANDBOOK.encode(STATUS)[12:].ljust(8 + MAX_SURPLUS, b"\0")
+    made, data = client(), HANDBOOK.encode(STATUS)[12:].ljust(8 + MAX_SURPLUS_BYTES, b"\0")
     frame = HANDBOOK.header.pack(0x12, len(data)) + data
     cut = len(frame) // pieces
     assert read(made, frame[:cut], 0.0) + read(made, frame[cut:], 0.0) == [STATUS]
@@ -101,7 +100,7 @@ def test_length_that_is_not_documented_may_be_what_is_accepted_of_any(
 
 def test_length_beyond_the_documented_one_is_dropped_from_datagrams() -> None:
     made = client(HANDBOOK, Transport.UDP)
-    size = 8 + MAX_SURPLUS + 1
+    size = 8 + MAX_SURPLUS_BYTES + 1
     made.receive_data(HANDBOOK.header.pack(0x12, size) + bytes(size))
     assert (made.events(), made.counters.ignored_frames) == ([], 1)
     made.receive_data(HANDBOOK.encode(STATUS))
@@ -236,7 +235,7 @@ def test_header_in_a_frame_that_comes_without_delay_is_data(dialect: FramedDiale
 @with_magic
 @pytest.mark.parametrize(
     ("number", "size"),
-    [(UNKNOWN, 8), (0x12, 7), (0x12, 8 + MAX_SURPLUS + 1), (RESULT, 3), (RESULT, 1 << 21)],
+    [(UNKNOWN, 8), (0x12, 7), (0x12, 8 + MAX_SURPLUS_BYTES + 1), (RESULT, 3), (RESULT, 1 << 21)],
 )
 def test_magic_number_alone_is_no_header(dialect: FramedDialect, number: int, size: int) -> None:
     made, inside = client(dialect), dialect.header.pack(number, size)

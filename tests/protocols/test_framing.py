@@ -9,9 +9,8 @@ import pytest
 
 from smartcam.exceptions import FrameError
 from smartcam.protocols import Frame, FramedDialect, HeaderLayout
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Framer
-from tests.machines import DIALECTS
+from tests.machines import B16, BID, DIALECTS, THESIS
 
 MAGIC = bytes.fromhex("50535642")
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")

@@ -16,9 +16,9 @@ from smartcam.models import Status
 from smartcam.protocols import INSIGHT, Frame, LinkEnded, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Event
-from smartcam.protocols._insight.dialect import NATIVE
-from smartcam.protocols._insight.machine import READ_SIZE, Command, InSightMachine, Piece, Reply
-from smartcam.protocols._insight.words import MAX_LINE
+from smartcam.protocols._insight.machine import MAX_READ_BYTES, Command, Piece, Reply
+from smartcam.protocols._insight.words import MAX_LINE_BYTES
+from tests.protocols.inside import NATIVE, InSightMachine
 from tests.protocols.insight_lines import (
     BITMAP,
     DIGITS,
@@ -225,15 +225,15 @@ def test_login_line_without_an_end_fails() -> None:
     talk = Talk()
     talk.send(m.Connect())
     talk.hear(b"Welcome to In-Sight " * 300)
-    assert failure(talk) == f"a line of more than {MAX_LINE} bytes came"
+    assert failure(talk) == f"a line of more than {MAX_LINE_BYTES} bytes came"
 
 
 def test_login_flood_before_connect_fails() -> None:
     talk = Talk()
-    talk.hear(b"x" * 2 * MAX_LINE)
+    talk.hear(b"x" * 2 * MAX_LINE_BYTES)
     assert talk.told() == []
     talk.hear(b"x")
-    assert failure(talk) == f"more than {2 * MAX_LINE} bytes came before the login"
+    assert failure(talk) == f"more than {2 * MAX_LINE_BYTES} bytes came before the login"
 
 
 def test_login_greeting_that_never_ends_fills_no_memory() -> None:
@@ -342,7 +342,7 @@ def test_get_status_in_line_is_not_repeated() -> None:
     assert talk.hear(b"1\r\n") == b""
 
 
-@pytest.mark.parametrize("name", ["a\r\nSO1", "\u65e5\u672c.job", "x" * MAX_LINE, "a\0b"])
+@pytest.mark.parametrize("name", ["a\r\nSO1", "\u65e5\u672c.job", "x" * MAX_LINE_BYTES, "a\0b"])
 def test_load_file_that_cannot_be_sent_is_refused_and_changes_nothing(name: str) -> None:
     talk = Talk().logged_in()
     talk.send(m.Trigger())
@@ -418,8 +418,8 @@ BROKEN: list[tuple[m.Message, bytes, str]] = [
     (m.Query(), b"1\r\n7a\r\n", "'7a' came, the id of a job was expected"),
     (m.Query(), b"1\r\n1000\r\n", "'1000' came, the id of a job was expected"),
     (m.Query(), b"1\r\n" + b"1" * 4000 + b"\r\n", "the id of a job was expected"),
-    (m.Query(), b"x" * (MAX_LINE + 2), f"a line of more than {MAX_LINE} bytes came"),
-    (m.Query(), b"1\n7\n" * MAX_LINE, f"a line of more than {MAX_LINE} bytes came"),
+    (m.Query(), b"x" * (MAX_LINE_BYTES + 2), f"a line of more than {MAX_LINE_BYTES} bytes came"),
+    (m.Query(), b"1\n7\n" * MAX_LINE_BYTES, f"a line of more than {MAX_LINE_BYTES} bytes came"),
     (m.Query(), b"-2\r\n-2\r\n", "'-2' came, nothing was asked"),
     (m.Start(), b"1\r\n\r\n", "'' came, nothing was asked"),
     (m.ReadImage(), b"1\r\nbig\r\n", "'big' came, an image's size was expected"),
@@ -507,7 +507,7 @@ def converse(requests: list[m.Message], pieces: list[bytes], *, login: bool) -> 
     for piece in pieces:
         written += talk.hear(piece)
         told += talk.told()
-        assert talk.machine.buffered <= MAX_LINE + 100 + len(piece)
+        assert talk.machine.buffered <= MAX_LINE_BYTES + 100 + len(piece)
     assert all(not isinstance(one, LinkFailed) for one in told[:-1])
     talk.machine.receive_eof()
     # by their texts: errors have no equals
@@ -539,7 +539,7 @@ def test_room_takes_what_a_link_writes_into_it() -> None:
     talk = Talk()
     talk.send(m.Connect())
     room = talk.machine.room()
-    assert len(room) == READ_SIZE
+    assert len(room) == MAX_READ_BYTES
     room[: len(LOGIN)] = LOGIN
     assert talk.machine.filled(len(LOGIN))
     assert talk.told() == [WELCOME]
@@ -664,5 +664,5 @@ def test_body_is_the_data_or_an_error() -> None:
 def test_command_that_is_none_cannot_be_made() -> None:
     with pytest.raises(ConfigurationError, match="it begins with none of GO, SO"):
         Command(line="HELO")
-    with pytest.raises(ConfigurationError, match=f"at most {MAX_LINE} bytes can be sent"):
-        Command(line="EV " + "x" * MAX_LINE)
+    with pytest.raises(ConfigurationError, match=f"at most {MAX_LINE_BYTES} bytes can be sent"):
+        Command(line="EV " + "x" * MAX_LINE_BYTES)

@@ -13,15 +13,13 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from smartcam.emulator._clock import NANOSECONDS
-from smartcam.emulator._insight.commands import InSightCommands
-from smartcam.emulator._insight.device import InSightDevice
 from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import State
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ONLINE, Event
 from smartcam.protocols._insight.machine import Command, Reply
 from smartcam.protocols._insight.words import command_reader
+from tests.emulator.parts import insight, pass_time
 from tests.protocols.insight_lines import LOGIN, Talk, with_cells
 
 REQUESTS: list[m.Message] = [
@@ -59,8 +57,7 @@ class Wires(RuleBasedStateMachine):
         runs = itertools.count(1)
         job = {"cells": {"A1": lambda _: next(runs)}, "load_time": 0.3}
         jobs = [{**job, "file": file} for file in ("7bolts.job", "12nuts.job", "spare.job")]
-        self.device = InSightDevice(jobs, online=True)
-        self.commands = InSightCommands(self.device)
+        self.device, self.commands = insight(jobs)
         self.heard = command_reader()
         self.busy = self.going = False
         self.to_camera, self.to_client = bytearray(), bytearray(LOGIN)
@@ -120,7 +117,7 @@ class Wires(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([0.01, 0.05, 0.3]))
     def pass_time(self, seconds: float) -> None:
-        self.device.advance_to(self.device.now + round(seconds * NANOSECONDS))
+        pass_time(self.device, seconds)
         self.modes.add(self.device.online)
 
     @rule(online=st.booleans())

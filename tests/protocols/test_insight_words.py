@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.protocols._inside import StatusCode, words
-from smartcam.protocols._insight.answers import MAX_IMAGE, AnswerReader, CommandAnswer
+from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES, AnswerReader, CommandAnswer
 from smartcam.protocols._insight.words import AnswerForm, Cell, hex_lines
 from smartcam.protocols._line_reader import LineReader
 from tests.protocols.insight_lines import BITMAP, DIGITS, IMAGE_LINES, crc
@@ -136,7 +136,7 @@ def test_hex_lines_have_eighty_digits_and_a_checksum(
 # ---------------------------------------------------------------------- lines
 
 
-def camera_reader(max_line: int = words.MAX_LINE) -> LineReader:
+def camera_reader(max_line: int = words.MAX_LINE_BYTES) -> LineReader:
     return LineReader(words.ENDS, max_line=max_line, encoding=words.ENCODING)
 
 
@@ -299,9 +299,9 @@ def test_sized_text_longer_than_accepted_is_refused_before_it_comes() -> None:
 def test_image_larger_than_accepted_is_refused_at_its_header() -> None:
     reader = Pieces().reader
     reader.expect(AnswerForm.HEX)
-    header = (b"BM" + struct.pack("<I", MAX_IMAGE + 1)).hex().encode()
+    header = (b"BM" + struct.pack("<I", MAX_IMAGE_BYTES + 1)).hex().encode()
     reader.feed(b"1\r\n1\r\n" + header + b"\r\n")
-    with pytest.raises(FrameError, match=f"a bitmap of {MAX_IMAGE + 1} bytes comes; at most"):
+    with pytest.raises(FrameError, match=f"a bitmap of {MAX_IMAGE_BYTES + 1} bytes comes; at most"):
         reader.next_answer()
 
 
@@ -362,9 +362,16 @@ def test_image_with_a_line_too_long_among_others_is_refused() -> None:
     reader = Pieces().reader
     reader.expect(AnswerForm.HEX)
     header = (b"BM" + struct.pack("<I", 1 << 20)).hex().encode()
-    lines = [b"1", b"1", header, b"00", b"00" * (words.MAX_LINE // 2), b"0" * (words.MAX_LINE + 2)]
+    lines = [
+        b"1",
+        b"1",
+        header,
+        b"00",
+        b"00" * (words.MAX_LINE_BYTES // 2),
+        b"0" * (words.MAX_LINE_BYTES + 2),
+    ]
     reader.feed(b"".join(line + b"\r\n" for line in lines))
-    with pytest.raises(FrameError, match=f"a line of more than {words.MAX_LINE} bytes came"):
+    with pytest.raises(FrameError, match=f"a line of more than {words.MAX_LINE_BYTES} bytes came"):
         reader.next_answer()
 
 

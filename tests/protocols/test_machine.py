@@ -30,16 +30,18 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
-from smartcam.protocols._framed.machine import MAX_FAMILIAR, TRANSITIONS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event, Policy, ResultBurst
 from tests.machines import (
+    B16,
+    BID,
     BIG_ENDIAN_NUMBER,
     CODE,
     DIALECTS,
     EVERYTHING,
     EXAMPLES,
     NO_ID,
+    THESIS,
+    TRANSITIONS,
     camera,
     carried,
     client,
@@ -50,6 +52,9 @@ from tests.machines import (
     request_for,
 )
 from tests.strategies import over
+
+MAX_FAMILIAR = 64
+
 
 TCP, UDP = Transport.TCP, Transport.UDP
 CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA
@@ -951,12 +956,12 @@ def test_burst_pays_for_one_answer_where_containers_were_asked_for() -> None:
         made.send(request, answered=True)
 
 
-def test_trace_sees_each_container_and_there_is_no_burst() -> None:
+def test_trace_sees_each_container_of_a_burst() -> None:
     seen: list[Frame | RemoteProtocolError] = []
     made = client(trace=lambda sender, frame: seen.append(frame))
     del seen[:]
     made.receive_data(HANDBOOK.encode(result(b"a")) * 3)
-    assert made.events() == [result(b"a")] * 3
+    assert made.events() == [ResultBurst(application=21, data=[b"a"] * 3, size=3)]
     assert seen == [HANDBOOK.to_frame(result(b"a"))] * 3
 
 

@@ -22,10 +22,9 @@ from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import Frame, FramedDialect, HeaderLayout, LinkFailed, Machine, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._framed import framing, machine
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Framer, Policy, ResultBurst
-from tests.machines import DIALECTS, client, label, one_by_one
+from tests.machines import DIALECTS, THESIS, client, label, one_by_one
 
 LARGE, FIRST_READ, MAX_READ, ALIKE = 32, 32, 128, 3
 SIZES = st.one_of(
@@ -184,8 +183,8 @@ def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
         rooms.append(len(framer.room()))
         stream = stream[read_into(framer, stream, 1 << 30) :]
         assert taken(framer)
-    doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ).bit_length()
-    growing = [framing.FIRST_READ << turn for turn in range(doublings)]
+    doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ_BYTES).bit_length()
+    growing = [framing.FIRST_READ_BYTES << turn for turn in range(doublings)]
     assert rooms[:doublings] == growing
     assert {*rooms[doublings:]} == {framing.MAX_READ_BYTES}
     read_into(framer, b"P", 1)
@@ -319,7 +318,7 @@ def test_bursts_and_what_came_before_are_the_frames_that_come_one_by_one(
     expected = outcome(alone, events[0])
     assert outcome(fed, one_by_one(events[1])) == expected
     assert outcome(written, one_by_one(events[2])) == expected
-    assert outcome(looked_at, events[3]) == expected  # not a burst among them
+    assert outcome(looked_at, one_by_one(events[3])) == expected
     heard = [what for sender, what in traced if sender is m.Sender.CAMERA]
     frames = [what for what in heard if isinstance(what, Frame)]
     assert len(frames) == looked_at.counters.frames_received

@@ -25,7 +25,6 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from smartcam.emulator._bvs.device import OPERATOR_CONDITIONS
 from smartcam.models import Status
 from smartcam.protocols import Role, Transport
 from smartcam.protocols import messages as m
@@ -234,7 +233,7 @@ class Cores(RuleBasedStateMachine):
         self.station.operate("switch_application", application, running=running)
 
     @only_with("faults")
-    @rule(what=st.sampled_from([*OPERATOR_CONDITIONS]), on=st.booleans())
+    @rule(what=st.sampled_from([Status.OVERHEAT, Status.SYSTEM_ERROR]), on=st.booleans())
     def operate_condition(self, what: Status, on: bool) -> None:
         self.station.operate("set_condition", what, on)
 

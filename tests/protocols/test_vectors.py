@@ -11,15 +11,17 @@ import pytest
 from smartcam.models import Status
 from smartcam.protocols import Frame, FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
-from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._inside import HANDBOOK, Framer
 from tests import ROOT
 from tests.machines import (
+    B16,
+    BID,
     BIG_ENDIAN_NUMBER,
     CODE,
     DIALECTS,
     NO_ID,
+    THESIS,
+    TRANSITIONS,
     camera,
     client,
     feed,

@@ -9,9 +9,9 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
-from smartcam.fleet._file.fleet_file import FramesEntry
+import pytest
+
+from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
 from smartcam.recording._folder import FileName, files_of
@@ -24,11 +24,11 @@ from smartcam.recording._recorder import MAX_WAITING_BYTES
 from smartcam.recording._replays.pictures import ReplayedPictures
 from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
+from tests.recording.inside import _recorder as recorder
 
 __all__ = [
     "MAX_WAITING_BYTES",
     "NAME",
-    "FramesEntry",
     "PictureMatcher",
     "RecordedPicture",
     "ReplayedPictures",
@@ -105,6 +105,12 @@ def files(folder: Path, camera: str = NAME) -> list[Path]:
 def runs(found: Recording, camera: str = NAME) -> list[int]:
     """Return the numbers that the camera's results have."""
     return [result.value["run"] for result in found.results(camera)]
+
+
+def write_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a folder's files written in many small chunks, however slow the machine is."""
+    monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
+    monkeypatch.setattr(recorder, "CHUNK", 1000)
 
 
 def all_runs(folder: Path, camera: str = NAME) -> list[int]:

@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from smartcam.recording import FleetRecorder, load_recording
-from smartcam.recording._mcap.form import GAP
 from tests.fleet.fleetkit import NumberedCamera
 from tests.recording.folderkit import NAME, files, runs, section, server, until
+
+GAP = "RecordingGap"
+
 
 DISK = 12 << 20
 

@@ -35,6 +35,7 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Result,
@@ -45,10 +46,10 @@ from smartcam.models import (
 from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording, write_bag
 from smartcam.recording._bags.items import topic_of_camera
 from smartcam.recording._inside import BagConversion
-from smartcam.recording._mcap.form import nanoseconds as recorded_time
-from smartcam.ros2._types.stores import stored
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
+from tests.recording.inside import nanoseconds as recorded_time
 from tests.recording.recordingkit import COUNTER, URL, at, container, containers, session, write
+from tests.ros2.typekit import forget_stores
 
 if TYPE_CHECKING:
     from smartcam.recording import Recording
@@ -445,9 +446,11 @@ def test_bag_value_that_is_nearly_a_localization_is_none(tmp_path: Path) -> None
         {"photo_index": 1.5},
         {"feature_id": 3},
         {"pose": {"position": {}}},
+        {"pose": {**good["pose"], "sigma": {"x": 0.1}}},
         {"more": 1},
     ]
-    items = [result(number, [{**good, **one}]) for number, one in enumerate([{}, *broken])]
+    sigma = {"pose": jsonable(part().pose.with_sigma(PoseSigma(1e-4, 2e-4, 1e-3, 0.5)))}
+    items = [result(number, [{**good, **one}]) for number, one in enumerate([sigma, *broken])]
     recording = write(tmp_path / "run.mcap", items)
     assert write_bag(recording, tmp_path / "bag").localizations == 1
     messages = read(tmp_path / "bag")
@@ -630,7 +633,7 @@ def test_bag_without_a_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
-    stored.cache_clear()
+    forget_stores()
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\['):
         BagRecorder(tmp_path / "bag").open()
     assert list(tmp_path.iterdir()) == []

@@ -20,13 +20,13 @@ from smartcam.observers import TraceEntry
 from smartcam.recording import Recorder, load_recording
 from smartcam.recording._mcap import bodies as _bodies
 from smartcam.recording._mcap.bodies import LastBodies
-from smartcam.recording._mcap.form import KINDS
+from tests.recording.inside import KINDS
 from tests.recording.recordingkit import COUNTER, at, containers, record
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from smartcam.recording._mcap.form import Item
+    from tests.recording.inside import Item
 
 CAMERAS = ("left", "right")
 

@@ -16,14 +16,13 @@ import smartcam
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, FrameSourceError
 from smartcam.fleet import load_fleet
-from smartcam.frames import FrameSource
 from smartcam.recording import FleetReplay, Recorder, load_recording
 from tests.fleet.fleetkit import NumberedCamera
+from tests.fleet.framekit import give_source
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.recording.folderkit import (
     MAX_WAITING_BYTES,
     NAME,
-    FramesEntry,
     PictureMatcher,
     RecordedPicture,
     ReplayedPictures,
@@ -77,7 +76,7 @@ async def device(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Device]:
     monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
     monkeypatch.setattr(folder_pictures, "RETRY", Backoff(initial=0.01, maximum=0.05))
     made = Device()
-    monkeypatch.setattr(FramesEntry, "source", lambda *_: FrameSource(made, stall=None))
+    give_source(monkeypatch, made)
     showing = asyncio.create_task(made.show())
     yield made
     showing.cancel()

@@ -18,10 +18,11 @@ from typing import Any
 
 import pytest
 
-from smartcam._client._inside import TriggerRequest
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
-from smartcam.fleet._agent.shared import Carrier
 from smartcam.models import ApplicationChanged, Connected, Result, Status, StatusChanged
+from smartcam.observers import RawFrame
+from smartcam.protocols import BVS
+from smartcam.protocols.messages import Sender
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folders import files as folder_files
@@ -31,7 +32,7 @@ from smartcam.recording._folders.track import CameraTrack
 from smartcam.recording._mcap.form import GAP, load_compress
 from smartcam.recording._replays.schedule import plan_replay
 from smartcam.recording._state import RecordedState
-from tests.fleet.fleetkit import NumberedCamera
+from tests.fleet.fleetkit import NumberedCamera, trigger_request
 from tests.recording.folderkit import (
     NAME,
     all_runs,
@@ -388,7 +389,8 @@ async def test_record_that_makes_no_json_is_counted_and_the_rest_is_written(
             for _ in range(5000):
                 deep = [deep]
             odd = frame(0, "> Query", odd=deep)._replace(camera=NAME)
-            agent.observers[0].on_frame(odd)
+            dialect = BVS.dialects["handbook"]
+            agent.observers[0].on_raw_frame(RawFrame(odd.at, NAME, dialect, Sender.CLIENT, odd))
             await agent.hosts[NAME].camera.trigger()
         assert recorder.accounts[NAME].lost == 1
     assert all_runs(tmp_path) == [1]
@@ -474,7 +476,7 @@ async def test_errors_of_programs_triggers_are_recorded(tmp_path: Path) -> None:
     async with NumberedCamera() as box, recording(tmp_path, box.url) as (_, agent):
         host = agent.hosts[NAME]
         await host.camera.stop()
-        request = TriggerRequest(Carrier(), None, 1, True)
+        request = trigger_request()
         with pytest.raises(NotRunningError):
             await host.camera.trigger_for(request, None, 1.0)
     errors = [one.error for one in load_recording(tmp_path / "rec").errors()]

@@ -25,17 +25,10 @@ from smartcam.recording import Recorder, ReplayedCamera, load_recording, write_p
 from smartcam.recording import _reader as reader
 from smartcam.recording._mcap import form as forms
 from smartcam.recording._mcap import records as bounds
-from smartcam.recording._mcap.form import (
-    FORMAT,
-    KINDS,
-    MAX_VALUES,
-    PICTURE_SCHEMAS,
-    RecordedPicture,
-    message_fields,
-    message_of,
-)
+from smartcam.recording._mcap.form import FORMAT, MAX_VALUES, PICTURE_SCHEMAS, RecordedPicture
 from smartcam.recording._pictures import messages as pictures
 from smartcam.recording._replays import schedule as plans
+from tests.recording.inside import KINDS, message_fields, message_of
 from tests.recording.picturekit import VARIED, all_formats, same, shot
 from tests.recording.recordingkit import at, container, frame, session, status, write
 
@@ -99,7 +92,7 @@ def written(path: Path, *records: bytes) -> Path:
 def test_load_recording_chunk_that_unpacks_beyond_the_bound_is_refused(
     tmp_path: Path, how: str, said: int | None
 ) -> None:
-    path = written(tmp_path / "bomb.mcap", chunk(bytes(3 * bounds.MAX_CHUNK), how, said))
+    path = written(tmp_path / "bomb.mcap", chunk(bytes(3 * bounds.MAX_CHUNK_BYTES), how, said))
     tracemalloc.start()
     try:
         with pytest.raises(RecordingError) as told:
@@ -108,8 +101,8 @@ def test_load_recording_chunk_that_unpacks_beyond_the_bound_is_refused(
     finally:
         tracemalloc.stop()
     assert str(told.value).startswith(f"recording {path}: a chunk unpacks to more than ")
-    assert str(told.value).endswith(f" bytes, expected {bounds.MAX_CHUNK} at most")
-    assert most < 2 * bounds.MAX_CHUNK
+    assert str(told.value).endswith(f" bytes, expected {bounds.MAX_CHUNK_BYTES} at most")
+    assert most < 2 * bounds.MAX_CHUNK_BYTES
 
 
 @pytest.mark.parametrize("how", ["zstd", "lz4", ""])
@@ -134,7 +127,7 @@ def test_load_recording_more_records_than_bytes_is_refused(tmp_path: Path, small
 def test_load_recording_many_chunks_of_nothing_new_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MIN_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MIN_UNPACKED_BYTES", 1 << 20)
     padding = record(0x77, bytes(1 << 22))
     with pytest.raises(RecordingError, match=r"bytes of the file unpack to .*, expected 10000 for"):
         load_recording(written(tmp_path / "bomb.mcap", *[chunk(padding)] * 2))
@@ -143,7 +136,7 @@ def test_load_recording_many_chunks_of_nothing_new_are_refused(
 def test_load_recording_results_of_one_frame_again_and_again_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MIN_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MIN_UNPACKED_BYTES", 1 << 20)
     large = message(message_of("frames", container(0, bytes(1 << 16))), 2)
     small = {**RESULT, "raw_from": 0}
     del small["raw"]
@@ -182,7 +175,7 @@ def test_replay_of_more_than_fits_into_memory_is_refused(
     data = {"application": 5, "data": "00" * 600}
     items = [*session(), *(frame(1 + n, "< ResultContainer", **data) for n in range(2))]
     recording = write(tmp_path / "run.mcap", items)
-    monkeypatch.setattr(plans, "MAX_REPLAY", 1000)
+    monkeypatch.setattr(plans, "MAX_REPLAY_BYTES", 1000)
     with pytest.raises(RecordingError, match="1200 bytes of containers"):
         ReplayedCamera(recording)
 
@@ -190,7 +183,7 @@ def test_replay_of_more_than_fits_into_memory_is_refused(
 def test_recorder_message_that_could_not_be_read_ends_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(forms, "MAX_MESSAGE", 1000)
+    monkeypatch.setattr(forms, "MAX_MESSAGE_BYTES", 1000)
     recorder = Recorder(tmp_path / "run.mcap").open()
     recorder.on_frame(frame(0, "> Trigger", data="0" * 1000))
     with pytest.raises(RecordingError, match=r"a message of \d+ bytes, expected 1000 at most"):
@@ -204,7 +197,7 @@ def test_load_recording_real_ones_stay_far_below_the_bounds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, container: bytes, seconds: int
 ) -> None:
     # nothing but zeros, and a minute that is nothing but statuses and containers
-    for name in ("MIN_RECORDS", "MIN_UNPACKED"):
+    for name in ("MIN_RECORDS", "MIN_UNPACKED_BYTES"):
         monkeypatch.setattr(bounds, name, getattr(bounds, name) >> 8)
     monkeypatch.setattr(reader, "MIN_VALUES", 1 << 14)
     items: list[Any] = session()
@@ -310,7 +303,7 @@ def test_load_recording_message_that_is_no_object_is_told(tmp_path: Path, body: 
         record(4, b"x"),
         record(6, b"x" * 30),
         record(12, b"\xff\xff\xff\xff"),
-        record(12, bytes(bounds.MAX_FACTS + 1)),
+        record(12, bytes(bounds.MAX_FACTS_BYTES + 1)),
         struct.pack("<BQ", 6, 1 << 60),
         chunk(message(RESULT)[:-3]),
         chunk(b"\x05\x00"),

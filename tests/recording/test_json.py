@@ -27,18 +27,22 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Result,
     Status,
     jsonable,
 )
-from smartcam.observers import TraceEntry
-from smartcam.recording._mcap.form import KINDS, message_fields, message_of, nanoseconds
+from smartcam.observers import RawFrame, TraceEntry
+from smartcam.protocols import BVS, INSIGHT, Frame
+from smartcam.protocols.messages import Sender
+from smartcam.recording._mcap.json import MAX_FRAMES_ALIKE, FrameTexts, body_of, frame_text
+from tests.recording.inside import KINDS, message_fields, message_of, nanoseconds
 from tests.recording.recordingkit import at
 
 if TYPE_CHECKING:
-    from smartcam.recording._mcap.form import Item
+    from tests.recording.inside import Item
 
 Pair = namedtuple("Pair", "left right")  # noqa: PYI024 - as somebody's plug-in has it
 
@@ -98,6 +102,29 @@ def test_text_is_that_of_the_standard_library(fields: dict[str, Any]) -> None:
     assert object_text(plain(fields)) == text
 
 
+COLUMNS = st.sampled_from(["<i2", ">i4", "u1", "<u8", "<f2", "<f4", ">f8", "?", "S3", "U2"])
+SHAPES = st.sampled_from([(), (0,), (1,), (3,), (2, 2)])
+
+
+@given(
+    st.dictionaries(st.text(min_size=1, max_size=4), COLUMNS, min_size=1, max_size=4),
+    SHAPES,
+    st.binary(min_size=400, max_size=400),
+)
+@example({"100%": "<f4", '"': "S3"}, (1,), bytes(400))
+@example({"x": "<f4", "y": "<f8"}, (3,), b"\xff" * 400)  # NaN
+@example({"x": "<f8"}, (3,), bytes.fromhex("000000000000f07f") * 50)  # infinity
+def test_text_of_a_table_is_that_of_the_standard_library(
+    columns: dict[str, str], shape: tuple[int, ...], data: bytes
+) -> None:
+    if {"?", "U2"} & {*columns.values()}:
+        data = bytes(len(data))  # not every byte is one of these
+    dtype = np.dtype([*columns.items()])
+    count = int(np.prod(shape))
+    table = np.frombuffer(data, dtype=dtype, count=count).reshape(shape)
+    assert text_of(table) == json.dumps(jsonable(table), separators=(",", ":"))
+
+
 @pytest.mark.parametrize(
     "value", [[{"x": (1, 2)}], [[1.5], None], {"of": [b"\xff"]}, Fraction(1, 2)]
 )
@@ -113,6 +140,7 @@ def test_text_is_made_while_another_thread_imports_numpy(
 @example([PART])  # integers where there are floats otherwise
 @example([PART._replace(quality=np.float32(0.5))])
 @example([PART._replace(quality=True)])
+@example([PART._replace(pose=PART.pose.with_sigma(PoseSigma(0.1, math.nan, 0.2, z=0.3)))])
 @example([PART._replace(pose=None)])
 @example([PART._replace(photo_index="first")])
 def test_result_is_written_as_the_slow_way_writes_it(value: Any) -> None:
@@ -247,3 +275,46 @@ def test_data_of_a_frame_begins_within_it(data_from: int) -> None:
 def test_nanoseconds_are_exact_and_never_negative(when: datetime) -> None:
     since = when - datetime(1970, 1, 1, tzinfo=UTC)
     assert nanoseconds(when) == max(0, since // timedelta(microseconds=1) * 1000)
+
+
+DIALECTS = [*BVS.dialects.values(), *INSIGHT.dialects.values()]
+
+
+@given(
+    frames=st.lists(
+        st.tuples(
+            st.sampled_from(DIALECTS),
+            st.sampled_from(Sender),
+            # ids with data and without, and one that nobody has
+            st.sampled_from([0x20, 0x21, 0x40, 0x41, 0x81, 0xFE]) | st.integers(0, 255),
+            # fronts that come again, with other data behind them
+            st.sampled_from([b"", bytes(2), bytes(4), b"\x05\0\0\0", bytes(6)]),
+            st.binary(max_size=12),
+        ),
+        max_size=30,
+    )
+)
+def test_texts_of_frames_that_are_alike_are_those_of_each(
+    frames: list[tuple[Any, Sender, int, bytes, bytes]],
+) -> None:
+    texts = FrameTexts()
+    for second, (dialect, sender, message_id, front, data) in enumerate(frames * 2):
+        raw = RawFrame(at(second), "left", dialect, sender, Frame(message_id, front + data))
+        entry = raw.entry()
+        assert texts.text(raw) == (frame_text(entry), body_of(entry))
+
+
+def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
+    texts, dialect = FrameTexts(), BVS.dialects["handbook"]
+    (result,) = (
+        number
+        for number in range(256)
+        if dialect.data_begins(Sender.CAMERA, number) is not None
+        and RawFrame(at(0), "left", dialect, Sender.CAMERA, Frame(number, bytes(8))).entry().message
+        == "ResultContainer"
+    )
+    for length in range(1000):
+        raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
+        entry = raw.entry()
+        assert texts.text(raw) == (frame_text(entry), body_of(entry))
+        assert 0 < len(texts._known) <= MAX_FRAMES_ALIKE

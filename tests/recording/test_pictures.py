@@ -45,6 +45,7 @@ from smartcam.recording import (
     load_recording,
     replay,
 )
+from smartcam.recording._inside import JudgedPictures
 from tests.frames.drivers import ShowingDriver
 from tests.recording.picturekit import BEGIN, VARIED, result, same, shot
 from tests.recording.recordingkit import at, session, write
@@ -503,6 +504,35 @@ async def test_size_that_changes_is_played_as_it_changes(tmp_path: Path) -> None
 
 
 # ---------------------------------------------------------------------- beside results
+
+
+class _Late(_Burst):
+    """Gives its frames when it is told to, as an agent that begins to stream does."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        super().__init__(frames)
+        self.go_on = asyncio.Event()
+
+    async def show(self, sink: FrameSink) -> None:
+        await self.go_on.wait()
+        await super().show(sink)
+
+
+async def test_trigger_waits_for_the_first_picture_of_those_that_results_are_made_of(
+    tmp_path: Path,
+) -> None:
+    driver = _Late([shot(1)])
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        found = JudgedPictures(recorder)
+        async with FrameSource(driver) as source:
+            recording = asyncio.create_task(found.record(source, "left"))
+            waiting = asyncio.create_task(found.wait_streaming())
+            await asyncio.sleep(0.05)
+            assert not waiting.done()
+            driver.go_on.set()
+            await waiting
+            recording.cancel()
+            await asyncio.wait({recording})
 
 
 def test_result_has_the_picture_that_the_recorder_was_told(tmp_path: Path) -> None:

@@ -16,8 +16,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 
 import smartcam
-from smartcam.emulator import EmulatedCamera, EmulatedInSight
-from smartcam.emulator._insight.job import BUILTIN_JOBS
+from smartcam.emulator import EmulatedCamera, EmulatedInSight, Job
 from smartcam.exceptions import (
     ConfigurationError,
     MissingExtraError,
@@ -26,8 +25,8 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Connected, Disconnected, Result, StatusChanged
 from smartcam.recording import Recorder, load_recording
-from smartcam.recording import _recorder as recorder
-from smartcam.recording._mcap.form import KINDS
+from tests.recording.inside import KINDS
+from tests.recording.inside import _recorder as recorder
 from tests.recording.recordingkit import COUNTER, at, frame, record, write
 
 
@@ -122,7 +121,9 @@ async def test_recorder_header_and_metadata_tell_the_run(tmp_path: Path) -> None
 
 async def test_recorder_in_sight_password_is_nowhere(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    async with EmulatedInSight(BUILTIN_JOBS, users={"admin": "geheim17"}) as emulator:
+    async with EmulatedInSight(
+        [Job(file="1PartCheck.job", cells={"A1": 101.5})], users={"admin": "geheim17"}
+    ) as emulator:
         url = emulator.url.replace("://", "://admin:geheim17@")
         with Recorder(path) as made:
             async with smartcam.connect(url, name="left", observers=[made]):

@@ -15,8 +15,11 @@ from hypothesis import strategies as st
 import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError
 from smartcam.ros1 import RosbridgeNode, _link, _outbox, _serving
+from smartcam.ros1._link import web_socket
 from smartcam.ros2 import QoS
 from tests.fleet.fleetkit import until
+from tests.frames.pictures import served as listening
+from tests.frames.test_elsewhere import answering, nobody_comes, redirect
 from tests.ros1.bridge import Bridge, Gone
 
 if TYPE_CHECKING:
@@ -800,3 +803,19 @@ async def test_what_ros1_has_not_is_not_asked_for(bridge: Bridge, node: Rosbridg
     with pytest.raises(RosError, match="the node is not open"):
         node.subscribe("text", STRING)
     assert not bridge.heard
+
+
+async def test_a_bridge_that_sends_us_elsewhere_is_none() -> None:
+    async with nobody_comes() as there:
+        for to in (f"http://127.0.0.1:{there.port}/", f"ws://127.0.0.1:{there.port}/", "/other"):
+            asked: list[str] = []
+
+            def answer(path: str, to: str = to, asked: list[str] = asked) -> bytes:
+                asked.append(path)
+                return redirect(to)
+
+            async with listening(answering(answer)) as port:
+                with pytest.raises(OSError, match="got a redirect to"):
+                    async with web_socket(f"ws://127.0.0.1:{port}/"):
+                        pass
+            assert asked == ["/"]

@@ -13,10 +13,10 @@ import pytest
 
 from smartcam._ros_names import full_name, resolve
 from smartcam.emulator import Application, EmulatedCamera, Run
-from smartcam.emulator._application import LOCALIZATIONS
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2 import QoS, RosTypes
 from smartcam.ros2._inside import NativeContext, NativeNode
+from tests.emulator.builtins import LOCALIZATIONS
 from tests.ros2.roskit import DOMAIN, NO_RCLPY
 from tests.timed_loop import TimedLoop
 

@@ -220,7 +220,7 @@ async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
 @contextlib.asynccontextmanager
 async def with_parameters(**options: Any) -> AsyncIterator[tuple[Any, RosParameters]]:
     node = NotedNode()
-    node.parameters = RosParameters(node, served=False)  # type: ignore[arg-type]
+    node.parameters = RosParameters(node, served=False)
     async with seen(node=node, **options) as one:
         yield one, node.parameters
     assert node.parameters.names() == ["use_sim_time"]  # it takes back its own
@@ -304,7 +304,7 @@ def test_options_that_cannot_be() -> None:
 async def test_a_part_that_does_not_start_undoes_the_others(refuses: str) -> None:
     async with box() as emulated, smartcam.connect(emulated.url, name=NAME) as camera:
         node = NotedNode()
-        node.parameters = RosParameters(node, served=False)  # type: ignore[arg-type]
+        node.parameters = RosParameters(node, served=False)
         node.refuses = refuses
         made = CameraNode(camera, node)
         with pytest.raises(RosError, match="refused"):

@@ -12,10 +12,8 @@ import pytest
 
 import smartcam
 from smartcam import Camera
-from smartcam._client.supervisor import TAKEN_WITHIN
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2 import Node, QoS
-from smartcam.ros2._cameras.results import CameraResults
 from smartcam.ros2._inside import DETECTIONS, DRIVER, POSES, RESULT
 from tests.client.clientkit import FAST
 from tests.fleet.fleetkit import Plant, until
@@ -33,6 +31,7 @@ from tests.ros2.camerakit import (
     PartsCamera,
     paper_or_rclpy,
 )
+from tests.ros2.inside import CameraResults
 
 pytestmark = pytest.mark.through_rclpy
 
@@ -121,7 +120,7 @@ async def test_reconnects_lose_nothing_that_came_and_repeat_nothing() -> None:
     async with published(box=box, reconnect=FAST) as (_, camera, node, results):
         direct = camera.results()
         for turn in range(1, 4):
-            await asyncio.sleep(TAKEN_WITHIN + 1)
+            await asyncio.sleep(11.0)  # else it was taken away
             inside(camera)._connection.require_link().abort(ConnectionResetError("pulled"))
             await until(lambda turn=turn: camera.statistics().sessions > turn)
         await asyncio.sleep(5)

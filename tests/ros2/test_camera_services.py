@@ -14,7 +14,6 @@ import smartcam
 from smartcam import Camera, Status
 from smartcam.exceptions import RosError
 from smartcam.ros2 import Node
-from smartcam.ros2._cameras.results import CameraResults
 from smartcam.ros2._cameras.services import CameraServices
 from smartcam.ros2._inside import LATCHED, RESULT
 from tests.fleet.fleetkit import Plant, until
@@ -32,6 +31,7 @@ from tests.ros2.camerakit import (
     PartsCamera,
     paper_or_rclpy,
 )
+from tests.ros2.inside import CameraResults
 
 pytestmark = pytest.mark.through_rclpy
 

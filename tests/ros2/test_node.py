@@ -25,19 +25,14 @@ from smartcam.exceptions import (
 )
 from smartcam.ros2 import Node, QoS, RosContext
 from smartcam.ros2._inside import LATCHED
-from smartcam.ros2._node.attachment import Attachment
-from smartcam.ros2._node.services import MAX_CONCURRENT_CALLS, MAX_REQUEST_BYTES
 from smartcam.testing import LinkProxy
 from tests.processes import free_place
-from tests.ros2.roskit import (
-    PATIENCE,
-    SET_BOOL,
-    STRING,
-    TRIGGER,
-    soon,
-    two_nodes,
-    until,
-)
+from tests.ros2.inside import Attachment
+from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, TRIGGER, soon, two_nodes, until
+
+MAX_CONCURRENT_CALLS = 64
+MAX_REQUEST_BYTES = 16 << 20
+
 
 SUM = "example_interfaces/srv/AddTwoInts"
 

@@ -18,8 +18,8 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.ros2 import Node, RosContext
-from smartcam.ros2._node.qos import PARAMETERS
 from tests.processes import free_place
+from tests.ros2.inside import PARAMETERS
 from tests.ros2.roskit import STRING, soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
@@ -220,10 +220,7 @@ async def test_ten_thousand_names(shared: tuple[Node, Node]) -> None:
     many = [integer("a", 5)] * MANY
     results = (await call(there, "set_parameters", parameters=many)).results
     assert len(results) == MANY
-    for one in (
-        *results,
-        (await call(there, "set_parameters_atomically", parameters=many)).result,
-    ):
+    for one in (*results, (await call(there, "set_parameters_atomically", parameters=many)).result):
         assert not one.successful
         assert "10000 names: expected 1024 at most" in one.reason
     assert here.parameters.get("a") == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 import time
 from dataclasses import replace
@@ -13,8 +14,7 @@ import pytest
 
 from smartcam.calibration import CameraModel
 from smartcam.exceptions import CalibrationError, FrameFormatError, RosMessageError
-from smartcam.frames import Frame, Moment, find_format
-from smartcam.frames._pixels.formats import PIXEL_FORMATS
+from smartcam.frames import Codecs, Frame, Moment, find_format
 from smartcam.ros2 import RosTypes, cloud_from, frame_from, pixels_from
 from smartcam.ros2._cameras.cloud_messages import (
     cloud_fields,
@@ -32,6 +32,7 @@ from smartcam.ros2._cameras.image_messages import (
     prepared,
 )
 from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
+from tests.frames.pictures import RAW_FORMATS as RAW
 
 TYPES = RosTypes("jazzy")
 IMAGE = TYPES.message("sensor_msgs/msg/Image")
@@ -42,7 +43,10 @@ WIDTH, HEIGHT = 12, 6
 UTC = 1_700_000_000.25
 HEADER = header_fields(UTC, "cam")
 
-RAW = [one.name for one in PIXEL_FORMATS if not one.compressed]
+
+async def as_png(frame: Frame) -> Frame:
+    async with Codecs() as codecs:
+        return await codecs.png(frame)
 
 
 def picture(name: str, padding: int = 0, *, whole: bool = True) -> Frame:
@@ -187,7 +191,6 @@ def test_the_format_of_compressed_pictures(name: str, text: str) -> None:
 
 
 def test_compressed_pictures_are_read() -> None:
-    from smartcam.frames._codecs.pictures import to_png
     from smartcam.frames._inside import decoded, to_jpeg
 
     grey = picture("Mono8")
@@ -198,7 +201,7 @@ def test_compressed_pictures_are_read() -> None:
     assert bytes(back.data) == bytes(jpeg.data)
     assert compression(jpeg).text() == "mono8; jpeg compressed mono8"
     depth = picture("Coord3D_C16")
-    png = COMPRESSED.new(**compressed_fields(to_png(depth), "x", "a"))
+    png = COMPRESSED.new(**compressed_fields(asyncio.run(as_png(depth)), "x", "a"))
     assert np.array_equal(decoded(frame_from(png), "Coord3D_C16").array(), depth.array())
     for data in (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"GIF89a"):
         with pytest.raises(FrameFormatError):

@@ -17,9 +17,8 @@ import zenoh.ext
 
 from smartcam.ros2 import Node
 from smartcam.ros2._inside import LATCHED
-from smartcam.ros2._node.attachment import Attachment
-from smartcam.ros2._node.tokens import Entity
 from tests.processes import free_place
+from tests.ros2.inside import Attachment, Entity
 from tests.ros2.roskit import PATIENCE, STRING, TRIGGER, peer, soon, until
 
 pytestmark = pytest.mark.real_time

@@ -12,8 +12,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2 import RosTypes
-from smartcam.ros2._types.built_in import MESSAGES, SERVICES
+from smartcam.ros2._types.built_in import SERVICES
 from smartcam.ros2._types.definitions import parse_message, parse_service
+from tests.ros2.inside import MESSAGES
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical", "rolling")
 

@@ -17,9 +17,9 @@ from smartcam._ros_names import as_name, check_namespace, check_node, resolve
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2 import QoS
 from smartcam.ros2._inside import DRIVER, LATCHED
-from smartcam.ros2._node.attachment import Attachment
-from smartcam.ros2._node.qos import PARAMETERS, SENSOR_DATA
-from smartcam.ros2._node.tokens import Entity, gid_of
+from smartcam.ros2._node.qos import SENSOR_DATA
+from smartcam.ros2._node.tokens import gid_of
+from tests.ros2.inside import PARAMETERS, Attachment, Entity
 
 STRING = "std_msgs::msg::dds_::String_"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -169,12 +169,7 @@ def test_no_attachment_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("name", "full"),
-    [
-        ("/a/b", "/a/b"),
-        ("a/b", "/line1/a/b"),
-        ("~/a", "/line1/cam3/a"),
-        ("~", "/line1/cam3"),
-    ],
+    [("/a/b", "/a/b"), ("a/b", "/line1/a/b"), ("~/a", "/line1/cam3/a"), ("~", "/line1/cam3")],
 )
 def test_names_are_resolved(name: str, full: str) -> None:
     assert resolve(name, "/line1", "cam3") == full

@@ -8,6 +8,7 @@ import numpy as np
 
 from smartcam.ros2._inside import MessageField
 from smartcam.ros2._types.definitions import INTEGERS, NUMBERS
+from smartcam.ros2._types.stores import stored
 
 if TYPE_CHECKING:
     import random
@@ -28,6 +29,11 @@ SHAPES = {
     "BoundedPlainSequences": "<=3",
     "UnboundedSequences": "",
 }
+
+
+def forget_stores() -> None:
+    """Have the messages of ROS read from rosbags anew."""
+    stored.cache_clear()
 
 
 def each(suffix: str, shape: str = "", kinds: tuple[str, ...] = ORDER) -> str:

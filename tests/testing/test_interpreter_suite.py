@@ -7,13 +7,12 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
-from smartcam.interpreters._basic import RecordInterpreter, TableInterpreter
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
@@ -55,7 +54,8 @@ class TestStrings50(InterpreterSuite):
 
 
 class TestRecord(InterpreterSuite):
-    spec, name = RecordInterpreter, "record"
+    spec: ClassVar[Any] = INTERPRETERS.load("record")
+    name = "record"
     samples = (
         ContainerSample(
             struct.pack("<h?f4s", 5, False, 10.0, b"M8"),
@@ -75,7 +75,8 @@ class TestRecord(InterpreterSuite):
 
 
 class TestTable(InterpreterSuite):
-    spec, name = TableInterpreter, "table"
+    spec: ClassVar[Any] = INTERPRETERS.load("table")
+    name = "table"
     samples = (
         ContainerSample(
             struct.pack("<hhhh", 1, 2, 3, 4),

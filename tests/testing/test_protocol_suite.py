@@ -15,11 +15,11 @@ from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import BVS, INSIGHT, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import HANDBOOK, ONLINE
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.conversations import Step
 from tests import ROOT
+from tests.machines import B16, BID, THESIS
 from tests.protocols.insight_lines import BITMAP, GREETING, IMAGE_LINES
 from tests.testing.acme_page import MODULE, TESTS, acme_is_known
 
@@ -71,11 +71,7 @@ def framed(dialect: FramedDialect, transport: Transport) -> Conversation:
     steps += [*sent(m.Disconnect()), *came(m.DisconnectAnswer())]
     name = f"{dialect.label} over {transport.value}"
     return Conversation(
-        name=name,
-        steps=steps,
-        dialect=dialect.name,
-        transport=transport,
-        quirks=dialect.quirks,
+        name=name, steps=steps, dialect=dialect.name, transport=transport, quirks=dialect.quirks
     )
 
 

@@ -26,7 +26,6 @@ from smartcam.protocols import LineDialect as Dialect
 from smartcam.protocols import LineMachine as Machine
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
-from smartcam.protocols._lines import _OpenRequest
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.words import ABILITIES
 from tests.testing.acme_page import acme, acme_is_known
@@ -296,11 +295,9 @@ class Willing(Machine):
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
         if isinstance(message, m.Query):
-            self._outbox.append(b"PROGRAM\n")
-            row = self.dialect.row(m.Query)
-            assert row is not None
-            script = self.dialect.script(row, message)
-            self._asked.append(_OpenRequest(row, script, next(script), row.word, said=True))
+            state, self.state = self.state, State.CONNECTED
+            super().send(message, answered=answered)
+            self.state = state
         else:
             super().send(message, answered=answered)
 

@@ -31,7 +31,7 @@ from smartcam.testing.proxy import (
     Stall,
 )
 from smartcam.testing.proxy import _log as log
-from smartcam.testing.proxy._rules import MAX_COPY, MAX_HOLD
+from smartcam.testing.proxy._rules import MAX_COPY_BYTES, MAX_HOLD_BYTES
 from tests.testing.proxykit import HOST, MESSAGE, SHORT, client, linked, target
 
 if TYPE_CHECKING:
@@ -197,10 +197,10 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: Flip(mask=0), "mask must be 1 to 255"),
     (lambda: SplitBytes(pause=-1), "pause must be 0 or more seconds"),
     (lambda: Drip(pause=-1), "pause must be 0 or more seconds"),
-    (lambda: CoalesceBytes(size=MAX_HOLD + 1), "size must be 1 to 65536 bytes"),
+    (lambda: CoalesceBytes(size=MAX_HOLD_BYTES + 1), "size must be 1 to 65536 bytes"),
     (lambda: CoalesceBytes(size=1, seconds=0), "seconds must be more than 0"),
     (lambda: InsertBytes(data=b""), "data must be 1 to 1048576 bytes"),
-    (lambda: DuplicateBytes(count=MAX_COPY + 1), "count must be at most 1048576 bytes"),
+    (lambda: DuplicateBytes(count=MAX_COPY_BYTES + 1), "count must be at most 1048576 bytes"),
     (lambda: DuplicateBytes(count=None), "count must be at most 1048576 bytes"),
     (lambda: DelayBytes(seconds=-1), "times must be 0 or more seconds"),
     (lambda: DelayBytes(seconds=1, jitter=-1), "times must be 0 or more seconds"),

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import pytest
 
-from smartcam.emulator._clock import NANOSECONDS
 from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import (
     CoalesceBytes,
@@ -239,7 +238,7 @@ async def test_receiver_that_does_not_read_stops_the_sender() -> None:
         camera.write(sent)
         pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
         await until(lambda: pipe._writing and not pipe._reading)
-        assert directions.MAX_HELD <= pipe.held < directions.MAX_HELD + directions.CHUNK
+        assert directions.MAX_HELD_BYTES <= pipe.held < directions.MAX_HELD_BYTES + directions.CHUNK
         assert camera.transport.get_write_buffer_size() > 0
         end.transport.resume_reading()
         await proxy.wait_passed("down", len(sent), timeout=20)
@@ -625,7 +624,7 @@ async def test_jitter_is_the_same_again_with_the_same_seed() -> None:
             begin = asyncio.get_running_loop().time()
             await in_pieces(camera, proxy, b"0")
             pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
-            delays.append(pipe._line._queue[0].due / NANOSECONDS - begin)
+            delays.append(pipe._line._queue[0].due * 1e-9 - begin)
     assert delays[0] == pytest.approx(delays[1], abs=3)
     assert abs(delays[0] - delays[2]) > 50
 
@@ -645,7 +644,7 @@ async def test_slow_rate_stops_the_sender_and_not_only_the_receiver() -> None:
         camera.write(bytes(32_000_000))
         await proxy.wait_passed("down", 60)
         pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
-        assert pipe.held < directions.MAX_HELD + directions.CHUNK
+        assert pipe.held < directions.MAX_HELD_BYTES + directions.CHUNK
         assert not pipe._reading
 
 

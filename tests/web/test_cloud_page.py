@@ -12,10 +12,10 @@ import pytest_asyncio
 
 from smartcam.depth import Cloud
 from smartcam.web import CloudSite
-from smartcam.web import _clouds as clouds_module
 from tests.handmade import until
 from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
+from tests.web.inside import _clouds as clouds_module
 from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ import urllib.request
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
-from smartcam._cli.smartcam_emulator import command
+from tests.cli.commandline import run_emulator
 from tests.processes import PATIENCE, Process
 
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
@@ -33,9 +32,9 @@ def get(url: str, token: str | None = None) -> Any:
 
 
 def refused(*options: str) -> str:
-    done = CliRunner().invoke(command, options)
-    assert done.exit_code == 2
-    return done.output.splitlines()[-1]
+    done = run_emulator(*options)
+    assert done.code == 2
+    return done.err.splitlines()[-1]
 
 
 @pytest.mark.long

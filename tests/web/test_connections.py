@@ -19,9 +19,9 @@ from smartcam._accepting import Places
 from smartcam.web import _connections as connections
 from smartcam.web import _emulator as emulator
 from smartcam.web import _routes as routes
-from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD, Visitor
+from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD_BYTES, Visitor
 from smartcam.web._emulator import MAX_WAITING_CHANGES
-from smartcam.web._routes import MAX_BODY
+from smartcam.web._routes import MAX_BODY_BYTES
 from smartcam.web._streams import MAX_STREAMS
 from tests.handmade import until
 from tests.web.sitekit import TOKEN, Raw, World, served
@@ -179,10 +179,10 @@ async def test_head_that_is_too_long_ends_the_connection(caplog: pytest.LogCaptu
     with caplog.at_level(logging.INFO, logger="smartcam.web"):
         async with served() as world, Raw.connected(world.site) as raw:
             raw.writer.write(b"GET /api HTTP/1.1\r\nHost: localhost\r\n")
-            for number in range(MAX_HEAD // 1000 + 1):
+            for number in range(MAX_HEAD_BYTES // 1000 + 1):
                 raw.writer.write(b"X-%d: %s\r\n" % (number, 1000 * b"x"))
             await ended(raw)
-    assert f"the head of its request has more than {MAX_HEAD} bytes" in caplog.text
+    assert f"the head of its request has more than {MAX_HEAD_BYTES} bytes" in caplog.text
 
 
 async def test_head_may_come_byte_by_byte_and_its_body_with_it() -> None:
@@ -205,8 +205,8 @@ async def test_large_body_does_not_count_as_a_head(token: str) -> None:
         raw.writer.write(
             b"POST /api/cameras/camera/endian HTTP/1.1\r\nHost: localhost\r\n"
             b"Content-Type: application/json\r\n"
-            + f"Authorization: Bearer {token}\r\nContent-Length: {MAX_BODY}\r\n\r\n".encode()
-            + bytes(MAX_BODY)
+            + f"Authorization: Bearer {token}\r\nContent-Length: {MAX_BODY_BYTES}\r\n\r\n".encode()
+            + bytes(MAX_BODY_BYTES)
         )
         answer = await ended(raw) if token != TOKEN else await raw.reader.readuntil(b"\r\n")
     assert answer.startswith(b"HTTP/1.1 400 " if token == TOKEN else b"HTTP/1.1 401 ")

@@ -13,10 +13,6 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from smartcam._meanings import FAIL_WORDS, NOT_WORDS, PASS_WORDS
-from smartcam.calibration._files.directory import MAX_NAME
-from smartcam.calibration._files.store import BACKUPS
-from smartcam.calibration._printing.page_layout import RULER
-from smartcam.calibration.wizards._services import JOURNALS
 from smartcam.emulator import EmulatedCamera
 from smartcam.web import EmulatorSite
 from smartcam.web import _emulator as emulator
@@ -91,11 +87,11 @@ def test_frames_page_has_its_numbers() -> None:
 def test_bounds_are_those_of_the_code() -> None:
     said = {
         f"did not come within {routes.READ_TIMEOUT:g} s",
-        f"more than {routes.MAX_BODY >> 10} KiB",
+        f"more than {routes.MAX_BODY_BYTES >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.SLOW:g} s",
-        f"long payloads to {serialize.MAX_HEX} bytes "
-        f"and decode results up to {serialize.MAX_VALUES}",
+        f"long payloads to {serialize.MAX_HEX_BYTES} bytes "
+        f"and decode results up to {serialize.MAX_VALUES_BYTES}",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit
@@ -142,13 +138,3 @@ async def test_curl_lines_are_answered() -> None:
             if not stream:
                 json.loads(out)
     assert lacking == []
-
-
-def test_wizards_bounds_are_those_of_the_code() -> None:
-    said = {
-        f"Names have up to {MAX_NAME} letters",
-        f"`NAME.json.1` to `.{BACKUPS}`",
-        f"`NAME.journal.1` to `.{JOURNALS}`",
-        f"printed {RULER:g} mm ruler",
-    }
-    assert {text for text in said if text not in WIZARD_PAGE} == set()

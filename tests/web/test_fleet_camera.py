@@ -13,17 +13,19 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectionTakenError
-from smartcam.fleet import Fleet, FleetFile
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import Fleet, FleetFile, MemoryBus
 from smartcam.web import FleetSite
-from smartcam.web import _fleet as fleet_module
-from smartcam.web._fleet import LINGER, MAX_CAMERAS
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, Plant
 from tests.handmade import until
+from tests.web.inside import _fleet as fleet_module
 from tests.web.sitekit import Answer, Caller, Listener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+LINGER = 30.0
+MAX_CAMERAS = 16
+
 
 CELL = FleetFile.model_validate(
     {
@@ -59,11 +61,7 @@ class World(NamedTuple):
 @contextlib.asynccontextmanager
 async def served(fleet: Fleet, **options: Any) -> AsyncIterator[World]:
     """Serve the page of a fleet."""
-    async with (
-        fleet,
-        FleetSite(fleet, **options) as site,
-        aiohttp.ClientSession() as session,
-    ):
+    async with fleet, FleetSite(fleet, **options) as site, aiohttp.ClientSession() as session:
         yield World(fleet, site, Caller(site, session, ""))
 
 

@@ -17,15 +17,15 @@ from smartcam.layout import Layout
 from smartcam.layout._inside import ShownUnits
 from smartcam.models import Header, Localization, Pose, Position, Quaternion, Status
 from smartcam.web import FleetSite
-from smartcam.web import _fleet as site_module
 from smartcam.web import _fleet_view as view_module
 from smartcam.web._fleet import CALLS, MAX_VIEWERS
-from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT, MAX_QUEUE, line_of
+from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT_BYTES, MAX_QUEUE, line_of
 from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS, PROTOCOL
 from smartcam.web._fleet_view import BUCKET
 from smartcam.web._streams import SLOW
 from smartcam.web._verdicts import judged
 from tests.handmade import until
+from tests.web.inside import _fleet as site_module
 from tests.web.madeup import AT, READY, MadeUpFleet, names
 from tests.web.sitekit import TOKEN, Caller, Raw
 
@@ -122,10 +122,7 @@ class World(NamedTuple):
 async def served(count: int = 100, **options: Any) -> AsyncIterator[World]:
     """Serve the page of a made-up fleet."""
     fleet = MadeUpFleet(names(count))
-    async with (
-        FleetSite(fleet.as_fleet, **options) as site,
-        aiohttp.ClientSession() as session,
-    ):
+    async with FleetSite(fleet.as_fleet, **options) as site, aiohttp.ClientSession() as session:
         yield World(fleet, site, Caller(site, session, ""))
 
 
@@ -392,12 +389,12 @@ async def test_parts_are_told_as_they_lie_and_long_results_by_their_length() -> 
         header = Header(1, AT, "line01/cam000")
         pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(1.5))
         world.fleet["line01/cam000"].send([Localization("square", 0.9, 0, pose)])
-        world.fleet["line01/cam001"].send(b"", raw=bytes(MAX_KEPT + 1))
+        world.fleet["line01/cam001"].send(b"", raw=bytes(MAX_KEPT_BYTES + 1))
         await looker.until(lambda: all(row["last"] for row in looker.rows.values()))
         last = looker.rows["line01/cam000"]["last"]
         assert last["parts"] == [["square", 0.1, 0.2, 1.5]]
         assert last["parts_count"] == 1
-        assert looker.rows["line01/cam001"]["last"]["text"] == f"{MAX_KEPT + 1} bytes"
+        assert looker.rows["line01/cam001"]["last"]["text"] == f"{MAX_KEPT_BYTES + 1} bytes"
 
 
 # ---------------------------------------------------------------------- who is slow

@@ -268,7 +268,7 @@ async def test_looker_that_vanishes_harms_nobody() -> None:
 
 async def test_picture_that_is_too_large_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     small = jpeg(plain(1), 80)
-    monkeypatch.setattr(pictures_module, "MAX_PICTURE", len(small))
+    monkeypatch.setattr(pictures_module, "MAX_PICTURE_BYTES", len(small))
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
         await all_of.driver.streams()

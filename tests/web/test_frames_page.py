@@ -13,11 +13,11 @@ import pytest_asyncio
 
 import smartcam.frames
 from smartcam.frames._inside import read_stamp
-from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.web import FramesSite
 from tests.frames.drivers import GoneError, frame, scripted
 from tests.frames.gige import camera as cameras
 from tests.frames.gige.camera import camera
+from tests.frames.pictures import stripes, write_stamp
 from tests.handmade import until
 from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, HIDE, PATIENCE, new_page, nothing_wrong, pass_gate, see
@@ -45,11 +45,7 @@ async def page() -> AsyncIterator[Page]:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page,
-    sources: Sequence[FrameSource],
-    *,
-    token: str | None = None,
-    changes: bool = False,
+    page: Page, sources: Sequence[FrameSource], *, token: str | None = None, changes: bool = False
 ) -> AsyncIterator[FramesSite]:
     """Show sources; what the browser finds wrong with the page fails the test."""
     with nothing_wrong(page):

@@ -31,8 +31,8 @@ from smartcam.web._live import CALLS, MAX_NEWS
 from smartcam.web._live_view import (
     MAX_PARTS,
     MAX_RESULTS,
-    MAX_SHOWN_RAW,
-    MAX_VALUE,
+    MAX_SHOWN_RAW_BYTES,
+    MAX_VALUE_CHARACTERS,
     ShownResult,
     shown_value,
 )
@@ -248,10 +248,10 @@ def result_of(value: object, raw: bytes = b"") -> Result[Any]:
 
 
 def test_long_values_are_cut() -> None:
-    told = ShownResult(0, result_of(["x" * MAX_VALUE], bytes(1000)), "").as_json()
+    told = ShownResult(0, result_of(["x" * MAX_VALUE_CHARACTERS], bytes(1000)), "").as_json()
     assert "value" not in told
-    assert len(json.dumps(told)) < MAX_VALUE
-    assert told["raw"] == bytes(MAX_SHOWN_RAW).hex(" ")
+    assert len(json.dumps(told)) < MAX_VALUE_CHARACTERS
+    assert told["raw"] == bytes(MAX_SHOWN_RAW_BYTES).hex(" ")
     assert told["size"] == 1000
 
 
@@ -260,11 +260,7 @@ def test_parts_are_told_in_the_plane_and_bounded() -> None:
     pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(0.5))
     found = [Localization("bolt", 0.9, 0, pose)] * (MAX_PARTS + 1)
     told = ShownResult(0, result_of(found), "").as_json()
-    assert (len(told["parts"]), told["count"], told["frame"]) == (
-        MAX_PARTS,
-        MAX_PARTS + 1,
-        "table",
-    )
+    assert (len(told["parts"]), told["count"], told["frame"]) == (MAX_PARTS, MAX_PARTS + 1, "table")
     assert told["parts"][0] == pytest.approx(
         {"name": "bolt", "quality": 0.9, "x": 0.1, "y": 0.2, "z": 0.0, "theta": 0.5}
     )

@@ -12,7 +12,6 @@ import pytest
 
 from smartcam.exceptions import FrameSourceError
 from smartcam.web import LiveSite
-from smartcam.web._pictures import PROTOCOL
 from tests.fleet.fleetkit import Plant, until
 from tests.fleet.framekit import FramePlant
 from tests.frames.drivers import frame
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from smartcam.fleet import FleetCamera
+
+PROTOCOL = "smartcam.frames"
+
 
 simplejpeg = pytest.importorskip("simplejpeg", reason="needs the extra frames")
 

@@ -18,8 +18,8 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
 from smartcam.web._emulator import CALLS, MAX_PARTS
-from smartcam.web._routes import MAX_BODY
-from smartcam.web._serialize import MAX_HEX, MAX_TOLD, MAX_VALUES
+from smartcam.web._routes import MAX_BODY_BYTES
+from smartcam.web._serialize import MAX_HEX_BYTES, MAX_TOLD_BYTES, MAX_VALUES_BYTES
 from smartcam.web._shapes import OUTLINES, SIDE
 from smartcam.web._streams import Streams
 from tests.web.sitekit import Raw, served
@@ -327,7 +327,7 @@ async def test_log_shows_a_result_decoded() -> None:
 
 
 async def test_log_cuts_a_long_payload_and_one_entry_has_all() -> None:
-    layout = f"a: string[{MAX_HEX}], b: string[{MAX_VALUES}]"
+    layout = f"a: string[{MAX_HEX_BYTES}], b: string[{MAX_VALUES_BYTES}]"
     long = {"id": 5, "layout": layout, "constant": {"a": "x", "b": "y"}, "processing_time": 0}
     async with (
         served(applications=[long], running=True) as world,
@@ -337,8 +337,8 @@ async def test_log_cuts_a_long_payload_and_one_entry_has_all() -> None:
         entries = (await world.caller.get("log"))["entries"]
         cut = next(one for one in entries if one["message"] == "ResultContainer")
         whole = await world.caller.get(f"log/{cut['serial']}")
-    assert cut["size"] == whole["size"] == 4 + MAX_HEX + MAX_VALUES
-    assert (len(bytes.fromhex(cut["hex"])), cut["values"]) == (MAX_HEX, None)
+    assert cut["size"] == whole["size"] == 4 + MAX_HEX_BYTES + MAX_VALUES_BYTES
+    assert (len(bytes.fromhex(cut["hex"])), cut["values"]) == (MAX_HEX_BYTES, None)
     assert len(bytes.fromhex(whole["hex"])) == whole["size"]
     assert whole["values"] == {"a": "x", "b": "y"}
 
@@ -346,7 +346,7 @@ async def test_log_cuts_a_long_payload_and_one_entry_has_all() -> None:
 def large(count: int) -> dict[str, Any]:
     """Return an application whose results are as long as a list of entries shows any."""
     layout = "(text: string[100])*"
-    values = [{"text": f"{number}"} for number in range((MAX_VALUES - 4) // 100)]
+    values = [{"text": f"{number}"} for number in range((MAX_VALUES_BYTES - 4) // 100)]
     return {"id": count, "layout": layout, "constant": values, "processing_time": 0}
 
 
@@ -363,7 +363,7 @@ async def test_log_ends_where_it_told_enough_and_goes_on_from_there() -> None:
         answers = 0
         while len(seen) < count:
             part = await world.caller.get(f"log?since={len(seen)}")
-            assert sum(one["size"] for one in part["entries"]) <= MAX_TOLD + MAX_VALUES
+            assert sum(one["size"] for one in part["entries"]) <= MAX_TOLD_BYTES + MAX_VALUES_BYTES
             seen += [one["serial"] for one in part["entries"]]
             answers += 1
     assert seen == list(range(count))
@@ -391,7 +391,7 @@ async def test_log_cuts_what_really_passed_too() -> None:
         (cut,) = (await world.caller.get("log"))["entries"]
         whole = await world.caller.get("log/0")
     assert (cut["hex"], cut["size"], cut["wire_size"]) == ("01", 1, 5000)
-    assert len(bytes.fromhex(cut["wire"])) == MAX_HEX
+    assert len(bytes.fromhex(cut["wire"])) == MAX_HEX_BYTES
     assert whole["wire"] == passed
 
 
@@ -519,7 +519,7 @@ async def test_fault_that_the_dialect_lacks_is_422_and_none_is_added() -> None:
         (b"\xff", "application/json", 400, "a body that is no JSON"),
         (b"seconds=1", "application/x-www-form-urlencoded", 415, "with curl: --json"),
         (b'{"seconds": 1}', "text/plain", 415, "with curl: --json"),
-        (b" " * (MAX_BODY + 1), "application/json", 413, f"{MAX_BODY} bytes at most"),
+        (b" " * (MAX_BODY_BYTES + 1), "application/json", 413, f"{MAX_BODY_BYTES} bytes at most"),
     ],
 )
 async def test_body_that_cannot_be_read_is_refused(

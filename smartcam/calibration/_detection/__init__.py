@@ -1,1 +1,1 @@
-"""Printed targets in images: found, refined, numbered."""
+"""Find printed targets in images, refine their points and number them."""

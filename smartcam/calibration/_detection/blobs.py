@@ -1,9 +1,9 @@
-"""Spots in an image: filled, as round as a tilted dot, darker than what lies around them.
+"""Find filled, round spots in an image that are darker than their surroundings.
 
-What is darker than the mean of its surroundings is cut into pieces that hang together. A piece
-whose area is that of the ellipse with its second moments is a spot: letters, lines, rings and
-corners have less. How large the surroundings are decides how large a dot may be and still be dark
-all over; a few sizes cover all grids that an image can show.
+Pixels darker than the mean of their surroundings are joined into connected pieces. A piece whose
+area is that of the ellipse with its second moments is a spot: letters, lines, rings and corners
+fill less of that ellipse. How large the surroundings are decides how large a dot may be and still
+be dark all over; a few sizes cover all grids that an image can show.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_CONTRAST = 7
-"""Grey levels of 255 by which a pixel is darker than the mean around it at least."""
+"""A pixel counts as dark if it is this many grey levels (of 255) darker than the mean around it."""
 
 MIN_SPOT_PIXELS = 9
-"""Pixels of a spot at least."""
+"""A spot has at least this many pixels."""
 
-MIN_SPECK, LARGEST_SPECK = 3, 24
-"""Pixels of a dot that is too small, or that is said to be small, to be told from others."""
+MIN_SPECK_PIXELS, MAX_SPECK_PIXELS = 3, 24
+"""Areas in pixels: a dot below the first is noise; one up to the second is called small."""
 
 MAX_PART_OF_IMAGE = 1 / 16
 """A spot covers at most this part of the image's area: a grid has nine dots or more."""
 
 MIN_ELLIPSE_SHARE = 0.85
-"""A dot fills at least this part of its moments' ellipse: rectangles fill 0.955, triangles 0.83."""
+"""A dot fills at least this part of the ellipse with its second moments: rectangles fill 0.955,
+triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
-"""Length over width of a dot at most: one that is seen 80 degrees from the front."""
+"""A dot is at most this many times as long as wide: so a circle looks at a tilt of 80 degrees."""
 
 
 MIN_RECTANGLE_SHARE = 0.2
@@ -46,16 +47,17 @@ as wide that lies aslant fills 0.22, if it is filled as little as MIN_ELLIPSE_SH
 class Spots(NamedTuple):
     """Dark spots that may be dots of a grid."""
 
-    points: Array  # (N, 2), middles, pixels
+    points: Array  # (N, 2), centres, pixels
     areas: Array  # (N,), pixels^2
 
 
 class Pieces(NamedTuple):
     """The connected dark pieces of an image."""
 
-    dark: NDArray[np.uint8]  # (H, W), 1 where it is
-    labels: NDArray[np.int32]  # (H, W), which piece each pixel is of; 0: none
-    boxes: NDArray[np.int32]  # (N, 5): left, top, width, height, area; the first is not a piece
+    dark: NDArray[np.uint8]  # (H, W), 1 in a dark pixel, else 0
+    labels: NDArray[np.int32]  # (H, W), number of the piece that a pixel belongs to, or 0
+    # (N, 5): left, top, width, height, area; the first row is the background
+    boxes: NDArray[np.int32]
     middles: Array  # (N, 2), pixels
 
     def spots(self, most: int) -> Spots:
@@ -74,9 +76,9 @@ class Pieces(NamedTuple):
         return Spots(pieces.points[good], pieces.areas[good])
 
     def specks(self) -> Spots:
-        """Return the pieces that may be dots of which only a few pixels are seen."""
+        """Return the pieces that may be dots that cover only a few pixels."""
         _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= MIN_SPECK) & (areas <= LARGEST_SPECK)
+        chosen = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
         chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
         chosen[0] = False
         return self._some(np.flatnonzero(chosen))
@@ -89,7 +91,7 @@ class Pieces(NamedTuple):
 def dark_pieces(image: NDArray[np.uint8], around: int) -> Pieces:
     """Return the dark pieces of an image (H, W).
 
-    ``around``: side of the square whose mean a pixel is compared with; about two of the distances
+    ``around``: side of the square whose mean a pixel is compared with; about twice the distance
     between dots.
     """
     cv2 = load("cv2")
@@ -105,7 +107,7 @@ def dark_pieces(image: NDArray[np.uint8], around: int) -> Pieces:
 def _filled(all_: Pieces, number: NDArray[np.int32], pieces: Spots) -> NDArray[np.bool_]:
     """Return True for each piece that fills an ellipse which is not too long.
 
-    ``number`` says which of the ``pieces`` each of all pieces is; -1: none.
+    ``number`` (for all pieces) is the index of a piece among ``pieces``, or -1.
     """
     count = len(pieces.areas)
     at = np.flatnonzero(all_.dark)

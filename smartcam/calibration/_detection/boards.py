@@ -1,8 +1,8 @@
-"""Checkerboards of any size in images: corners in rows and columns, whole or in part.
+"""Find checkerboards of any size in images, whole or in part.
 
-Saddles of the grey levels whose neighbours are turned against them hang together as a board's
-corners do, and little else does. They are looked for in a reduced image, and completed in the given
-one by fits where the ones found say that the next ones are.
+A corner of a board is a saddle of the grey levels, and the saddles next to it are turned by 90
+degrees. Little else in a picture is connected like that. Saddles are looked for in a reduced image;
+missing corners are then fitted in the full image, at places predicted from those found.
 """
 
 from __future__ import annotations
@@ -31,45 +31,49 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 USUAL_SIDE_PX = 800
-"""Longest side, pixels, of a usual image: a board is looked for in half of this size, in this size,
-and in double size, as far as the image is as large."""
+"""Longest side of a usual image, pixels: a board is looked for at half of this size, at this size
+and at twice this size, unless the image is smaller."""
 
 NEIGHBOURS = 8
-"""Saddles around one among which a board's next ones are: four and what else is near."""
+"""Nearest saddles among which the next corners are looked for: four corners and what else is
+near."""
 
 FITTED_SHARE = 0.45
-"""Edges at a corner are fitted along this part of a square's side, short of the next edges."""
+"""Edges at a corner are fitted along this part of a square's side, which ends before the next
+edges."""
 
 MIN_FITTED_SHARE = 0.6
-"""A board has at least this part of its tried corners fitted well, with colours in turn."""
+"""A board has at least this part of its tried corners fitted well, with alternating colours."""
 
 MIN_FILLED_SHARE = 0.5
 """An outermost row or column is left out where fewer than this part of its corners are seen."""
 
-ASIDE = 0.25
-"""A fitted corner may lie off its expected place by this part of a step to the next corner."""
+MAX_OFFSET_STEPS = 0.25
+"""A fitted corner may lie this part of a step, from one corner to the next, off its predicted
+place."""
 
 MIN_SQUARE_PIXELS = 9.0
 """A corner is fitted only where a square has a larger area than this in the image, pixels^2."""
 
-MAX_REACH = 8.0
-"""Pixels from a corner that are fitted at most: enough to see whether there is one."""
+MAX_REACH_PX = 8.0
+"""At most this many pixels around a corner are fitted: enough to see whether there is a corner."""
 
 MAX_CORNERS_JUDGED = 24
-"""Corners of a part of a board by which is judged whether it is one."""
+"""At most this many corners of a candidate are checked to decide whether it is a board."""
 
-WITHIN_SQUARES = np.array(
+PLACES_IN_SQUARES = np.array(
     [
         (side * x, up * y)
         for side, up in ((1, 1), (-1, -1), (1, -1), (-1, 1))
         for x, y in itertools.product((0.2, 0.35), repeat=2)
     ]
 )
-"""(16, 2), places in the four squares beside a corner, in parts of the ways to the next ones: those
-of two squares that lie opposite each other, then of the other two."""
+"""(16, 2), places in the four squares beside a corner, as parts of the steps to the next corners:
+first those in two opposite squares, then those in the other two."""
 
 MAX_SAME_BOARD_OFF_PX = 3.0
-"""Median distance of a board's corners as two sizes of an image show them, at most, pixels."""
+"""Two sizes of an image show the same board if its corners differ by at most this median
+distance."""
 
 MAX_ROUNDS = 4
 """A board is completed in at most this many rounds."""
@@ -79,8 +83,9 @@ class Board(NamedTuple):
     """Corners in rows and columns."""
 
     points: Array  # (N, 2), pixels
-    places: NDArray[np.intp]  # (N, 2), column and row, counted from anywhere in any direction
-    again: bool = False  # whether the image has another board of as many columns and rows
+    places: NDArray[np.intp]  # (N, 2), column and row; their origin and directions are arbitrary
+    # whether the image has another board with the same numbers of columns and rows
+    again: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -97,7 +102,7 @@ class Board(NamedTuple):
         return len(self.places) == columns * rows
 
     def by_rows(self, columns: int, rows: int) -> Array | None:
-        """Return all points (columns * rows, 2), row by row; None where it is another board."""
+        """Return all points (columns * rows, 2) row by row; None if the board has another shape."""
         if not self.is_full or sorted(self.shape) != sorted((columns, rows)):
             return None
         row, column = (1, 0) if self.shape == (columns, rows) else (0, 1)
@@ -109,7 +114,7 @@ class Board(NamedTuple):
         return bool(np.median(tree.query(other.points)[0]) < MAX_SAME_BOARD_OFF_PX)
 
     def filled(self) -> Board:
-        """Return the board with missing corners put where the others say that they are."""
+        """Return the board with each missing corner at the place that the others predict."""
         low, high = self.places.min(axis=0), self.places.max(axis=0)
         missing = _missing(self, low, high)
         points = GridMap(self.places.astype(np.float64), self.points)(missing.astype(np.float64))
@@ -130,12 +135,12 @@ class Board(NamedTuple):
 
 
 def parity(places: NDArray[np.intp]) -> Array:
-    """Return 1 and -1 in turn."""
+    """Return 1 and -1 in alternation, like the colours of a board."""
     return np.where(places.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
-    """Yield the largest board in each size of an image, with ``most`` corners or some more.
+    """Yield the largest board in each size of an image, of about ``most`` corners at the most.
 
     The search in a size ends with the first one of ``count`` corners or more.
     """
@@ -155,12 +160,12 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
 
 
 def _shape(grid: Lattice) -> list[int]:
-    """Return the counts of a grid's columns and rows, the smaller first, and of its corners."""
+    """Return a grid's counts of columns and rows, the smaller first, and of its corners."""
     return [*sorted(np.ptp(np.array(list(grid)), axis=0).tolist()), len(grid)]
 
 
 def completed(image: GreyImage, board: Board) -> Board | None:
-    """Return a board with the corners that were missed; None where fits show none."""
+    """Return the board with missed corners added; None if the fits find no corners."""
     some = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
     _, signs = _fitted(image, board, some)
     sign = float(parity(some) @ signs)
@@ -169,7 +174,8 @@ def completed(image: GreyImage, board: Board) -> Board | None:
     near = board.places
     for _ in range(MAX_ROUNDS):
         missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
-        # what was no corner is one only where a corner beside it has said better where it is
+        # a place without a corner may have one when a corner beside it has given a better
+        # prediction
         beside = np.abs(missing[:, None] - near).max(axis=2).min(axis=1, initial=2) <= 1
         missing = missing[beside]
         points, signs = _fitted(image, board, missing)
@@ -184,7 +190,7 @@ def completed(image: GreyImage, board: Board) -> Board | None:
 
 
 def _missing(board: Board, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the places (N, 2) from ``low`` to ``high`` where no corner was found."""
+    """Return the places (N, 2) from ``low`` to ``high`` where no corner has been found yet."""
     every = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
     there = set(map(tuple, board.places.tolist()))
     missing = [place for place in every if place not in there]
@@ -194,7 +200,7 @@ def _missing(board: Board, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDA
 def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[Array, Array]:
     """Return corners (N, 2) at a board's places, and the signs of their gains.
 
-    The sign is 0 where the image shows no corner, or is not there.
+    The sign is 0 where the image shows no corner, and for places outside of the image.
     """
     mapped = GridMap(board.places.astype(np.float64), board.points)
     at = places.astype(np.float64)
@@ -205,11 +211,11 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     inside[inside] = like_corners(image, points[inside], ways[inside])
     if inside.any():
         lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(FITTED_SHARE, MAX_REACH / lengths.max(axis=1))[:, None, None]
+        part = np.minimum(FITTED_SHARE, MAX_REACH_PX / lengths.max(axis=1))[:, None, None]
         corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
         step = lengths.min(axis=1)
-        good = corners.fitted & (aside < ASIDE * step)
+        good = corners.fitted & (aside < MAX_OFFSET_STEPS * step)
         points[inside] = corners.points
         signs[inside] = np.sign(corners.gains) * good
     return points, signs
@@ -218,13 +224,13 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
 def like_corners(image: GreyImage, points: Array, ways: Array) -> NDArray[np.bool_]:
     """Return True for each point (N, 2) beside which two opposite squares are darker than the rest.
 
-    The test tells most places that are no corners, for a small part of what a fit takes. ``ways``
+    The test rejects most places that are no corners, in a small part of the time of a fit. ``ways``
     (N, 2, 2) lead to the next corners, pixels.
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
     cv2 = load("cv2")
-    at = points[:, None] + np.einsum("pk,nki->npi", WITHIN_SQUARES, ways)
+    at = points[:, None] + np.einsum("pk,nki->npi", PLACES_IN_SQUARES, ways)
     levels = cv2.remap(
         image.levels, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

@@ -1,4 +1,4 @@
-"""ChArUco boards in images: corners with ids, some of which may be hidden."""
+"""Find ChArUco boards in images: their corners have ids, and some may be hidden."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
 from smartcam.calibration._detection.markers import (
     Markers,
     agreeing,
@@ -35,29 +35,30 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_CORNERS = 4
-"""Corners that fix a pose at least."""
+"""At least this many corners determine a pose."""
 
-LARGEST_DOUBLED = 2600
-"""Longest side, pixels, of an image that is looked at in double size, too, for small markers."""
+MAX_DOUBLED_PX = 2600
+"""An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 MIN_QUADRANGLES = 5
-"""Dark quadrangles in rows and columns that may be a board's markers, at least."""
+"""Fewer dark quadrangles than this, in rows and columns, are not taken for a board's markers."""
 
 MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
-"""Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
-is not there, where none was read."""
+"""Sides of a marker's module, pixels: a smaller one than the first cannot be read even at twice the
+size; one larger than the second would have been read, so quadrangles of that size are no
+markers."""
 
 MAX_SQUARES_OFF = 0.3
-"""Sides of a square by which a corner may lie off where the nearest markers see it."""
+"""A corner may lie this many sides of a square away from where the nearest markers predict it."""
 
 FITTED_SHARE = 0.45
 """The edges at a corner are fitted along this part of a square's side."""
 
 
 def charuco_board(target: Charuco, *, legacy_pattern: bool | None = None) -> Any:
-    """Return OpenCV's board; SHAPE: no such dictionary, or too few markers in it.
+    """Return OpenCV's board; raise SHAPE if the dictionary is unknown or has too few markers.
 
-    ``legacy_pattern``: None for the target's.
+    ``legacy_pattern``: None uses the target's own.
     """
     cv2 = load("cv2")
     needed = target.columns * target.rows // 2
@@ -74,9 +75,9 @@ def _name(target: Charuco) -> str:
 
 
 def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetView:
-    """Find the corners of a ChArUco board that are seen.
+    """Find the visible corners of a ChArUco board.
 
-    Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE: no such dictionary.
+    Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE if the dictionary is unknown.
     """
     sighting = _numbered(image, target)
     ids, found = sighting.ids, sighting.points
@@ -108,8 +109,8 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
 def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
     """Return the sighting of a board, with at least four corners.
 
-    Where few are found beside what may be markers, the mirror image is looked at as well: a
-    marker's mirror image can be another one of its dictionary.
+    If only few markers are read beside many quadrangles, the mirrored image is searched as well:
+    the mirror image of a marker can be another marker of the dictionary.
     """
     seen = _detect(image, target)
     count = len(seen.ids)
@@ -134,7 +135,7 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
 
 
 def _other_pattern(target: Charuco, seen: _Sighting) -> CalibrationError:
-    """Return an error of a board whose markers stand as on the other pattern's."""
+    """Return the error for markers that are arranged as in the other ``legacy_pattern``."""
     said, other = target.legacy_pattern, not target.legacy_pattern
     return Code.WRONG_TARGET.refusal(
         f"{_name(target)}: expected markers as "
@@ -156,30 +157,30 @@ class _Sighting(NamedTuple):
 
     ids: NDArray[np.intp]  # (N,), ascending
     points: Array  # (N, 2), pixels
-    markers: int  # how many were read
-    agreeing: int  # how many of these stand to each other as on the board
-    contrary: int  # how many stand so to each other, but not to these
-    otherwise: int  # the same as on the board of the other legacy_pattern
-    strays: tuple[int, ...]  # the numbers of those that were left out
-    # of what may be markers, pixels of the given image: of those that were read, or of quadrangles
-    # in rows and columns; 0: there are none
+    markers: int  # count of the markers that were read
+    agreeing: int  # count of those that are arranged as on the board
+    contrary: int  # count of others that agree with each other, but not with these
+    otherwise: int  # count of those arranged as on the board of the other legacy_pattern
+    strays: tuple[int, ...]  # ids of the markers that were left out
+    # side of a module, pixels of the given image: of the markers that were read, or else of
+    # quadrangles in rows and columns; 0 if there are neither
     side: float
 
 
 def _detect(image: GreyImage, target: Charuco) -> _Sighting:
-    """Find a board in a reduced image, in the given one, and in one that is twice as large.
+    """Look for a board in a reduced image, then in the given one, then in one twice as large.
 
-    The next one is looked at where the one before does not show enough; the last one only where
-    there may be markers that are too small to be read.
+    Each image is searched only if the one before shows too little, and the last one only if there
+    may be markers that were too small to be read.
     """
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
-    times = math.ceil(max(image.size) / USUAL_SIZE)
+    times = math.ceil(max(image.size) / USUAL_SIDE_PX)
     if times > 1:
         best = _look(reduced(image.bytes, times), 1 / times, target, best)
         if _is_all(best, target, image):
             return best
     best = _look(image.bytes, 1.0, target, best)
-    few = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
+    few = max(image.size) <= MAX_DOUBLED_PX and 2 * len(best.ids) <= len(target.points)
     if few and (
         best.markers or 0 < best.side < MAX_UNREAD_MODULE_PIXELS * _modules(charuco_board(target))
     ):
@@ -239,22 +240,22 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sight
 
 
 def _map(board: Any) -> Array:
-    """Return (M, 4, 2): the corners of a board's markers by their numbers."""
+    """Return the corners of a board's markers, in the order of their ids, (M, 4, 2)."""
     return np.asarray(board.getObjPoints(), dtype=np.float64)[:, :, :2]
 
 
 def _between(
     bytes_: NDArray[np.uint8], board: Any, markers: Markers
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the numbers, as OpenCV has them, and places (N, 2) of corners beside markers.
+    """Return OpenCV's numbers of the corners beside markers, and their places (N, 2).
 
-    Those that are not where their markers see them are left out.
+    Corners that are not where their markers predict them are left out.
     """
     cv2 = load("cv2")
     given = cv2.aruco.CharucoParameters()
     given.minMarkers = 1
     if hasattr(given, "checkMarkers"):  # OpenCV 4.11 and later
-        given.checkMarkers = False  # they agree
+        given.checkMarkers = False  # the two forms of OpenCV's result agree
     detector = cv2.aruco.CharucoDetector(board, given)
     quads = [quad[None].astype(np.float32) for quad in markers.quads]
     numbers = markers.ids.astype(np.int32)[:, None]

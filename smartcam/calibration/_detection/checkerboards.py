@@ -1,4 +1,4 @@
-"""Checkerboards in images: found, refined, numbered from their origin."""
+"""Find checkerboards in images, refine their corners and number them from their origin."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from smartcam.calibration._detection.boards import (
     like_corners,
     parity,
 )
-from smartcam.calibration._detection.corners import UNREFINED, Corners, refine_corners
+from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, Corners, refine_corners
 from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.ordering import (
     MIN_ORIGIN_CONTRAST,
@@ -27,7 +27,7 @@ from smartcam.calibration._detection.ordering import (
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import apply_homography, fit_homography
-from smartcam.calibration._targets import AREA_DIAMETER, AREA_DISTANCE
+from smartcam.calibration._targets import AREA_DIAMETER_SQUARES, AREA_DISTANCE_SQUARES
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import Code
 
@@ -44,23 +44,25 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_CORNERS_CONNECTED = 10
-"""Corners that hang together in what may be a part of a board: pictures of leaves, bricks and noise
+"""A part of a board has at least this many connected corners: pictures of leaves, bricks and noise
 have up to nine."""
 
 MAX_STRAY_PX = 0.5
-"""Pixels by which a corner may lie off the place that the others predict, beside four times the
-median of these distances."""
+"""A corner may lie this many pixels plus four times the median distance off the place that the
+others predict."""
 
 OUTER_AREA_RATIO = 0.8
-"""The area outside of a corner is looked at within this part of its diameter, not at its rim."""
+"""The grey level outside of a corner is averaged over this part of the area's diameter, so not at
+its rim."""
 
 DOT_RING_SIDES = 0.3
-"""Sides of a square from the middle of the dot at the origin to the paper around it."""
+"""Distance from the centre of the dot at the origin to the paper around it, in sides of a
+square."""
 
 RING_ANGLES = np.arange(8) * np.pi / 4
 
 SQUARES = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]])
-"""Middles of the four squares next to an outer corner, in sides of one."""
+"""Centres of the four squares next to an outer corner, in sides of a square."""
 
 DISC = np.array([(x, y) for x in range(-4, 5) for y in range(-4, 5) if x * x + y * y <= 20]) / 4.5
 """(N, 2), points of the unit disc."""
@@ -115,22 +117,23 @@ _ANOTHER: Final = Code.WRONG_TARGET.remark(
 class _Search:
     """The findings of a search, kept for the text of its error."""
 
-    shape: tuple[int, int] | None = None  # columns and rows of the largest board
+    shape: tuple[int, int] | None = None  # columns and rows of the largest board found
 
 
 class _BoardCorners(NamedTuple):
     """Corners of a board, row by row."""
 
     points: Array  # (N, 2), pixels
-    seen: NDArray[np.bool_]  # (N,), whether a corner was seen there; else the others say the place
-    part: Checkerboard  # the target, or as many of its columns and rows as are seen
-    again: bool = False  # whether the image has another one that is whole
+    # (N,), whether the corner was seen; the place of any other is predicted from its neighbours
+    seen: NDArray[np.bool_]
+    part: Checkerboard  # the target, or the part of its columns and rows that is seen
+    again: bool = False  # whether the image has another complete board
 
 
 def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterator[_BoardCorners]:
-    """Yield corners row by row, of boards that are seen as a whole, and then of those that are not.
+    """Yield corners row by row: first of boards seen as a whole, then of those seen in part.
 
-    Of the latter, the corners that were not found are where the others say that they are.
+    Corners that were not found are at the places that the others predict.
     """
     count = target.columns * target.rows
     looked_at: list[Board] = []
@@ -160,7 +163,7 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterat
 
 
 def _parts(target: Checkerboard, shape: tuple[int, int]) -> Iterator[Checkerboard]:
-    """Yield the target if it has a shape, else parts of that shape that its mark can place."""
+    """Yield the target if it has this shape, else its parts of this shape with the mark."""
     for columns, rows in dict.fromkeys((shape, shape[::-1])):
         if (columns, rows) == (target.columns, target.rows):
             yield target
@@ -169,7 +172,7 @@ def _parts(target: Checkerboard, shape: tuple[int, int]) -> Iterator[Checkerboar
 
 
 def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
-    """Return corners refined; a place that shows none stays where it is, not fitted.
+    """Return the refined corners; one that is not visible keeps its place, as not fitted.
 
     ``steps`` (N, 2, 2) lead to the next corners, pixels.
     """
@@ -180,7 +183,7 @@ def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
     some &= inside
     if some.all():
         return refine_corners(image, points, FITTED_SHARE * steps)
-    covariance = np.tile(UNREFINED**2 * np.eye(2), (len(points), 1, 1))
+    covariance = np.tile(UNREFINED_SIGMA_PX**2 * np.eye(2), (len(points), 1, 1))
     corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(some))
     if some.any():
         found_there = refine_corners(image, points[some], FITTED_SHARE * steps[some])
@@ -190,7 +193,7 @@ def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
 
 
 def _steps(points: Array, target: Checkerboard) -> Array:
-    """Return (N, 2, 2): the ways from each corner to the next along columns and rows, pixels."""
+    """Return the steps from each corner to the next along columns and rows, (N, 2, 2), pixels."""
     grid = points.reshape(target.rows, target.columns, 2)
     steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2)
     return steps.reshape(-1, 2, 2)
@@ -199,10 +202,10 @@ def _steps(points: Array, target: Checkerboard) -> Array:
 def _without_strays(
     image: GreyImage, corners: Corners, seen: NDArray[np.bool_], target: Checkerboard
 ) -> Corners:
-    """Return corners of which those that could not be fitted, or lie apart, are looked for again.
+    """Return the corners after a second search for those not fitted or far off their place.
 
-    They start from where the others say that they are; what cannot be fitted there, or lies
-    apart again, has a covariance as large as its distance from there.
+    The second search starts from the place that the other corners predict. A corner that cannot be
+    fitted there either, or is far off again, gets a covariance as large as its distance from there.
     """
     flat = rows_of(target.columns, target.rows).astype(np.float64)
     good = corners.fitted
@@ -253,7 +256,7 @@ def _number(
         note = f" ({outside} of the 4 such areas outside of the image)" if outside else ""
 
         def level(order: NDArray[np.intp]) -> float:
-            """Return the level that the area would have in the mean light of the board."""
+            """Return the grey level that the area would have in the board's mean light."""
             black, white, area = shades[int(order[0, 0])]
             part = 1.0 if area is None else (area - black) / max(white - black, 1.0)
             return float(dark + (light - dark) * part)
@@ -267,10 +270,10 @@ def _number(
 
 
 def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
-    """Return an error of a board whose black corners are where the target's white ones are.
+    """Return the error for a board whose black corners are where the target has white ones.
 
-    Of counts that are both odd and differ, two corners that lie opposite each other are black, and
-    turning the sheet exchanges no black one with a white one.
+    If the counts of columns and rows are both odd and differ, two corners that lie opposite each
+    other are black, and turning the sheet exchanges no black one with a white one.
     """
     return Code.MIRRORED.refusal(
         f"{what}: expected a black square outside of the corner at the origin, got a white one: "
@@ -284,10 +287,11 @@ def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
 def _number_part(
     image: GreyImage, part: Checkerboard, corners: Corners, ways: list[Arrangement]
 ) -> tuple[Arrangement, float] | None:
-    """Return the numbering of a part of a board whose mark is seen; None where no mark is seen.
+    """Return the numbering of a part of a board by its mark; None if no mark is seen.
 
     Beside the dark dot at the origin the paper is light: around the dot, and along both of the
-    board's edges that meet there. So a place within the board or on something else is no corner.
+    board's edges that meet there. So a place inside the board, or on something else, is not taken
+    for its corner.
     """
     found = []
     for way in ways:
@@ -311,7 +315,7 @@ def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
     Places outside of the image have the level 0.
     """
     rows, columns, _ = grid.shape
-    low = -(1 + AREA_DISTANCE)
+    low = -(1 + AREA_DISTANCE_SQUARES)
     around = DOT_RING_SIDES * np.column_stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)]) + low
     along = (
         [(at + 0.5, low) for at in range(columns - 1)],
@@ -328,15 +332,17 @@ def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
 class _Shades(NamedTuple):
     """Grey levels near an outer corner."""
 
-    black: float  # of the two black squares next to it
-    white: float  # of the two white ones
-    area: float | None  # of the area outside of it; None where that is not in the image
+    black: float  # mean level of the two black squares next to the corner
+    white: float  # mean level of the two white ones
+    area: float | None  # level of the area outside of the corner; None if that is not in the image
 
 
 def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
     grid = corners.points[way.order]
     squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
-    area = target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER / 2 * DISC
+    area = (
+        target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC
+    )
     seen = _near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
     level = mean_level(image, seen) if inside else None
@@ -344,7 +350,7 @@ def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arran
 
 
 def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> float:
-    """Count corners by which the outermost square at the origin is black, less the others."""
+    """Count the corners that say that the square at the origin is black, minus the others."""
     order = way.order
     # gains refer to the found grid's columns and rows, which may run against the target's
     against = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
@@ -353,9 +359,9 @@ def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> floa
 
 
 def _near(grid: Array, at: Array) -> Array:
-    """Return pixels of places (N, 2) near the first corner of a grid (rows, columns, 2).
+    """Map places (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
 
-    Places are in sides of a square from this corner.
+    A place is given from this corner, in sides of a square.
     """
     places = rows_of(3, 3).astype(np.float64)
     near = grid[:3, :3].reshape(-1, 2)

@@ -1,7 +1,7 @@
-"""Grids of dots in images: found, numbered from their origin, centred.
+"""Find grids of dots in images, number them from their origin and fit their centres.
 
 A grid that is seen in part could be numbered in more than one way. It is refused: all its dots must
-be there, and none beyond them.
+be visible, and no further ones beside them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import local_steps
@@ -35,30 +35,34 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
     from smartcam.geometry._inside import Array
 
-WIDE, NARROW = 1.0, 0.3
-"""Side of the square that a pixel is compared with, in distances between dots of a grid that fills
-the image."""
+WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO = 1.0, 0.3
+"""Side of the square whose mean a pixel is compared with, in distances between dots of a grid that
+fills the image: a wide and a narrow square."""
 
 SMALL_SIDE_PX = 800
-"""Longest side of the image in which a grid is looked for first, pixels."""
+"""A grid is looked for first in an image whose longest side has this many pixels."""
 
 MIN_DOT_SHARE = 0.4
-"""At least this part of a grid's dots must stand in rows and columns among dots of a few pixels. So
-many are still told apart in an image that shows all of them once it is twice as large."""
+"""At least this part of a grid's dots must be found in rows and columns among dots of a few pixels,
+before the image is searched at twice its size. If all dots are visible at twice the size, this many
+can be separated in the given one."""
 
 NEIGHBOURS = 8
-"""The next dots of a grid are looked for among this many dots around one of a few pixels."""
+"""Dots of a few pixels: the next dots of a grid are looked for among this many neighbours."""
 
-MORE_SPOTS = 1000
-"""Spots looked at beside twice the dots of the target: of an image with more, the largest."""
+EXTRA_SPOTS = 1000
+"""Spots examined beyond twice the number of the target's dots; in an image with more, the
+largest."""
 
 MIN_DOTS_REPORTED = 9
-"""Dots in rows and columns that an error tells of at least."""
+"""An error reports dots in rows and columns only if there are at least this many."""
 
 MAX_OFFSET_RATIO = 0.15
-"""A dot may lie off the place that the others give it by this part of the distance between dots."""
+"""A dot may lie this part of the distance between dots off the place that the others predict."""
 
-RING = np.column_stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)])
+RING_DIRECTIONS = np.column_stack(
+    [np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)]
+)
 """(16, 2), points of the unit circle."""
 
 
@@ -79,17 +83,17 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 class _Counted:
     """The counts of a search, kept for the text of its error."""
 
-    spots: int | None = None  # how many dark ones, in the first look at the image
-    # dots in rows and columns at most; not counted on where there are more than those of the target
+    spots: int | None = None  # count of dark spots, in the first search
+    # the most dots found in rows and columns; a count above the target's is not completed
     largest: int = 0
 
 
 def _grids(
     image: GreyImage, target: CircleGrid, seen: _Counted
 ) -> Iterator[tuple[GreyImage, Array, list[Arrangement]]]:
-    """Yield dots (N, 2), pixels, that stand as the target's do, and the ways to number them.
+    """Yield dots (N, 2), pixels, that are arranged as the target's, and the ways to number them.
 
-    They are dark in the image that comes with them, which is the given one or its negative.
+    The image that is yielded with them is the given one or its negative, whichever has them dark.
     """
     for light, scale, spots in _looks(image.bytes, target):
         for points, places in _laid_out(spots, target, seen):
@@ -101,39 +105,39 @@ def _grids(
 
 
 def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
-    """Yield looks at an image: True for its negative, the size relative to the image, and spots.
+    """Yield each search of an image: whether of its negative, at which scale, and the spots found.
 
-    A large image is looked at in a small size first, and any one in double size where there may be
-    dots of a few pixels.
+    A large image is searched at a small size first. Any image is searched at twice its size if it
+    may have dots of a few pixels.
     """
     longest = max(image.shape)
-    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIZE / longest)
-    most = MORE_SPOTS + 2 * len(target.points)
+    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIDE_PX / longest)
+    most = EXTRA_SPOTS + 2 * len(target.points)
     if times > 1:
         small = reduced(image, times)
         for light in (False, True):
-            yield light, 1 / times, _pieces(small, light, WIDE, target).spots(most)
+            yield light, 1 / times, _pieces(small, light, WIDE_WINDOW_RATIO, target).spots(most)
     looked_at = scaled(image, usual)
     fine = []
-    for part, light in itertools.product((WIDE, NARROW), (False, True)):
+    for part, light in itertools.product((WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO), (False, True)):
         pieces = _pieces(looked_at, light, part, target)
         yield light, usual, pieces.spots(most)
-        if part == NARROW and _may_be_dots(pieces.specks(), target):
+        if part == NARROW_WINDOW_RATIO and _may_be_dots(pieces.specks(), target):
             fine.append(light)
     for light in fine:
-        pieces = _pieces(scaled(image, 2 * usual), light, NARROW, target)
+        pieces = _pieces(scaled(image, 2 * usual), light, NARROW_WINDOW_RATIO, target)
         yield light, 2 * usual, pieces.spots(most)
 
 
 def _pieces(image: NDArray[np.uint8], light: bool, part: float, target: CircleGrid) -> Pieces:
-    # the longer side of the grid, distances between its dots
+    # length of the grid's longer side, in distances between its dots
     longest = max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
     around = round(part * max(image.shape) / longest)
     return dark_pieces(255 - image if light else image, around)
 
 
 def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
-    """Return True if a good part of a grid may be among dots of a few pixels."""
+    """Return True if dots of a few pixels may be a good part of the grid."""
     least = max(4, round(MIN_DOT_SHARE * len(target.points)))
     alike = alike_areas(specks.areas)
     return any(lattices(specks.points, alike, least=least, most=least, neighbours=NEIGHBOURS))
@@ -142,7 +146,7 @@ def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
 def _laid_out(
     spots: Spots, target: CircleGrid, seen: _Counted
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-    """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
+    """Yield the target's number of dots (N, 2) in rows and columns, and their places (N, 2)."""
     count = target.columns * target.rows
     if seen.spots is None:
         seen.spots = len(spots.areas)
@@ -161,7 +165,7 @@ def _laid_out(
 
 
 def _is_flat(target: CircleGrid, points: Array) -> bool:
-    """Return True if dots are where a flat grid shows them."""
+    """Return True if the dots lie where a flat grid would show them."""
     flat = target.points[:, :2]
     mapped = GridMap(flat, points)
     steps = np.linalg.norm(local_steps(mapped, flat, target.spacing), axis=2).min(axis=1)
@@ -172,7 +176,8 @@ def _is_flat(target: CircleGrid, points: Array) -> bool:
 def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
     """Return True if no dots stand where the grid's rows and columns would go on.
 
-    A dot there is dark, and all around it is light; what is outside of the image is neither.
+    A further dot would be dark with light paper all around; a place outside of the image is
+    neither.
     """
     flat = target.points[:, :2]
     mapped = GridMap(flat, points)
@@ -193,18 +198,18 @@ def _apart(target: CircleGrid) -> float:
 
 
 def _contrast(image: GreyImage, target: CircleGrid, mapped: GridMap) -> tuple[float, float]:
-    """Return the mean level within dots and that of the gaps around them."""
+    """Return the mean grey level within the dots, and the mean level of the gaps around them."""
     flat = target.points[:, None, :2]
     gap = (_apart(target) + target.diameter) / 4
     inside, outside = (
-        mean_level(image, mapped((flat + radius * RING).reshape(-1, 2)))
+        mean_level(image, mapped((flat + radius * RING_DIRECTIONS).reshape(-1, 2)))
         for radius in (target.diameter / 4, gap)
     )
     return inside, outside
 
 
 def _next_to(target: CircleGrid) -> Array:
-    """Return (N, 2), metres: where rows and columns would go on, all around the grid."""
+    """Return the places around the grid where rows and columns would go on, (N, 2), metres."""
     half = target.spacing / 2
     own = np.rint(target.points[:, :2] / half).astype(np.intp)
     steps = [(1, 1), (1, -1)] if target.asymmetric else [(2, 0), (0, 2)]
@@ -215,12 +220,12 @@ def _next_to(target: CircleGrid) -> Array:
 
 def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Array:
     """Return grey levels (N, 16) on circles around places; NaN outside of the image."""
-    u, v = mapped((flat[:, None] + radius * RING).reshape(-1, 2)).T
+    u, v = mapped((flat[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
     width, height = image.size
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     column, row = (np.rint(np.where(inside, one, 0)).astype(np.intp) for one in (u, v))
     levels = np.where(inside, image.levels[row, column], np.nan)
-    return levels.reshape(len(flat), len(RING))
+    return levels.reshape(len(flat), len(RING_DIRECTIONS))
 
 
 def _view(
@@ -247,7 +252,7 @@ def _view(
 def _refine(
     image: GreyImage, target: CircleGrid, seen: GridMap, points: Array, diameters: Array
 ) -> Dots:
-    """Return dots, each looked at to the middle of the gap to the next one."""
+    """Return the fitted dots, each from the pixels up to half way to the next dot."""
     flat, radii = target.points[:, :2], diameters / 2
     gaps = _apart(target) - 2 * radii
     gaps[1:] = np.minimum(gaps[1:], np.linalg.norm(flat[1:], axis=1) - radii[0] - radii[1:])
@@ -269,8 +274,8 @@ def _number(
     if target.origin_diameter is None:
         return leftmost(ways, what), None
     flat = target.points[:, :2]
-    rim = RING * (target.diameter + target.origin_diameter) / 4
-    between = target.spacing * (RING / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
+    rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
+    between = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
     seen = {}
     for way in ways:
         mapped = GridMap(flat, found[way.order.ravel()])
@@ -278,7 +283,7 @@ def _number(
     light = sum(paper for _, paper in seen.values()) / len(seen)
 
     def level(order: NDArray[np.intp]) -> float:
-        """Return the level of the rim, were the paper there as light as in the mean."""
+        """Return the level of the rim, as if the paper there had the mean brightness."""
         dark, paper = seen[int(order[0, 0])]
         return dark * light / max(paper, 1.0)
 

@@ -32,34 +32,35 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Windows
     from smartcam.geometry._inside import Array
 
-MAX_REACH = 13
-"""Pixels to each side of a window at most: more of the edges adds little and takes time."""
+MAX_REACH_PX = 13
+"""At most this many pixels to each side of a corner are fitted: more of the edges adds little and
+takes time."""
 
-WORST_RESIDUAL = 0.35
-"""Rms of the residuals in parts of the gain at most; without an edge it is 1."""
+MAX_RESIDUAL_RATIO = 0.35
+"""Largest RMS of a good fit's residuals, as a part of the gain; where there is no edge it is 1."""
 
 MIN_SINE = 0.17
 """The two edges of a corner must cross at an angle whose sine is larger than this: 10 degrees."""
 
-UNREFINED = 0.25
-"""Standard deviation of a corner that could not be refined, pixels: what detectors reach."""
+UNREFINED_SIGMA_PX = 0.25
+"""Standard deviation, pixels, of a corner that could not be refined: that of common detectors."""
 
 ROUNDED_PX = 2.0
-"""Pixels around the corner of a single square that are not fitted: there a blur rounds it, and
-where its angle is not right the levels are no product of two edges."""
+"""Pixels around the corner of a single square that are not fitted: there the blur rounds the
+corner, and unless its angle is a right one the levels are no product of two edges."""
 
 PLACES, ANGLES = slice(0, 4, 2), slice(1, 4, 2)
 
 
 class Corners(NamedTuple):
-    """Corners as the image's grey levels have them."""
+    """Corners as fitted to the grey levels."""
 
     points: Array  # (N, 2), pixels
     covariance: Array  # (N, 2, 2), pixels^2
     # (N,), half the step from black to white, grey levels; positive where the squares between the
-    # two ways, and opposite, are black
+    # two steps, and the squares opposite, are black
     gains: Array
-    # (N,), whether the fit was good; otherwise the corner stays where it was
+    # (N,), whether the fit was good; a corner that was not fitted keeps its place
     fitted: NDArray[np.bool_]
 
 
@@ -71,25 +72,26 @@ def refine_corners(
     *,
     single: bool = False,
 ) -> Corners:
-    """Return corners to a fraction of a pixel, never worse than they were.
+    """Refine corners to a fraction of a pixel, never to a worse place than before.
 
     A fit that does not come to rest near its start, or that does not look like a corner, leaves the
     corner where OpenCV's ``cornerSubPix`` puts it.
 
     ``points`` (N, 2) are found to a pixel or two. ``ways`` (N, 2, 2), pixels, lead along the two
-    edges; to both sides they span the part of the corner's four squares that is looked at.
+    edges; in both directions they span the part of the corner's four squares that is fitted.
     ``clear`` (N, 2) is the part of ``ways`` from an edge within which nothing is printed on the
-    squares; None: all of it. ``single``: the corner of one square; it lies between the first way
-    and the second one's opposite, which stand counter-clockwise in the image's u and v.
+    squares; None takes all of it. ``single`` says that it is the corner of one square, which lies
+    between the first way and the second one's opposite, which stand counter-clockwise in the
+    image's u and v.
     """
     reach = np.linalg.norm(ways, axis=2).min(axis=1)
     start = _start(image, points, reach if clear is None else reach * clear.min(axis=1))
-    windows = cut_windows(image, start, ways, MAX_REACH, round_=False, clear=clear)
+    windows = cut_windows(image, start, ways, MAX_REACH_PX, round_=False, clear=clear)
     if single:
         windows = windows.without(start, ROUNDED_PX)
     guess = _guess(start - windows.middle, ways)
     evaluate = partial(_evaluate, alone=1.0 if single else 0.0)
-    fits, good = refined(evaluate, windows, guess, moving=(0, 2), worst=WORST_RESIDUAL)
+    fits, good = refined(evaluate, windows, guess, moving=(0, 2), worst=MAX_RESIDUAL_RATIO)
     corners, covariance, crossing = _crossings(fits, windows)
     corners += windows.middle
     moved = np.linalg.norm(corners - start, axis=1)
@@ -97,12 +99,12 @@ def refine_corners(
     if single:
         good &= reach > 1.5 * ROUNDED_PX
     start[good] = corners[good]
-    covariance[~good] = UNREFINED**2 * np.eye(2)
+    covariance[~good] = UNREFINED_SIGMA_PX**2 * np.eye(2)
     return Corners(start, covariance, fits.values[:, GAIN], good)
 
 
 def _start(image: GreyImage, points: Array, reach: Array) -> Array:
-    """Return points by OpenCV's refinement, with the window of the narrowest corner."""
+    """Refine points by OpenCV, with a window that fits the smallest corner."""
     cv2 = load("cv2")
     half = int(np.clip(0.8 * reach.min(), 2, 5))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-2)
@@ -113,9 +115,10 @@ def _start(image: GreyImage, points: Array, reach: Array) -> Array:
 
 
 def _guess(near: Array, ways: Array) -> Array:
-    """Return values (N, 7): edges as they should lie."""
+    """Return the values (N, 7) that a fit begins with: the edges along the given steps."""
     values = np.zeros((len(near), 7))
-    # an edge along (x, y) has the normal (-y, x): cos(angle) u + sin(angle) v = place
+    # an edge along (x, y) has the normal (-y, x), and its points fulfil cos(angle) u + sin(angle) v
+    # = place
     angles = np.arctan2(ways[:, :, 0], -ways[:, :, 1])
     values[:, ANGLES] = angles
     values[:, PLACES] = np.cos(angles) * near[:, :1] + np.sin(angles) * near[:, 1:]
@@ -125,8 +128,8 @@ def _guess(near: Array, ways: Array) -> Array:
 def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
     """Return the fits of four squares, or with ``alone`` = 1 of a single one.
 
-    Its levels are ``offset + gain * ((1 + E1) * (1 + E2) / 2 - 1)``; those of four are the same
-    with 0 in place of the three ones, and without the half.
+    The levels of a single square are ``offset + gain * ((1 + E1) * (1 + E2) / 2 - 1)``, those of
+    four ``offset + gain * E1 * E2``.
     """
     x, y, weights = windows.x, windows.y, windows.weights
     narrow = values.astype(np.float32)
@@ -166,7 +169,7 @@ def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
 
 
 def _crossings(fits: Fits, windows: Windows) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the crossings of the edges, their covariances, and the mask of those found."""
+    """Return the crossings of the edges, their covariances, and a mask of those that cross."""
     # N p = q with the normals as rows of N: p = N^-1 q, and dp = N^-1 (dq - dN p); a normal turned
     # by da moves by da along its edge, so dN p is da times the way along it.
     places, angles = fits.values[:, PLACES], fits.values[:, ANGLES]

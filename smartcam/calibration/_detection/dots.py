@@ -2,12 +2,12 @@
 
 A round dot is seen as an ellipse. Behind a lens that blurs by a Gaussian of width ``s`` the grey
 levels around its rim are ``offset + gain * erf(d / s')``, where ``d`` is the distance from the rim
-and ``s' = sqrt(2) * s``. Eight values, the middle, the shape (three), blur, gain and offset, are
-fitted to all pixels around a dot.
+and ``s' = sqrt(2) * s``. Eight values, the centre (two), the shape (three), blur, gain and offset,
+are fitted to all pixels around a dot.
 
-The middle of the ellipse is not where the dot's centre is seen: perspective makes the nearer half
-larger, and a lens bends it. :class:`GridMap` says how the whole grid is seen, and by that where the
-middle of a round dot's outline must lie beside its centre.
+The centre of the ellipse is not the image of the dot's centre: perspective makes the nearer half
+larger, and a lens bends it. :class:`GridMap` maps the whole grid into the image, and so tells how
+far the centre of a round dot's outline lies from the image of the dot's centre.
 """
 
 from __future__ import annotations
@@ -34,19 +34,21 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Windows
     from smartcam.geometry._inside import Array
 
-MAX_REACH = 20
-"""Pixels to each side of a dot's window at most; larger dots are looked at in a smaller image."""
+MAX_REACH_PX = 20
+"""A dot's window reaches at most this many pixels to each side; a larger dot is fitted in a reduced
+image."""
 
-WORST_RESIDUAL = 0.5
-"""Rms of the residuals in parts of the gain at most; without a dot it is 1."""
+MAX_RESIDUAL_RATIO = 0.5
+"""Largest RMS of a good fit's residuals, as a part of the gain; where there is no dot it is 1."""
 
-UNREFINED = 0.5
-"""Standard deviation of a dot that could not be refined, pixels: what detectors reach."""
+UNREFINED_SIGMA_PX = 0.5
+"""Standard deviation, pixels, of a dot that could not be refined: that of common detectors."""
 
 MIDDLE, SHAPE = slice(0, 2), slice(2, 5)
 
 MIN_DOTS_FOR_LENS = 20
-"""Dots from which on the bend of a lens is taken from the grid, too: ten values an axis."""
+"""From this many dots on, the bend of the lens is fitted to the grid, too: ten values for each
+axis."""
 
 # The points of a regular polygon with n corners at distance R are on average, squared,
 # R^2 / 2 (1 - 2/3 sin^2(pi / n)) from its middle; those of the unit disc 1/2.
@@ -58,12 +60,12 @@ those of the unit disc."""
 
 
 class Dots(NamedTuple):
-    """Ellipses in an image."""
+    """Dots as ellipses in an image."""
 
-    points: Array  # (N, 2), middles, pixels
+    points: Array  # (N, 2), centres, pixels
     covariance: Array  # (N, 2, 2), pixels^2
     areas: Array  # (N,), pixels^2
-    # (N,), whether the fit was good; a dot is where it was before elsewhere
+    # (N,), whether the fit was good; a dot that was not fitted keeps its place
     fitted: NDArray[np.bool_]
 
 
@@ -71,8 +73,8 @@ class GridMap:
     """The map from a flat grid to pixels: a homography, and a cubic where a lens bends the grid.
 
     Args:
-        flat: (N, 2), of the grid's dots, metres.
-        pixels: (N, 2), where they are seen.
+        flat: (N, 2), places of the dots on the sheet, metres.
+        pixels: (N, 2), places of the dots in the image.
     """
 
     def __init__(self, flat: Array, pixels: Array) -> None:
@@ -94,7 +96,7 @@ class GridMap:
         return apply_homography(self.matrix, flat) + self._powers(flat) @ self._bend
 
     def shifts(self, flat: Array, diameters: Array) -> Array:
-        """Return the offsets of the outlines' middles from the dots' centres, (N, 2), pixels."""
+        """Return the offsets of the outlines' centres from those of the dots, (N, 2), pixels."""
         # A tilted circle's image is an ellipse whose middle is not where the circle's centre is
         # seen. Instead of a formula for a pinhole, the dot's outline is mapped as the grid is,
         # lens and all, and the middle of its area taken: of a polygon with corners p_i
@@ -111,18 +113,19 @@ class GridMap:
 
 
 def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -> Dots:
-    """Return the middles of the ellipses that dots are seen as.
+    """Return the fitted ellipses of dots.
 
-    ``points`` (N, 2) are known to a part of their radius; ``radii`` (N, 2, 2) lead from the middle
-    to the rim along the sheet's x and y, ``reaches`` as far as nothing but the dot is seen; pixels.
+    ``points`` (N, 2) are known to a fraction of the radius. ``radii`` (N, 2, 2) lead from the
+    centre to the rim along the sheet's x and y, ``reaches`` as far as nothing but the dot is
+    visible; all in pixels.
     """
     longest = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
-    if longest > MAX_REACH:
-        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH))
-    windows = cut_windows(image, points, reaches, MAX_REACH, round_=True)
+    if longest > MAX_REACH_PX:
+        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH_PX))
+    windows = cut_windows(image, points, reaches, MAX_REACH_PX, round_=True)
     near = points - windows.middle
     guess = _guess(near, radii)
-    fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=WORST_RESIDUAL)
+    fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=MAX_RESIDUAL_RATIO)
     a, b, d = fits.values[:, SHAPE].T
     inverse_area = a * d - b * b  # the area is pi / det S
     moved = np.linalg.norm(fits.values[:, MIDDLE] - near, axis=1)
@@ -130,7 +133,7 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     good &= (inverse_area > 0) & (moved < np.maximum(smallest, 1.0)) & (fits.values[:, GAIN] > 0)
     middles = np.where(good[:, None], fits.values[:, MIDDLE] + windows.middle, points)
     covariance = covariances(fits, windows.counts)[:, MIDDLE, MIDDLE].copy()
-    covariance[~good] = UNREFINED**2 * np.eye(2)
+    covariance[~good] = UNREFINED_SIGMA_PX**2 * np.eye(2)
     expected = np.pi * np.abs(np.linalg.det(radii))
     areas = np.where(good, np.pi / np.where(good, inverse_area, 1.0), expected)
     return Dots(middles, covariance, areas, good)
@@ -139,7 +142,7 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
 def _refine_smaller(
     image: GreyImage, points: Array, radii: Array, reaches: Array, times: int
 ) -> Dots:
-    """Return the dots by an image whose pixels are the means of ``times`` by ``times`` pixels."""
+    """Fit the dots in an image whose pixels are means of ``times`` by ``times`` pixels."""
     levels = reduced(image.levels, times)
     smaller = GreyImage(levels, np.rint(levels).astype(np.uint8))
     dots = refine_dots(smaller, (points + 0.5) / times - 0.5, radii / times, reaches / times)
@@ -152,7 +155,7 @@ def _refine_smaller(
 
 
 def _guess(near: Array, radii: Array) -> Array:
-    """Return values (N, 8): ellipses as they should lie."""
+    """Return the values (N, 8) that a fit begins with: the ellipses of the given radii."""
     values = np.zeros((len(near), 8))
     values[:, MIDDLE] = near
     # With W the ways (as rows) to the rim, m + W^T c is the rim for |c| = 1, so |W^-T (p - m)| = 1

@@ -20,49 +20,51 @@ if TYPE_CHECKING:
 def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     """Find a target's points in an image.
 
-    Corners of squares are found where two fitted edges cross, dots by the fitted ellipse of their
-    rim, from whose middle the centre is told by how the whole grid is seen. All points of a grid of
-    dots must be seen; of a checkerboard some in each row and column, most of them in the outermost
-    ones, those that are covered are left out, or any part with the origin's mark; of a ChArUco
-    board at least four. Its markers are held against each other by the board's map: those that
-    stand elsewhere than their numbers say are left out and named in the view's ``warnings``. Dots
-    may be dark on light or light on dark; a grid that goes on beside them is refused.
+    Corners of squares are found where two fitted edges cross, dots by an ellipse fitted to their
+    rim, whose centre is corrected for perspective by the map of the whole grid. All dots of a grid
+    must be visible. Of a checkerboard some corners in each row and column must be visible, and most
+    of those in the outermost ones; covered corners are left out. Any part of a checkerboard is
+    enough if it has the origin's mark. Of a ChArUco board at least four corners must be visible.
+    The places of its markers are compared with the board: those that lie elsewhere than their ids
+    say are left out and named in the view's ``warnings``. Dots may be dark on light or light on
+    dark; a grid with more dots than the target is refused.
 
-    Points are numbered as the target does. Its origin is told by its mark, its larger dot or its
-    ids; without these by the outermost square there, which is black, where only one of the corners
-    in question has a black one. Where nothing tells it, the target's x points to the right of the
-    image rather than to the left.
+    Points are numbered as in the target. Its origin is known by its mark, its larger dot or its
+    ids; without these by the black outermost square at the origin, if only one of the possible
+    corners has a black one. Otherwise the target's x points to the right of the image rather than
+    to the left.
 
-    A mirrored image is refused where the print tells it: of a ChArUco board; of a checkerboard or a
-    grid of dots with a mark or a larger dot at its origin, unless it is square (as many columns as
-    rows; of an asymmetric grid, half as many); of a checkerboard without a mark whose columns and
-    rows are odd and differ, by its black corners; of an asymmetric grid with an even count of rows
-    that is not square. The mirror image of any other target looks like the target itself when it is
-    turned: its view has the points mirrored, and nothing in one image tells it.
+    A mirrored image is refused if the print shows that it is mirrored: of a ChArUco board; of a
+    checkerboard or a grid of dots with a mark or a larger dot at its origin, unless it is square
+    (as many columns as rows; of an asymmetric grid, half as many); of a checkerboard without a mark
+    whose columns and rows are odd and differ, by its black corners; of an asymmetric grid with an
+    even count of rows that is not square. The mirror image of any other target looks like the
+    target itself after a turn: the view then has mirrored points, which nothing in a single image
+    can show.
 
-    An image without a target is given up after work that is bounded: by the saddles, dark spots or
-    quadrangles that are looked at, and from how many of them a grid is grown.
+    The time spent on an image without a target is bounded: by the number of saddles, dark spots or
+    quadrangles that are examined, and of those that a grid is grown from.
 
     Args:
         image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
-            and high. Or a :class:`~smartcam.frames.Frame`, whose brightness counts.
-        target: what is printed on the sheet.
+            and high. Or a :class:`~smartcam.frames.Frame`, of which the brightness is used.
+        target: the print on the sheet.
         name: name of the image, for messages.
 
     Returns:
-        Points with a covariance that follows from the noise in the image alone: what its
-        compression, the print or the lens do to an edge comes on top. A corner that cannot be
+        Points with a covariance that follows from the noise in the image alone: errors that
+        compression, the print or the lens add to an edge come on top. A corner that cannot be
         fitted stays where it was found first, with a standard deviation of a quarter of a pixel or
         more.
 
     Raises:
-        CalibrationError: SHAPE: no such image, or a ChArUco board of an unknown dictionary;
-            TARGET_NOT_FOUND; WRONG_TARGET: markers contradict the target's description: they stand
-            as on a board of the other ``legacy_pattern``, of other counts, or on several boards;
-            AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30 grey levels of
-            255; MIRRORED: the image shows the target as in a mirror, or, where only its black
-            corners tell, as a negative or with columns and rows exchanged.
-        MissingExtraError: OpenCV is not installed, or what reads a compressed frame.
+        CalibrationError: SHAPE: the array is no such image, or the ChArUco board has an unknown
+            dictionary; TARGET_NOT_FOUND; WRONG_TARGET: markers contradict the target's description:
+            they are arranged as on a board of the other ``legacy_pattern``, of other counts, or as
+            on several boards; AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30
+            grey levels of 255; MIRRORED: the image shows the target as in a mirror, or, where only
+            its black corners tell, as a negative or with columns and rows exchanged.
+        MissingExtraError: OpenCV is not installed, or the decoder of a compressed frame.
         FrameFormatError: a frame has no brightness, or its bytes are wrong.
     """
     grey = grey_image(image)

@@ -1,8 +1,9 @@
-"""Dots that stand in rows and columns, among others that do not.
+"""Find dots in rows and columns among others that are in none.
 
-A dot whose neighbours stand opposite each other in two directions may be a grid's. From there each
-dot is looked for where the ones before it say that it is, until no more are found. A tilted sheet's
-steps change from dot to dot, which is why the last two of a row predict the third.
+A dot whose neighbours lie opposite each other in two directions may belong to a grid. From there
+each next dot is looked for at the place that the ones before it predict, until no more are found.
+The steps of a tilted sheet change from dot to dot, which is why the last two dots of a row predict
+the third.
 """
 
 from __future__ import annotations
@@ -24,46 +25,48 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 NEIGHBOURS = 12
-"""Dots around one among which those opposite each other are looked for: a grid's eight next ones
-and what may be printed between."""
+"""Opposite neighbours of a dot are looked for among this many nearest dots: the eight of a grid,
+and others that may be printed between."""
 
 MAX_OPPOSITE_DIFFERENCE = 0.2
-"""Steps to two opposite dots differ by less than this part of the shorter step."""
+"""The steps to two opposite dots differ by less than this part of the shorter step."""
 
 MIN_SINE = 0.5
 """The steps to a grid's next column and next row must enclose an angle whose sine is larger than
 this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more."""
 
-NEAR, NEAR_FIRST = 0.3, 0.2
-"""A dot is the grid's next one where it lies within this part of a step of the place to which the
-step leads. The second part counts within two steps of the first dot, where steps change less."""
+MAX_STEP_OFFSET, MAX_FIRST_STEP_OFFSET = 0.3, 0.2
+"""A dot is the grid's next one if it lies within the first part of a step from the place that the
+step leads to; within two steps of the first dot, where steps change less, within the second
+part."""
 
 MAX_AREA_RATIO = 1.8
-"""A dot has at most as many times the area of its neighbour."""
+"""A dot has at most this many times the area of its neighbour."""
 
-MAX_MEDIAN_OFF = 0.08
-"""The dots of a flat grid lie off their places by less than this part of a step in the median:
-lenses bend a grid of fewer than 20 dots by less."""
+MAX_MEDIAN_OFFSET = 0.08
+"""The dots of a flat grid lie off their places by a median of less than this part of a step: lenses
+bend a grid of fewer than 20 dots by less."""
 
 MAX_SEEDS_RANKED = 128
-"""Dots, ranked by their best pair of opposite neighbours, that are searched for a second pair."""
+"""At most this many dots, those with the best pair of opposite neighbours, are searched for a
+second pair."""
 
 MAX_SEEDS_TRIED = 4
 """A grid is grown from at most this many dots. A grid's dots stand opposite each other more exactly
 than dots that do so by chance, so the first dot that is tried is the grid's as a rule."""
 
 MIN_DOTS_REACHED = 8
-"""Dots of a grid that must be within two steps of its first dot, that dot included."""
+"""At least this many dots of a grid lie within two steps of its first dot, that dot included."""
 
 Place = tuple[int, int]
 
 _AROUND: Final[list[Place]] = [(1, 0), (0, 1), (-1, 0), (0, -1)]
 
 Lattice = dict[Place, int]
-"""The dot at a column and a row, counted from anywhere in any direction."""
+"""The dot at each column and row; the origin and directions of these are arbitrary."""
 
 Alike: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
-"""Function that tells, from indices of dots, whether each may be a neighbour of the other."""
+"""Function that returns, from the indices of pairs of dots, whether the two may be neighbours."""
 
 
 def lattices(
@@ -75,12 +78,12 @@ def lattices(
     follows: Alike | None = None,
     neighbours: int = NEIGHBOURS,
 ) -> Iterator[Lattice]:
-    """Yield grids, each of dots that hang together.
+    """Yield grids of connected dots.
 
-    ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
-    else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
-    ``most``, a few more than these are returned. It is grown from dots that have two pairs of their
-    next ``neighbours`` opposite each other, of which no more than MAX_SEEDS_TRIED are tried.
+    ``alike`` says which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
+    others may come after a dot. A grid has at least ``least`` dots, four or more. Growing stops
+    soon after ``most`` dots. A grid is grown from a dot that has two pairs of opposite dots among
+    its nearest ``neighbours``; at most MAX_SEEDS_TRIED of these are tried.
     """
     if len(points) < 5:
         return
@@ -101,7 +104,7 @@ def lattices(
 
 
 def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
-    """Return a test that dots' ``areas`` (N,) are alike, or one ``larger`` times the other."""
+    """Return a test whether two ``areas`` (N,) are alike, or one ``larger`` times the other."""
 
     def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
         part = areas[one] / (larger * areas[other])
@@ -112,7 +115,7 @@ def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
 
 @dataclass(eq=False)
 class _Grown:
-    """Dots by their places, and grids that are grown from one of them."""
+    """Dots by their places, and the grids that are grown from one of them."""
 
     _points: Array
     _alike: Alike
@@ -124,7 +127,7 @@ class _Grown:
     def starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
         """Yield dots with neighbours on four sides, and the steps (2, 2) to two of them.
 
-        Those whose neighbours are exactly opposite each other come first.
+        Dots whose neighbours lie most exactly opposite each other come first.
         """
         points = self._points
         _, near = self._tree.query(points, min(neighbours + 1, len(points)))
@@ -156,17 +159,17 @@ class _Grown:
                     break
 
     def grow(self, start: int, steps: Array, most: int) -> Lattice:
-        """Return all dots that are reached from one step by step, or some more than ``most``."""
+        """Return the dots reached step by step from a dot; stop soon after ``most``."""
         places: Lattice = {(0, 0): start}
         taken = {start}
-        # each with the steps from it, and the one that those after it are like
+        # each dot with the steps from it, and with the dot whose area the next ones must be like
         reached = [((0, 0), start, steps, start)]
         waves = 0
         while reached and len(places) <= most:
             if waves == 2 and len(places) < MIN_DOTS_REACHED:
                 break
             waves += 1
-            around = self._around(reached, NEAR_FIRST if waves < 2 else NEAR)
+            around = self._around(reached, MAX_FIRST_STEP_OFFSET if waves < 2 else MAX_STEP_OFFSET)
             wave, reached = reached, []
             for (here, dot, steps, like), sides in zip(wave, around, strict=True):
                 for side, fits in enumerate(sides):
@@ -184,9 +187,9 @@ class _Grown:
         return places
 
     def complete(self, places: Lattice, most: int) -> None:
-        """Add the dots next to a grid that are where all of its dots say that they are.
+        """Add the dots beside a grid that lie where all of its dots together predict them.
 
-        Far from the start and near the horizon the last step alone says it less well.
+        Far from the start and near the horizon, the last step alone predicts them less well.
         """
         added = True
         while added and len(places) <= most:
@@ -200,7 +203,9 @@ class _Grown:
                 if (x + column, y + row) not in places
             }
             at = np.array(list(next_to), dtype=np.float64)
-            longest = NEAR * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(axis=1)
+            longest = MAX_STEP_OFFSET * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(
+                axis=1
+            )
             off, near = self._tree.query(mapped(at))
             fits = (off < longest) & self._follows(near, np.array(list(next_to.values())))
             for place, dot, fit in zip(next_to, near.tolist(), fits.tolist(), strict=True):
@@ -212,7 +217,7 @@ class _Grown:
     def _around(
         self, reached: list[tuple[Place, int, Array, int]], limit: float
     ) -> list[list[list[int]]]:
-        """Return for each dot and each of its four sides the dots that may be next there.
+        """Return, for each dot and each of its four sides, the dots that may come next.
 
         ``limit``: largest distance of such a dot from the end of the step, as a part of the step.
         """
@@ -234,9 +239,10 @@ class _Grown:
 
 
 def _across(ways: Array, apart: Array) -> Array:
-    """Return the distance from being opposite (N,) of the best pair that lies across the best one.
+    """Return the deviation from opposite (N,) of the best pair across the best one.
 
-    ``ways`` (N, K, 2) lead to neighbours, two of which are ``apart`` (N, K, K) from being opposite.
+    ``ways`` (N, K, 2) lead to the neighbours; ``apart`` (N, K, K) says how far each two are from
+    being opposite.
     """
     count, around, _ = apart.shape
     between = (ways[:, :, None] - ways[:, None]).reshape(count, around * around, 2)
@@ -248,10 +254,10 @@ def _across(ways: Array, apart: Array) -> Array:
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
-    """Return True if a flat sheet may show the grid: among many dots, chance makes other grids."""
+    """Return True if a flat sheet could look like the grid, which chance may have made."""
     places = np.array(list(grid), dtype=np.float64)
     found = points[list(grid.values())]
     seen = GridMap(places, found)
     off = np.linalg.norm(seen(places) - found, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
-    return bool(np.median(off / steps) < MAX_MEDIAN_OFF)
+    return bool(np.median(off / steps) < MAX_MEDIAN_OFFSET)

@@ -1,4 +1,4 @@
-"""An image as detectors take it: grey levels from 0 to 255."""
+"""Make the grey levels, from 0 to 255, that detectors work on."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from smartcam.geometry import Code
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MIN_SIDE = 16
-"""Width and height of an image at least, pixels."""
+MIN_SIDE_PX = 16
+"""An image has at least this width and height, pixels."""
 
-MAX_SIDE = 20_000
-"""Width and height of an image at most, pixels."""
+MAX_SIDE_PX = 20_000
+"""An image has at most this width and height, pixels."""
 
-USUAL_SIZE = 1600
-"""Longest side of the image in which OpenCV looks for a grid first, pixels.
-
-In a larger one it takes seconds and finds less.
+USUAL_SIDE_PX = 1600
+"""OpenCV looks for a grid first in an image whose longest side has this many pixels: in a larger
+one it takes seconds and finds less.
 """
 
 
@@ -30,7 +29,7 @@ Level = TypeVar("Level", np.uint8, np.float32)
 
 @runtime_checkable
 class HasGrey(Protocol):
-    """An object that knows its brightness, as a frame of a camera does."""
+    """An object that gives its brightness, such as a frame of a camera."""
 
     def grey(self) -> NDArray[Any]:
         """Return the brightness, (H, W), uint8 or uint16."""
@@ -40,8 +39,8 @@ class HasGrey(Protocol):
 class GreyImage(NamedTuple):
     """An image without its colours."""
 
-    levels: NDArray[np.float32]  # (H, W), float32, 0 to 255; what refinement works on
-    bytes: NDArray[np.uint8]  # (H, W), uint8, the same; what OpenCV's detectors take
+    levels: NDArray[np.float32]  # (H, W), float32, 0 to 255; for refinement
+    bytes: NDArray[np.uint8]  # (H, W), uint8, the same; for OpenCV's detectors
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,9 +52,9 @@ class GreyImage(NamedTuple):
 def grey_image(image: Any) -> GreyImage:
     """Return an image's grey levels.
 
-    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red, or what has its ``grey``
-    levels; else SHAPE is raised. The brightest level of uint16 becomes 255, whether the camera
-    fills 10, 12 or 16 bits.
+    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red, or an object with
+    ``grey`` levels; anything else raises SHAPE. The brightest level of uint16 becomes 255, whether
+    the camera fills 10, 12 or 16 bits.
     """
     if isinstance(image, HasGrey):
         image = image.grey()
@@ -66,12 +65,12 @@ def grey_image(image: Any) -> GreyImage:
         isinstance(image, np.ndarray)
         and fits
         and kind in (np.uint8, np.uint16)
-        and all(MIN_SIDE <= side <= MAX_SIDE for side in shape[:2])
+        and all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in shape[:2])
     ):
         what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
         raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
-            f"{MIN_SIDE} to {MAX_SIDE} pixels wide and high",
+            f"{MIN_SIDE_PX} to {MAX_SIDE_PX} pixels wide and high",
             "uint8 or uint16, (H, W) or (H, W, 3)",
             what,
         )
@@ -85,9 +84,9 @@ def grey_image(image: Any) -> GreyImage:
 
 
 def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
-    """Return an image, ``scale`` times as wide and high.
+    """Return the image ``scale`` times as wide and high.
 
-    A place ``p`` of it is ``(p + 0.5) / scale - 0.5`` in the image.
+    A place ``p`` in the result is ``(p + 0.5) / scale - 0.5`` in the given image.
     """
     if scale == 1.0:
         return image
@@ -98,9 +97,9 @@ def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
 
 
 def reduced(levels: NDArray[Level], times: int) -> NDArray[Level]:
-    """Return levels (H, W) each of which is the mean of ``times`` by ``times`` of the given ones.
+    """Reduce grey levels (H, W): each new one is the mean of ``times`` by ``times`` given ones.
 
-    A place ``p`` among them is ``(p + 0.5) * times - 0.5`` in the image.
+    A place ``p`` in the result is ``(p + 0.5) * times - 0.5`` in the given image.
     """
     if times == 1:
         return levels

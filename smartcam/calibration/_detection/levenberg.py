@@ -1,8 +1,9 @@
 """Many small least-squares problems of one kind, solved side by side.
 
 Levenberg's and Marquardt's method, for fits to the pixels around each of many points: NumPy's cost
-of a call is paid once for all of them, and those that no longer move drop out. So it is no use of
-:mod:`smartcam.calibration._least_squares`, which solves one problem after the other.
+of a call is paid once for all of them, and those that no longer move drop out.
+:mod:`smartcam.calibration._least_squares` is not used here, since it solves one problem after the
+other.
 
 The models are of blurred edges. Their last three values are the lens' blur, the gain (half the step
 from black to white) and the offset of the grey levels.
@@ -25,22 +26,23 @@ if TYPE_CHECKING:
 BLUR, GAIN, OFFSET = -3, -2, -1
 
 MIN_BLUR_PIXELS = 0.25
-"""Pixels: the pixel's own width; a drawn image may have less, which no fit can tell."""
+"""Least blur of a fit, pixels: the width of a pixel itself; a drawn image may have less, which no
+fit can measure."""
 
 MAX_BLUR_PIXELS = 6.0
-"""Pixels; a fit that needs more has seen something else than an edge."""
+"""Largest blur of a fit, pixels: a fit that needs more shows something else than an edge."""
 
 MIN_HALF_STEP = 4.0
-"""Grey levels of 255: half the step from black to white at least."""
+"""Half the step from black to white is at least this many grey levels of 255."""
 
 MAX_STEPS = 20
 """A fit takes at most this many steps; most fits take four to seven."""
 
 MAX_LAST_MOVE_PX = 1e-3
-"""Pixels by which a point moves in the last step at most."""
+"""A fit has come to rest when its last step moves the point by at most this many pixels."""
 
-RIDGE = 1e-6
-"""Added to the diagonal: what no pixel determines stays finite."""
+DIAGONAL_OFFSET = 1e-6
+"""Added to the diagonal, so that a value which no pixel determines stays finite."""
 
 
 class Fits(NamedTuple):
@@ -52,7 +54,7 @@ class Fits(NamedTuple):
     gradient: Array  # (N, M), the Jacobian's transpose by the residuals
 
     def put(self, which: NDArray[np.intp], others: Fits, chosen: NDArray[np.bool_]) -> None:
-        """Take over the chosen ones of others; ``which`` says whose they are."""
+        """Replace the fits at the indices ``which``, where ``chosen``, by those of others."""
         for mine, other in zip(self, others, strict=True):
             mine[which[chosen]] = other[chosen]
 
@@ -62,7 +64,7 @@ def fits_of(
 ) -> Fits:
     """Return the normal equations of fits with ``values`` (N, M).
 
-    ``columns``: M of the Jacobian, (N, P) each, to be multiplied by ``factors`` (N, 1).
+    ``columns``: the M columns of the Jacobian, (N, P) each, to be multiplied by ``factors`` (N, 1).
     ``residuals`` (N, P): measured less modelled. Both are 0 where a pixel does not count.
     """
     # J = (f_1 c_1, f_2 c_2, ...): J^T J and J^T r of the columns c, in single precision, are
@@ -83,18 +85,18 @@ def refined(
     moving: Sequence[int],
     worst: float,
 ) -> tuple[Fits, NDArray[np.bool_]]:
-    """Return the best fits, and which of them (N,) are good.
+    """Return the best fits, and a mask (N,) of the good ones.
 
-    A good one came to rest, with a blur and a gain that an edge may have.
+    A good fit came to rest, with a blur and a gain that an edge may have.
 
-    ``values`` (N, M) are where it starts; of gain and offset the best are taken. ``moving`` are
-    those in pixels, which must come to rest. ``worst``: rms of a good one's residuals in parts of
-    its gain.
+    A fit starts from ``values`` (N, M), except that the best gain and offset are solved for.
+    ``moving`` are the indices of the values in pixels, which must come to rest. ``worst`` is the
+    largest RMS of a good fit's residuals, as a part of its gain.
     """
     values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
     # The model is linear in gain and offset, so one solution of their normal equations is the best.
     flat = evaluate(windows, values)
-    linear = flat.hessian[:, GAIN:, GAIN:] + RIDGE * np.eye(2)
+    linear = flat.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
     values[:, GAIN:] = np.linalg.solve(linear, flat.gradient[:, GAIN:, None])[:, :, 0]
     fits, settled = _solve(evaluate, windows, values, moving)
     blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
@@ -108,7 +110,7 @@ def _solve(
     values: Array,
     moving: Sequence[int],
 ) -> tuple[Fits, NDArray[np.bool_]]:
-    """Return the best fits, with a cost not above the start's, and which (N,) came to rest."""
+    """Return the best fits, none worse than its start, and a mask (N,) of those at rest."""
     best = evaluate(windows, values)
     settled = np.zeros(len(values), dtype=np.bool_)
     damping = np.full(len(values), 1e-3)
@@ -119,7 +121,7 @@ def _solve(
         # (J^T J + damping diag(J^T J)) step = J^T r, each point with a damping of its own.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963).
-        diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + RIDGE
+        diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + DIAGONAL_OFFSET
         damped = hessian + diagonal[:, :, None] * identity
         step = np.linalg.solve(damped, best.gradient[active, :, None])[:, :, 0]
         trial = best.values[active] + step
@@ -137,13 +139,13 @@ def _solve(
 
 
 def covariances(fits: Fits, counts: Array) -> Array:
-    """Return each fit's covariance (N, M, M), with the noise that its residuals show.
+    """Return the covariance (N, M, M) of each fit, with the noise estimated from its residuals.
 
-    ``counts`` (N,): pixels that count.
+    ``counts`` (N,): the number of pixels in each fit.
     """
     # s^2 (J^T J)^-1 with s^2 = sum r^2 / (pixels - M)
     size = fits.values.shape[1]
     variance = fits.cost / np.maximum(counts - size, 1)
-    inverse = np.linalg.inv(fits.hessian + RIDGE * np.eye(size))
+    inverse = np.linalg.inv(fits.hessian + DIAGONAL_OFFSET * np.eye(size))
     covariance: Array = inverse * variance[:, None, None]
     return covariance

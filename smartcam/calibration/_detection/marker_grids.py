@@ -1,4 +1,4 @@
-"""Grids of markers in images: Kalibr's AprilGrid and OpenCV's GridBoard."""
+"""Find grids of markers in images: Kalibr's AprilGrid and OpenCV's GridBoard."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
-from smartcam.calibration._detection.image import USUAL_SIZE, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, reduced, scaled
 from smartcam.calibration._detection.markers import (
-    MIN_AGREEING,
+    MIN_AGREEING_MARKERS,
     Markers,
     agreeing,
     check_one_board,
@@ -36,22 +36,23 @@ FITTED_SHARE = 0.9
 """Part of the black border, or of the white gap beside a corner, that is fitted."""
 
 MAX_MOVED_PX = 1.0
-"""Pixels by which a corner that could not be fitted has moved from where it was read, at most."""
+"""A corner that could not be fitted is kept if refinement moved it by less than this many
+pixels."""
 
 MAX_DOUBLED_PX = 2600
-"""Longest side, pixels, of an image that is looked at in double size, too, for small markers."""
+"""An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 
 def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> TargetView:
-    """Find the corners of the markers that are seen.
+    """Find the corners of the visible markers.
 
-    Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE: no such dictionary.
+    Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE if the dictionary is unknown.
     """
     what = f"grid of {target.columns} x {target.rows} markers"
     board = target.points[target.corners, :2]
     best, strays, read = Markers(np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)), (), 0
     against = 0
-    times = math.ceil(max(image.size) / USUAL_SIZE)
+    times = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for scale in dict.fromkeys((1 / times, 1.0, 2.0)):
         few = len(best.ids) < len(board) / 2
         if len(best.ids) == len(board) or (
@@ -66,11 +67,11 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
             best = found.some(good)
             strays = tuple(sorted((found.ids[~good] + target.first_id).tolist()))
     check_one_board(len(best.ids), against, what)
-    if len(best.ids) < MIN_AGREEING:
+    if len(best.ids) < MIN_AGREEING_MARKERS:
         raise Code.TARGET_NOT_FOUND.refusal(
-            f"{what}: expected at least {MIN_AGREEING} that stand to each other as on the board, "
-            f"found {len(best.ids)} of {read} markers of its dictionary",
-            MIN_AGREEING,
+            f"{what}: expected at least {MIN_AGREEING_MARKERS} that stand to each other as "
+            f"on the board, found {len(best.ids)} of {read} markers of its dictionary",
+            MIN_AGREEING_MARKERS,
             len(best.ids),
         )
     numbers = target.corners[best.ids].ravel()
@@ -90,7 +91,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
 
 
 def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Markers:
-    """Return the markers of an image that is ``scale`` times as large, numbered from the first."""
+    """Return the markers read at ``scale`` times the size, numbered from the target's first."""
     cv2: Any = load("cv2")
     count = target.columns * target.rows
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
@@ -104,7 +105,7 @@ def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Marker
 
 
 def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points: Array) -> Corners:
-    """Return corners of markers; four squares meet at one, or it is the marker's alone."""
+    """Return the refined corners of markers; at each, either four squares meet or a marker ends."""
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, points)
     if matrix is None:
@@ -116,7 +117,7 @@ def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points
     ways = local_steps(partial(apply_homography, matrix), flat, clear)
     if target.kalibr:
         return refine_corners(image, points, ways)
-    # towards the inside of the marker, in the order that the fit of a single square wants
+    # from the corner into the marker, in the order that the fit of a single square needs
     row, column = np.divmod(ids, 2 * target.columns)
     ways *= np.stack([1 - 2 * (column % 2), 1 - 2 * (row % 2)], axis=1)[:, :, None]
     ways[np.linalg.det(ways) < 0] = ways[np.linalg.det(ways) < 0][:, ::-1]

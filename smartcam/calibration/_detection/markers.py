@@ -1,9 +1,9 @@
-"""Square markers in images: read, and held against the map of the board that they stand on.
+"""Read square markers in images, and compare their places with those on the board.
 
-A marker that was misread, or that belongs to another board, stands elsewhere than its number says.
-Its neighbours tell: two markers agree where the way between their middles in the image is the way
-that the board's map has between them, as both of them see the board turned and scaled. Those that
-agree hang together; of a board that is what its description says, all of them do.
+A marker that was misread, or that belongs to another board, lies elsewhere than its number says.
+Its neighbours show it. From the corners of a marker follows how the board is turned and scaled
+there; two markers agree if the vector between their centres is then the one on the board. Markers
+that agree form a group; on a board that matches its description there is one group of all.
 """
 
 from __future__ import annotations
@@ -24,47 +24,49 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_NEIGHBOUR_PITCHES = 2.9
-"""Distance on the board, in distances of next neighbours, up to which two markers are compared."""
+"""Two markers are compared if they are at most this far apart on the board, in distances of next
+neighbours."""
 
-MAX_ASIDE = 0.15
-"""Part of the way between two markers by which it may differ from the map's. A number that is one
-off moves a marker by a third of the longest way or more."""
+MAX_VECTOR_DIFFERENCE = 0.15
+"""The vector between two markers may differ from the board's by this part of its length. A number
+that is wrong by one moves a marker by a third of the longest such vector or more."""
 
-MAX_TURNED = 0.5
-"""Part by which the turns and scales of two neighbouring markers may differ."""
+MAX_SLOPE_DIFFERENCE = 0.5
+"""The turns and scales of two neighbouring markers may differ by this part."""
 
 MAX_PITCHES_OFF = 0.35
-"""Distances of next neighbours by which a marker that has no neighbour may lie off the place that
-the others give it."""
+"""A marker without a neighbour may lie this many distances of next neighbours off the place that
+the others predict."""
 
 MIN_PITCHES_AGAINST = 0.6
-"""Distances of next neighbours by which a group of markers lies off the others' places that speaks
-against the map, beside MAX_ASIDE of its distance from them."""
+"""A group of markers contradicts the board's description if it lies at least this many distances of
+next neighbours, plus MAX_VECTOR_DIFFERENCE times its distance from the others, off the place that
+they predict."""
 
-MIN_CONTRARY = 3
-"""Markers of a group that speaks against the description of the target, at least."""
+MIN_CONTRARY_MARKERS = 3
+"""A group that contradicts the description of the target has at least this many markers."""
 
-MAX_NAMED = 8
-"""Numbers of markers in a text at most."""
+MAX_NUMBERS_IN_MESSAGE = 8
+"""At most this many marker numbers stand in one message."""
 
-MIN_AGREEING = 2
-"""Markers that agree at least: the number of a single one rests on one reading."""
+MIN_AGREEING_MARKERS = 2
+"""At least this many markers must agree: one alone rests on a single reading."""
 
 
 WINDOWS_PX = (3, 13, 23)
-"""Sides of the windows whose mean tells dark from light: OpenCV's."""
+"""Sides of the windows, pixels, whose mean separates dark from light: OpenCV's."""
 
-MANY_OUTLINES, MAX_OUTLINES = 1500, 4000
-"""Dark outlines of an image, in the mean of the windows, above which one window does; and how many
-of that are looked at, at most. A board of 1,000 markers, the most that a dictionary has, shows some
-3,000."""
+MAX_OUTLINES_OF_ALL_WINDOWS, MAX_OUTLINES = 1500, 4000
+"""Dark outlines of an image, as the mean over the windows: with more than the first number a single
+window is used, and of that at most the second number is examined. A board of 1,000 markers, the
+most that a dictionary has, shows some 3,000."""
 
 
 class Markers(NamedTuple):
     """Markers that were read."""
 
     quads: Array  # (N, 4, 2), corners in OpenCV's order, pixels
-    ids: NDArray[np.intp]  # (N,)
+    ids: NDArray[np.intp]  # (N,), numbers of the markers
 
     def some(self, which: NDArray[np.bool_]) -> Markers:
         """Return some of the markers."""
@@ -72,16 +74,16 @@ class Markers(NamedTuple):
 
 
 class MarkerAgreement(NamedTuple):
-    """Markers held against a map."""
+    """The result of comparing markers with a board."""
 
-    good: NDArray[np.bool_]  # (N,), which stand as the map says
-    contrary: int  # how many others stand so to each other, elsewhere
+    good: NDArray[np.bool_]  # indices of the markers that lie as on the board
+    contrary: int  # count of others that agree with each other, elsewhere
 
 
 def marker_dictionary(name: str, needed: int, what: str) -> Any:
-    """Return one of OpenCV's dictionaries by its name, of ``needed`` markers or more.
+    """Return OpenCV's dictionary of a name, which must have at least ``needed`` markers.
 
-    ``what`` names the target. Raises SHAPE: no such dictionary, or too few markers in it.
+    ``what`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
     """
     cv2 = load("cv2")
     number = getattr(cv2.aruco, name, None)
@@ -102,15 +104,15 @@ def marker_dictionary(name: str, needed: int, what: str) -> Any:
 
 
 def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = None) -> Any:
-    """Return OpenCV's detector for an image, bounded: it compares each outline with each other one.
+    """Return OpenCV's detector for an image, set up so that its time is bounded.
 
-    Where there are many dark outlines they are looked for in one way instead of three, and where
-    there are too many, only the largest are looked at.
+    The detector compares each dark outline with each other one. If there are many, one window is
+    used instead of three; if there are too many, only the largest outlines are examined.
     """
     cv2 = load("cv2")
     given = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
-    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MANY_OUTLINES:
+    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
         window = sorted(WINDOWS_PX, key=lambda one: len(lengths[one]))[len(WINDOWS_PX) // 2]
         given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
@@ -120,9 +122,9 @@ def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = 
 
 
 def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.intp]:
-    """Return the lengths of the outlines, pixels, that may be a marker's.
+    """Return the lengths, pixels, of the outlines that may be a marker's.
 
-    What is darker than the mean of a window about it is taken for dark.
+    A pixel is dark if it is darker than the mean of a window around it.
     """
     cv2 = load("cv2")
     mean, kind = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
@@ -135,14 +137,14 @@ def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.
 
 
 def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
-    """Return the agreement of markers with the map of a board, each number counted once.
+    """Compare markers with a board; count each number once.
 
-    ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. Where fewer than
-    MIN_AGREEING agree, none does.
+    ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. If fewer than
+    MIN_AGREEING_MARKERS markers agree, the result has none.
     """
     good = np.zeros(len(markers.ids), dtype=np.bool_)
     known = np.flatnonzero((markers.ids >= 0) & (markers.ids < len(board)))
-    if len(known) < MIN_AGREEING:
+    if len(known) < MIN_AGREEING_MARKERS:
         return MarkerAgreement(good, 0)
     ids, quads = markers.ids[known], markers.quads[known]
     flat = board[ids]
@@ -151,7 +153,7 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     groups = _hanging_together(_agreements(slopes, seen, mapped, MAX_NEIGHBOUR_PITCHES * pitch))
     largest = groups == np.bincount(groups).argmax()
     matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
-    if largest.sum() < MIN_AGREEING or matrix is None:
+    if largest.sum() < MIN_AGREEING_MARKERS or matrix is None:
         return MarkerAgreement(good, 0)
     off = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
     off /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
@@ -159,17 +161,17 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     upright = _alike(slopes, derivatives(matrix, mapped))
     joined = largest | ((off < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
     good[known[joined]] = True
-    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_ASIDE * away)
+    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
     return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
 
 
 def check_one_board(agreed: int, contrary: int, what: str) -> None:
-    """Raise (WRONG_TARGET) where markers stand as on a board that is another one, or several.
+    """Raise WRONG_TARGET if markers are arranged as on another board, or as on several.
 
-    ``agreed`` of them stand to each other as on the board, and ``contrary`` others do as well, but
-    not to these. ``what`` names the target.
+    ``agreed`` markers are arranged as on the board; ``contrary`` others agree with each other, but
+    not with these. ``what`` names the target.
     """
-    if contrary >= MIN_CONTRARY and 2 * contrary >= agreed:
+    if contrary >= MIN_CONTRARY_MARKERS and 2 * contrary >= agreed:
         raise Code.WRONG_TARGET.refusal(
             f"{what}: expected markers of one such board, got {agreed} that stand to each other as "
             f"on it and {contrary} others that do so elsewhere: columns and rows are others, or "
@@ -180,7 +182,7 @@ def check_one_board(agreed: int, contrary: int, what: str) -> None:
 
 
 def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Array]:
-    """Return the pixels where the nearest markers see places (N, 2) of a board, and a unit's there.
+    """Predict the pixels of places (N, 2) on a board from the nearest markers, and the scale there.
 
     ``quads`` (M, 4, 2): the corners of markers in the image, ``flat`` on the board.
     """
@@ -197,16 +199,18 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
 
 
 def strays_told(numbers: Sequence[int]) -> tuple[Remark, ...]:
-    """Return the remark about markers that were left out, by their numbers; none of none."""
+    """Return the remark that names the markers left out; nothing if none were."""
     if not numbers:
         return ()
-    shown = ", ".join(map(str, numbers[:MAX_NAMED])) + (", ..." if numbers[MAX_NAMED:] else "")
+    shown = ", ".join(map(str, numbers[:MAX_NUMBERS_IN_MESSAGE])) + (
+        ", ..." if numbers[MAX_NUMBERS_IN_MESSAGE:] else ""
+    )
     text = f"markers left out, which do not stand where the board has them: {shown}"
     return (Code.OUTLIER.remark(text),)
 
 
 def _slopes(quads: Array, flat: Array) -> Array:
-    """Return (N, 2, 2): how the image moves along the board's x and y at each marker."""
+    """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     around = flat - flat.mean(axis=1, keepdims=True)
     seen = quads - quads.mean(axis=1, keepdims=True)
     squares = (around**2).sum(axis=(1, 2)) / 2  # of a square's corners, the same along x and y
@@ -215,23 +219,23 @@ def _slopes(quads: Array, flat: Array) -> Array:
 
 
 def _pitch(middles: Array) -> float:
-    """Return the distance of a marker of a board from its next neighbour."""
+    """Return the distance between a board's markers that are next to each other."""
     apart = np.linalg.norm(middles - middles[0], axis=1)
     return float(apart[1:].min()) if len(middles) > 1 else 0.0
 
 
 def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDArray[np.bool_]:
-    """Return (N, N): which two markers confirm each other."""
+    """Return a mask (N, N) that is True for two markers that agree."""
     ways = mapped[None] - mapped[:, None]
     apart = np.linalg.norm(ways, axis=2)
-    # the mean of both slopes leads from one to the other exactly to second order
+    # the mean of both derivatives predicts one marker from the other exactly to second order
     both = (slopes[:, None] + slopes[None]) / 2
     expected = np.einsum("ijkl,ijl->ijk", both, ways)
     off = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
     return np.asarray(
         (apart > 0)
         & (apart <= reach)
-        & (off < MAX_ASIDE * np.linalg.norm(expected, axis=2))
+        & (off < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
         & _alike(slopes[:, None], slopes[None])
     )
 
@@ -239,10 +243,12 @@ def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDAr
 def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
     """Return True for each pair of slopes (..., 2, 2) with about the same turn and scale."""
     differ = np.linalg.norm(one - other, axis=(-2, -1))
-    return np.asarray(differ < MAX_TURNED * np.linalg.norm((one + other) / 2, axis=(-2, -1)))
+    return np.asarray(
+        differ < MAX_SLOPE_DIFFERENCE * np.linalg.norm((one + other) / 2, axis=(-2, -1))
+    )
 
 
 def _hanging_together(agreed: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the number (N,) of the group that each belongs to."""
+    """Return the number of the group of agreeing markers that each belongs to, (N,)."""
     _, parts = load("scipy.sparse.csgraph").connected_components(agreed, directed=False)
     return np.asarray(parts, dtype=np.intp)

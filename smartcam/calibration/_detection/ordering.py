@@ -1,8 +1,8 @@
 """Number the points that were found as the target numbers them.
 
-A detector returns a grid whose first point may be any of its corners. The ways to lay the target's
-rows and columns over it are few; those that keep the sheet's front towards the camera are
-``proper``, the others show it mirrored.
+A detector returns a grid whose first point may be any of its corners. There are only a few ways to
+lay the target's rows and columns over it. Those in which the sheet's front faces the camera are
+``proper``; the others show it mirrored.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_ORIGIN_CONTRAST = 30.0
-"""Grey levels of 255 by which a marked origin is darker than the next corner at least."""
+"""A marked origin is darker than the next darkest corner by at least this many grey levels of
+255."""
 
 _TURNS: Final = [
     np.array(entries).reshape(2, 2)
     for entries in itertools.product((-1, 0, 1), repeat=4)
     if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
 ]
-"""Matrices that may lie between the steps that were followed and those to the next column and row:
+"""Matrices that may turn the steps a grid was grown by into those to the next column and row:
 turns, mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its
 sides."""
 
@@ -39,9 +40,9 @@ sides."""
 class Arrangement(NamedTuple):
     """One way to number the points that were found."""
 
-    # (rows, columns): which of them is the target's point in that row and column
+    # (rows, columns), index of the found point in each row and column of the target
     order: NDArray[np.intp]
-    proper: bool  # whether the sheet's front is seen, and not its mirror image
+    proper: bool  # True if the sheet's front is seen, and not its mirror image
     rightward: float  # cosine of the angle between the target's x and the image's u
 
 
@@ -51,8 +52,8 @@ def arrangements(
     """Return all ways in which a grid can be numbered.
 
     ``points`` (N, 2), pixels, are all points of the target in any order; ``places`` (N, 2) the
-    column and the row of each, counted from anywhere in any direction; of a grid with shifted rows
-    the steps to the two nearest neighbours.
+    column and the row of each, with arbitrary origin and directions; in a grid with shifted rows
+    they count steps to the two nearest neighbours.
     """
     wanted = _places(target)
     ways: list[Arrangement] = []
@@ -95,9 +96,9 @@ def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
 
 
 def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
-    """Return the proper one whose x points most to the image's right: the same one every time.
+    """Return the proper arrangement whose x points most to the image's right, which is unique.
 
-    Raises MIRRORED where none is proper; ``what`` names the target.
+    Raises MIRRORED if no arrangement is proper; ``what`` names the target.
     """
     proper = [way for way in ways if way.proper]
     if not proper:
@@ -114,9 +115,9 @@ def marked(
 ) -> tuple[Arrangement, float]:
     """Return the arrangement with a dark mark at its origin, and by how much it is darker.
 
-    The margin to the next corner is in grey levels of 255, which ``level`` gives where the mark of
-    an arrangement's order should be. ``what`` are the target and its mark, for messages. Raises
-    AMBIGUOUS_ORIGIN where the margin is too small; MIRRORED.
+    ``level`` returns the grey level, of 255, at the place where an arrangement would have its mark.
+    ``what`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too
+    little darker than the next corner, and MIRRORED.
     """
     levels = {int(way.order[0, 0]): level(way.order) for way in ways}
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]

@@ -2,8 +2,9 @@
 
 Around a corner of a checkerboard two dark sectors lie opposite each other between two light ones.
 Its grey levels are a saddle there, and on a circle around it they come twice: a half turn further
-they are the same, and they go up and down twice. By the darker sectors' direction a corner's
-neighbours are told from others: theirs is turned by 90 degrees, however the sheet is seen.
+they are the same, and they go up and down twice. The direction of the dark sectors shows which
+saddles are neighbours on a board: it is turned by 90 degrees from each corner to the next, from
+wherever the sheet is seen.
 """
 
 from __future__ import annotations
@@ -20,30 +21,34 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Floats
     from smartcam.geometry._inside import Array
 
-SMOOTHED = 1.0
-"""Standard deviation of the Gaussian before second derivatives are taken, pixels."""
+SMOOTHING_PX = 1.0
+"""The image is smoothed by a Gaussian of this standard deviation, pixels, before its second
+derivatives are taken."""
 
 MIN_CURVATURE = 0.3
 """The bend of a saddle, ``f_xy^2 - f_xx f_yy`` in grey levels of 255 and pixels, must be larger
 than this; a sharp corner with a step of 15 grey levels has 1."""
 
-RADIUS = 3.0
-"""Radius of the circle of levels around a saddle, pixels: it stays in squares of seven pixels."""
+CIRCLE_RADIUS_PX = 3.0
+"""Radius, pixels, of the circle around a saddle whose grey levels are tested; it fits squares of
+seven pixels."""
 
 MIN_SWING = 1.0
-"""Grey levels by which a circle's levels swing at least."""
+"""Along the circle, the grey levels of a corner swing by at least this many."""
 
 MAX_ASYMMETRY = 0.35
-"""Part of the squared swing common to a circle's halves that their squared difference may reach."""
+"""The squared difference between a circle's halves is at most this part of the squared swing that
+they share."""
 
 MAX_SADDLES_KEPT = 600
 """At most this many saddles that look like a corner are kept, the strongest ones."""
 
 MAX_SADDLES_EXAMINED = 1500
-"""Saddles of an image, the strongest ones; so that noise and leaves take no more than others."""
+"""At most this many saddles of an image, the strongest, are examined, so that leaves and noise take
+bounded time."""
 
 _ANGLES = np.arange(16) * np.pi / 8
-_CIRCLE = RADIUS * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_CIRCLE = CIRCLE_RADIUS_PX * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _TWICE = np.column_stack([np.cos(2 * _ANGLES), np.sin(2 * _ANGLES)]) / 16
 
 
@@ -51,11 +56,11 @@ class Saddles(NamedTuple):
     """Saddles of the grey levels that may be corners."""
 
     points: Array  # (N, 2), pixels
-    # (N, 2), unit vectors, at twice the angle of where the lighter sectors lie
+    # (N, 2), unit vectors, at twice the angle of the direction of the lighter sectors
     turns: Array
 
     def alike(self, one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return True for each two corners, by their indices, that may be neighbours on a board."""
+        """Return True for each pair of saddles, by index, that may be neighbours on a board."""
         cosine = (self.turns[one] * self.turns[other]).sum(axis=-1)
         return np.asarray(cosine < -0.5)
 
@@ -63,7 +68,7 @@ class Saddles(NamedTuple):
 def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     """Return the corners that an image (H, W) may show."""
     cv2 = load("cv2")
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHED)
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
     xx, yy, xy = (
         cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.25)
         for order in ((2, 0), (0, 2), (1, 1))
@@ -71,7 +76,7 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     bent = xy * xy - xx * yy
     highest = cv2.dilate(bent, np.ones((5, 5), np.uint8))
     peaks = (bent == highest) & (bent > MIN_CURVATURE)
-    rim = int(RADIUS) + 1
+    rim = int(CIRCLE_RADIUS_PX) + 1
     inside = peaks[rim:-rim, rim:-rim]
     v, u = np.divmod(np.flatnonzero(inside), inside.shape[1])
     at = np.column_stack([u, v]) + rim
@@ -93,9 +98,9 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
 
 
 def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
-    """Return the ways (N, 2) from pixels to the saddles, where the slope is 0; a pixel at most.
+    """Return the steps (N, 2), at most a pixel, from pixels to the saddles, where the slope is 0.
 
-    ``bends`` (N, 4): second derivatives there.
+    ``bends`` (N, 4): second derivatives at the pixels.
     """
     u, v = at.T
     slopes = np.stack(

@@ -1,4 +1,4 @@
-"""Grey levels between pixels."""
+"""Interpolate grey levels between pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def mean_level(image: GreyImage, points: Array) -> float:
-    """Return the mean grey level at points (N, 2); those of the image's rim beyond it."""
+    """Return the mean grey level at points (N, 2); outside of the image its rim is continued."""
     cv2 = load("cv2")
     at = points.astype(np.float32)[None]
     levels = cv2.remap(image.levels, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

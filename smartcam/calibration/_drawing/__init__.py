@@ -1,1 +1,1 @@
-"""Pictures of calibrations from images, as SVG."""
+"""Draw calibrations that were made from images, as SVG."""

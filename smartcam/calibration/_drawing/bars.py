@@ -1,4 +1,4 @@
-"""A bar or two for each view, with the numbers that they are to be compared with."""
+"""Draw a bar or two for each view, with lines at the values to compare them with."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 WIDTH, HEIGHT = 900.0, 260.0
-"""A chart is drawn this wide and this high, pixels."""
+"""Width and height of a chart, pixels."""
 
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
 
-ADVANCE: Final = 7.5
+LETTER_WIDTH_PX: Final = 7.5
 """Approximate width of a letter, pixels."""
 
-CUT: Final = 3.0
-"""Multiple of the highest bar of a used view beyond which a bar is cut, with its number."""
+MAX_BAR_RATIO: Final = 3.0
+"""Bars longer than this many times the longest bar of a used view are cut, and their value is
+written."""
 
 MAX_LINES: Final = 5
-"""Horizontal lines of a chart at most."""
+"""A chart has at most this many horizontal lines."""
 
 DIGITS: Final = "0123456789"
 
@@ -36,17 +37,17 @@ class Series(NamedTuple):
     """One bar of each view."""
 
     name: str
-    values: Sequence[float]  # NaN: none
-    level: float = math.nan  # of all views together; NaN: none
+    values: Sequence[float]  # NaN for a view without a value
+    level: float = math.nan  # value of all views together; NaN if there is none
 
 
 class Chart(NamedTuple):
     """Bars of each view, in one unit."""
 
     unit: str
-    series: Sequence[Series]  # one or two
-    names: Sequence[str]  # of the views
-    off: Sequence[bool]  # whether each was left out
+    series: Sequence[Series]  # one series or two
+    names: Sequence[str]  # names of the views
+    off: Sequence[bool]  # whether each view was left out
 
 
 def draw_bars(charts: Sequence[Chart], title: str) -> str:
@@ -60,7 +61,7 @@ def draw_bars(charts: Sequence[Chart], title: str) -> str:
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without what all of them begin and end with, digits apart."""
+    """Return the names without their common beginning and end; digits are kept."""
     if len(set(names)) < 2:
         return list(names)
     begin = _common(names).rstrip(DIGITS)
@@ -97,7 +98,7 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
 
 
 def _largest(chart: Chart) -> float:
-    """Return the upper end of a chart: views that were left out do not make the others small."""
+    """Return the upper end of a chart, which views that were left out do not raise."""
     used = [
         value
         for one in chart.series
@@ -106,7 +107,9 @@ def _largest(chart: Chart) -> float:
     ]
     every = [value for one in chart.series for value in one.values if math.isfinite(value)]
     most = max(used, default=0.0)
-    return max(most, min(max(every), CUT * most)) if most else max(every, default=1.0) or 1.0
+    return (
+        max(most, min(max(every), MAX_BAR_RATIO * most)) if most else max(every, default=1.0) or 1.0
+    )
 
 
 def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
@@ -116,7 +119,7 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
     shorts = short_names(chart.names)
     longest = max((len(one) for one in shorts), default=1)
     # a name at each bar where there is room, else at each second, fifth, tenth, ...
-    needed = math.ceil(ADVANCE * (min(longest, 12) + 1) / room)
+    needed = math.ceil(LETTER_WIDTH_PX * (min(longest, 12) + 1) / room)
     each = next(n for n in (1, 2, 5, 10, 20, 50, 100, 10**9) if n >= needed)
     for number, (name, short) in enumerate(zip(chart.names, shorts, strict=True)):
         middle = LEFT + (number + 0.5) * room
@@ -151,4 +154,4 @@ def _legend(chart: Chart, y: float) -> Iterator[str]:
     for kind, said in entries:
         yield rectangle((x, y - 10), (12, 12), f'class="{kind}"')
         yield text((x + 18, y), said)
-        x += 18 + ADVANCE * len(said) + 20
+        x += 18 + LETTER_WIDTH_PX * len(said) + 20

@@ -41,24 +41,25 @@ MILLIMETRES: Final = 1e3
 def draw_views(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of each view's errors as bars, SVG.
 
-    Of a lens the rms of its residuals and the held-out one, pixels; of a pair that of each side,
-    and the held-out one of lengths, millimetres; of a camera on a robot both on the target,
-    millimetres. Dashed lines are those of all together; grey bars were left out. ``title``: a line
-    on top. The document has a size of its own, no parts elsewhere, and follows a page that is dark.
+    For a lens the bars are the RMS of the residuals and the held-out error, in pixels; for a pair
+    the RMS of each side in pixels and the held-out error of lengths in millimetres; for a camera on
+    a robot the errors on the target, fitted and held out, in millimetres. Dashed lines are the
+    values of all views together; grey bars are views that were left out. ``title`` is a line on
+    top. The document has a fixed size, loads no other files, and adapts to a dark page.
 
     Raises:
-        CalibrationError: ``WRONG_KIND``: no calibration from images.
+        CalibrationError: ``WRONG_KIND``: this is no calibration from images.
     """
     return draw_bars(_of(calibration, _CHARTS, "draw_views")(calibration), title)
 
 
 @takes(title=check_text)
 def draw_scene(calibration: FromImages, *, title: str = "") -> str:
-    """Return a picture of targets and cameras in space, SVG; as :func:`draw_views` else.
+    """Return a picture of targets and cameras in space, SVG, otherwise as :func:`draw_views`.
 
-    Of a lens and of a pair the cameras stand and the targets are around them; of a robot the base
-    stands. Targets are blue and have the views' names, those that were left out are dashed; cameras
-    are orange.
+    For a lens or a pair the cameras are fixed, and the targets lie around them; for a robot its
+    base is fixed. Targets are blue, with the views' names; dashed ones were left out. Cameras are
+    orange.
     """
     return _draw_scene(_of(calibration, _SCENES, "draw_scene")(calibration), title)
 
@@ -70,12 +71,13 @@ def draw_uncertainty(
     distance: float | None = None,
     title: str = "",
 ) -> str:
-    """Return the uncertainty of a lens as a map, SVG; as :func:`draw_views` else.
+    """Return a map of the uncertainty of a lens, SVG, otherwise as :func:`draw_views`.
 
-    Of a comparison both maps: by how much the two lenses differ, and what noise leads to. Colours
-    go by the logarithm, from dark to light; numbers are of a coordinate, pixels. A white cross is
-    where it is largest; white dots are the points in the views of a calibration. ``distance`` is
-    that of :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    For a comparison of two lenses there are two maps: by how much the lenses differ, and by how
+    much noise alone makes them differ. Colours follow the logarithm, from dark to light; numbers
+    are pixels of one coordinate. A white cross marks the largest value; white dots are the points
+    in the views of a calibration. ``distance`` is as in
+    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     if isinstance(shown, LensComparison):
         observed = [Map("difference", _size(shown.pixels), shown.lengths, _said(shown.observed))]
@@ -186,7 +188,7 @@ def _robot_names(one: HandEyeCalibration) -> list[str]:
 
 
 def _corners(target: Target | None) -> Array:
-    """Return the corners of a target's points (4, 3); of a square of 100 mm where it is unknown."""
+    """Return the corners (4, 3) of a target, or of a square of 100 mm for an unknown one."""
     if target is None:
         return 0.05 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     (left, low, _), (right, high, _) = target.points.min(axis=0), target.points.max(axis=0)

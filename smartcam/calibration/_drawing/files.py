@@ -1,4 +1,4 @@
-"""Pictures of what a file holds."""
+"""Draw pictures of the calibration in a file."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ PICTURES: Final[Mapping[str, tuple[Picture, ...]]] = {
     HandEyeCalibration.kind: ("views", "scene"),
     PlaneCalibration.kind: ("plane",),
 }
-"""Pictures that may be drawn of each kind of file, the first where nothing is asked for."""
+"""Pictures of each kind of file; the first is drawn by default."""
 
 
 def draw_file(
     path: str | os.PathLike[str], picture: Picture | None = None, distance: float | None = None
 ) -> str:
-    """Return a picture of the calibration in a file, SVG; its name is the title.
+    """Return a picture of the calibration in a file, SVG, with the file's name as title.
 
-    Raises ``WRONG_KIND``: there is no such picture of it, or none at all; and what ``load`` of the
-    calibrations says.
+    Raises ``WRONG_KIND`` if this kind of file has no such picture, and the errors of the
+    calibration's ``load``.
     """
     document = read_document(path)
     known = PICTURES.get(document.kind, ())

@@ -1,4 +1,4 @@
-"""Maps over a camera's field, as coloured cells with a legend."""
+"""Draw maps over a camera's field of view, as coloured cells with a legend."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 WIDTH: Final = 640.0
-"""A map is drawn this wide, pixels."""
+"""Width of a map, pixels."""
 
 BORDER, HEAD, FOOT = 30.0, 70.0, 84.0
 """Pixels beside, above and below a map."""
@@ -30,7 +30,7 @@ Source: S. van der Walt and N. Smith, viridis (public domain).
 """
 
 STEPS: Final = 24
-"""Colours of a map: neighbours of one colour merge into one rectangle."""
+"""Number of colours of a map; neighbouring cells of one colour become one rectangle."""
 
 MAX_DECADES: Final = 3.0
 """A map's colours span this many powers of ten at most; smaller values have the first colour."""
@@ -42,9 +42,9 @@ class Map(NamedTuple):
     """The values of one map, with the texts and points drawn on it."""
 
     title: str
-    size: tuple[int, int]  # of the image, pixels
-    values: Array  # (h, w), from corner to corner; NaN: none
-    said: str = ""  # below it
+    size: tuple[int, int]  # size of the image, pixels
+    values: Array  # (h, w), from corner to corner; NaN where there is no value
+    said: str = ""  # text below the map
     points: Array = np.zeros((0, 2))  # pixels that are marked by dots
 
 
@@ -89,7 +89,7 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
 
 
 def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
-    """Yield the values in the corners and the middle, and a cross where the map is largest."""
+    """Yield the values at the corners and the centre, and a cross at the largest value."""
     rows, columns = values.shape
     for row, y in ((0, 20.0), (rows // 2, tall / 2 + 5), (rows - 1, tall - 10)):
         ends = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
@@ -102,7 +102,8 @@ def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
     if np.isfinite(values).any():
         row, column = np.unravel_index(np.nanargmax(values), values.shape)
         at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * tall / rows])
-        if row not in {0, rows - 1} or column not in {0, columns - 1}:  # not on a number
+        # the cross must not cover a number
+        if row not in {0, rows - 1} or column not in {0, columns - 1}:
             for kind in ("mark-rim", "mark"):
                 for arm in np.array([[6.0, 0.0], [0.0, 6.0]]):
                     yield line(at - arm, at + arm, kind)

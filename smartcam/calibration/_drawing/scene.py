@@ -1,6 +1,7 @@
-"""Boards and cameras in space, seen from a corner of the room.
+"""Draw boards and cameras in space, seen from a corner of the room.
 
-Far things are as large as near ones, so one scale holds for all of the picture.
+The projection is parallel: far things are as large as near ones, so one scale holds for the whole
+picture.
 """
 
 from __future__ import annotations
@@ -19,40 +20,41 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, Rigid
 
 WIDTH, HEIGHT = 900.0, 560.0
-"""The scene is drawn this wide and this high at most, pixels."""
+"""Largest width and height of a scene, pixels."""
 
 BORDER, HEAD, FOOT = 40.0, 56.0, 50.0
-"""Pixels beside, above and below it."""
+"""Pixels beside, above and below the scene."""
 
 AZIMUTH, ELEVATION = math.radians(-38.0), math.radians(24.0)
-"""Direction from which the scene is looked at: turned about the vertical, and from above."""
+"""Direction of the viewer: angle about the vertical, and angle above the ground."""
 
 FRUSTUM: Final = 0.16
-"""Length of a camera's frustum, parts of the scene's extent; of many cameras it is shorter."""
+"""Length of a camera's frustum, as a part of the scene's extent; with many cameras it is
+shorter."""
 
 ARROW: Final = 0.12
-"""Length of a frame's axes, likewise."""
+"""Length of the axes of a frame, as a part of the scene's extent."""
 
-LETTER: Final = (7.5, 15.0)
-"""Width and height of a letter, about, pixels."""
+LETTER_PX: Final = (7.5, 15.0)
+"""Approximate width and height of a letter, pixels."""
 
-BELOW: Final = np.array([0.0, 14.0])
-"""Way from a thing's place to its label, pixels."""
+LABEL_OFFSET_PX: Final = np.array([0.0, 14.0])
+"""Offset of a label from its thing, pixels."""
 
-OFFSETS: Final = [(0.0, 0.0)] + [
+LABEL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
     (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
 ]
-"""Places of a label beside its thing, pixels; the first that is free is taken."""
+"""Further offsets of a label, pixels; the first that is free is taken."""
 
 
 class DrawnBoard(NamedTuple):
     """A target in the scene."""
 
     name: str
-    corners: Array  # (4, 3)
-    off: bool = False  # left out of the calibration
+    corners: Array  # (4, 3), metres
+    off: bool = False  # True if it was left out of the calibration
 
 
 class DrawnCamera(NamedTuple):
@@ -76,14 +78,15 @@ class DrawnScene(NamedTuple):
     boards: Sequence[DrawnBoard]
     cameras: Sequence[DrawnCamera]
     axes: Sequence[Axes] = ()
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # of a camera's frame; a robot's is z
+    # direction of "up" in the scene's frame: that of the camera's image, or a robot's z
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
 
 
 class _Drawn(NamedTuple):
     depth: float
     drawn: str
     label: str
-    at: Array  # (2,)
+    at: Array  # (2,), pixels
 
 
 class _Outlook:
@@ -101,7 +104,7 @@ class _Outlook:
         )
         around = np.array([[turn[0], -turn[1], 0.0], [turn[1], turn[0], 0.0], [0.0, 0.0, 1.0]])
         tilted = np.array([[1.0, 0.0, 0.0], [0.0, rise[0], -rise[1]], [0.0, rise[1], rise[0]]])
-        self.axes: Array = tilted @ around @ room  # right, away, up
+        self.axes: Array = tilted @ around @ room  # axes of the viewer: right, away, up
         seen = points @ self.axes.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         span = np.maximum(high - low, 1e-9)
@@ -109,19 +112,19 @@ class _Outlook:
         self.middle: Array = (low + high) / 2
 
     def pixels(self, points: Array) -> Array:
-        """Return points (..., 3) in pixels (..., 2)."""
+        """Project points (..., 3) to pixels (..., 2)."""
         seen = points @ self.axes.T - self.middle
         centre = np.array([BORDER + WIDTH / 2, HEAD + HEIGHT / 2])
         places: Array = centre + seen[..., [0, 2]] * [self.zoom, -self.zoom]
         return places
 
     def depth(self, points: Array) -> float:
-        """Return the depth of the middle of points, along the line of sight."""
+        """Return the mean depth of points along the line of sight."""
         return float((points @ self.axes[1]).mean())
 
 
 def draw_scene(scene: DrawnScene, title: str) -> str:
-    """Return a scene: boards in blue, those that were left out dashed; cameras in orange."""
+    """Draw a scene: cameras in orange, boards in blue, dashed if they were left out."""
     places = np.concatenate(
         [
             *(one.corners for one in scene.boards),
@@ -144,7 +147,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         for one in scene.boards
     ]
     items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
-    items.sort(key=lambda one: -one.depth)  # far ones first
+    items.sort(key=lambda one: -one.depth)  # draw far things first
     parts = [text((BORDER, 28), title, "title")] if title else []
     parts += [one.drawn for one in items]
     for one, tips in zip(scene.axes, ends, strict=True):
@@ -152,14 +155,14 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
             items.append(_Drawn(0.0, "", axis, tip))
-        items.append(_Drawn(0.0, "", one.name, start + BELOW))
+        items.append(_Drawn(0.0, "", one.name, start + LABEL_OFFSET_PX))
     parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
 
 
 def _frustum(camera: DrawnCamera, long: float) -> Array:
-    """Return a camera's centre and the corners of what it sees at a distance (5, 3)."""
+    """Return a camera's centre, and the corners of its field of view at a distance, (5, 3)."""
     wide, high = 0.5, 0.375
     if camera.model is not None:
         wide, high = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
@@ -171,17 +174,17 @@ def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
     sides = [line(centre, one, "camera") for one in rim]
     drawn = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
-    return _Drawn(sight.depth(shape), drawn, camera.name, centre + BELOW)
+    return _Drawn(sight.depth(shape), drawn, camera.name, centre + LABEL_OFFSET_PX)
 
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
-    """Yield labels, each where it is on none of the others; one without room is left out."""
+    """Yield labels that cover no other label; those without room are left out."""
     taken: list[tuple[float, float, float, float]] = []
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
-        wide, tall = LETTER[0] * len(label) + 6.0, LETTER[1]
-        for offset in OFFSETS:
+        wide, tall = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
+        for offset in LABEL_OFFSETS_PX:
             x, y = at + offset
             box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]

@@ -1,1 +1,1 @@
-"""Calibrations in files: written whole or not at all, and never misread."""
+"""Keep calibrations in files: written whole or not at all, and never misread."""

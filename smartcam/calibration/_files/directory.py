@@ -1,7 +1,7 @@
-"""The folder of calibrations: names that clients give, and the files they stand for.
+"""Map the names of calibrations, which clients choose, to files in one folder.
 
-A name never leads out of the folder. It is refused by its letters before anything is opened, and a
-symbolic link on the way is refused too: what stands in the folder is in it.
+A name never leads out of the folder. A name with other letters is refused before anything is
+opened, and so is a symbolic link inside the folder.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
 """Pattern of a name: no dot, no slash, nothing that a file system gives a meaning to."""
 
-MAX_NAME = 64
-"""Characters of a name."""
+MAX_NAME_LENGTH = 64
+"""A name has at most this many characters."""
 
 EXPORTS = "exports"
 """Name of the folder, inside of the given one, in which exported files stand."""
@@ -33,7 +33,7 @@ _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)
 
 
 class Folder:
-    """A folder of calibrations; made where it is not there.
+    """A folder of calibrations, which is created if it does not exist.
 
     Args:
         path: the folder. It is the user's own choice, so it may be a symbolic link.
@@ -43,7 +43,7 @@ class Folder:
 
     Raises:
         ConfigurationError: the path is no path.
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -51,7 +51,7 @@ class Folder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def names(self) -> list[str]:
-        """Return the names of the calibrations there, sorted."""
+        """Return the sorted names of the calibrations in the folder."""
         files = (one for one in self.path.glob("*.json") if one.is_file() and not one.is_symlink())
         return sorted(one.stem for one in files if _is_name(one.stem))
 
@@ -85,14 +85,14 @@ class Folder:
         return self._within(f"{_checked(name)}.checks.jsonl")
 
     def export(self, target: str) -> Path:
-        """Return the file that an export goes to; its folder is made.
+        """Return the file that an export is written to; create its folder.
 
         Args:
             target: name of the file, with the suffix ``.json`` or ``.yaml``.
 
         Raises:
             CalibrationError: ``BAD_NAME``.
-            OSError: the folder cannot be made.
+            OSError: the folder cannot be created.
         """
         target = target.removeprefix(f"{EXPORTS}/")
         stem, dot, suffix = target.rpartition(".")
@@ -135,18 +135,18 @@ class Folder:
 
 def _is_name(text: str) -> bool:
     return bool(
-        len(text) <= MAX_NAME and re.fullmatch(NAME, text) and not _RESERVED.fullmatch(text)
+        len(text) <= MAX_NAME_LENGTH and re.fullmatch(NAME, text) and not _RESERVED.fullmatch(text)
     )
 
 
 def _checked(name: str) -> str:
     if not _is_name(name):
-        raise _bad(name, f"1 to {MAX_NAME} letters, digits, '-' and '_'")
+        raise _bad(name, f"1 to {MAX_NAME_LENGTH} letters, digits, '-' and '_'")
     return name
 
 
 def _bad(name: str, expected: str) -> CalibrationError:
-    shown = repr(name) if len(name) <= MAX_NAME else f"{name[:MAX_NAME]!r}..."
+    shown = repr(name) if len(name) <= MAX_NAME_LENGTH else f"{name[:MAX_NAME_LENGTH]!r}..."
     return Code.BAD_NAME.refusal(
         f"the name {shown} cannot be used: expected {expected}", expected, name
     )

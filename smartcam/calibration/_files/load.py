@@ -1,4 +1,4 @@
-"""Files of calibrations that bring localizations to the robot, whichever kind they hold."""
+"""Load calibrations that bring localizations to the robot, whichever kind a file holds."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ KINDS: Final[Mapping[str, type[AnyCalibration]]] = {
 
 @takes(path=check_path)
 def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
-    """Load the calibration that a file holds: a plane's, or a sheet's.
+    """Load the calibration of a plane or a sheet from a file.
 
-    That it is not good goes to the log, as a warning.
+    If the calibration is not good, a warning is logged.
 
     Raises:
         CalibrationError: the file is damaged, newer, or holds something else.
-        OSError: the file is not there, or cannot be read.
+        OSError: the file does not exist, or cannot be read.
     """
     return of_document(read_document(path), str(path))
 
 
 def of_document(document: Document, name: str) -> AnyCalibration:
-    """Return the calibration that a document holds; ``name`` of the file is for messages.
+    """Return the calibration that a document holds; ``name``, of the file, is for messages.
 
-    Raises WRONG_KIND, or SHAPE: its data are no calibration.
+    Raises WRONG_KIND, or SHAPE if the data are no calibration.
     """
     if document.kind in KINDS:
         found = KINDS[document.kind].from_data(document.data)

@@ -1,7 +1,7 @@
-"""Calibrations that have files of their own, and the forms of their fields.
+"""Base of the calibrations that have files of their own, and the forms of their fields.
 
-The forms are those of ``smartcam/geometry/_stored.py``, which says how they are used. Here they
-are names of this module, since ``storage.rows`` reads better in a list of fields than ``rows``.
+The forms are those of ``smartcam/geometry/_stored.py``, which explains them. This module repeats
+their names, since ``storage.rows`` reads better in a list of fields than ``rows``.
 """
 
 from __future__ import annotations
@@ -119,11 +119,11 @@ class SavedCalibration(Stored):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote; that it is not good goes to the log, as a warning.
+        """Read what :meth:`save` wrote; log a warning if the calibration is not good.
 
         Raises:
             CalibrationError: the file is damaged, newer, or holds something else.
-            OSError: the file is not there, or cannot be read.
+            OSError: the file does not exist, or cannot be read.
         """
         found = cls.from_data(store.read(path, cls.kind))
         warn(found, str(path))

@@ -1,10 +1,10 @@
-"""Files of calibrations: written whole or not at all, and never misread.
+"""Write files of calibrations whole or not at all, and never misread one.
 
 A file is JSON: ``schema``, ``schema_version``, ``kind``, ``written_at``, ``units``, ``software``,
 ``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with as many
 digits as it takes to read the same bits again; NaN and infinity, which JSON lacks, are refused.
 
-How a file takes the place of another one, and how many earlier ones are kept, is in
+How a file replaces another one, and how many earlier ones are kept, is in
 :mod:`smartcam._whole_files`.
 """
 
@@ -36,13 +36,13 @@ SCHEMA_VERSION = (1, 0)
 """Major and minor; a file of a newer major is refused, one of a newer minor is read."""
 
 UNITS: Mapping[str, str] = {"length": "m", "angle": "rad", "time": "s"}
-"""Units of all that a file holds, unless a name in it says otherwise."""
+"""Units of everything in a file, unless the name of a field says otherwise."""
 
 BACKUPS = 3
-"""Earlier versions of a file that are kept."""
+"""Number of earlier versions of a file that are kept."""
 
-MAX_FILE = 1 << 24
-"""Bytes of a file at most: a calibration of 10,000 touches has a quarter of it."""
+MAX_FILE_BYTES = 1 << 24
+"""A file has at most this many bytes: a calibration of 10,000 touches needs a quarter of them."""
 
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 """Functions, by major version, that make a file's content that of the next major version."""
@@ -57,11 +57,11 @@ class Document:
     """The contents of a calibration's file.
 
     Attributes:
-        kind: what the data are: ``plane``, ...
+        kind: kind of the data: ``plane``, ...
         data: the data.
-        context: what was said about them: frames, tool, raw samples, ...
-        written_at: when, UTC, ISO 8601.
-        software: versions of what wrote it, by name.
+        context: what was said about the data: frames, tool, raw samples, ...
+        written_at: time of writing, UTC, ISO 8601.
+        software: versions of the programs that wrote it, by name.
         version: the file's schema version, major and minor.
     """
 
@@ -81,12 +81,12 @@ def write(
     context: Mapping[str, Any] | None = None,
     backups: int = BACKUPS,
 ) -> None:
-    """Write a file; what was there is kept as a backup.
+    """Write a file, and keep the previous one as a backup.
 
-    The folder of ``path`` must be there. ``data`` are JSON-able, SI units, finite numbers;
-    ``context`` is what else is to be kept with them: frames, tool, raw samples. Raises
-    ``NOT_STORABLE``: the data are no JSON or too large; ``NOT_WRITTEN`` or ``IN_USE``: what was
-    there is there.
+    The folder of ``path`` must exist. ``data`` must be possible as JSON, with finite numbers in SI
+    units; ``context`` is stored with them: frames, tool, raw samples. Raises ``NOT_STORABLE`` if
+    the data are not possible as JSON or too large; ``NOT_WRITTEN`` or ``IN_USE``, which leave the
+    previous file in place.
     """
     content = {
         "schema": SCHEMA,
@@ -106,17 +106,20 @@ def write(
         raise Code.NOT_STORABLE.refusal(
             f"{path}: cannot be stored: {exc}; expected finite numbers, texts, lists and mappings"
         ) from exc
-    if len(body) > MAX_FILE:
+    if len(body) > MAX_FILE_BYTES:
         raise Code.NOT_STORABLE.refusal(
-            f"{path}: {len(body)} bytes, expected {MAX_FILE} at most", MAX_FILE, len(body)
+            f"{path}: {len(body)} bytes, expected {MAX_FILE_BYTES} at most",
+            MAX_FILE_BYTES,
+            len(body),
         )
     replace_file(Path(path), body, backups=backups)
 
 
 def read(path: StrPath, kind: str) -> dict[str, Any]:
-    """Return the data of a file, which must be of a kind.
+    """Return the data of a file of the given kind.
 
-    Raises ``BROKEN_FILE``, ``NEWER_VERSION``, ``WRONG_KIND``; OSError: it cannot be read.
+    Raises ``BROKEN_FILE``, ``NEWER_VERSION``, ``WRONG_KIND``; and OSError if the file cannot be
+    read.
     """
     document = read_document(path)
     if document.kind != kind:
@@ -129,12 +132,12 @@ def read(path: StrPath, kind: str) -> dict[str, Any]:
 def read_document(path: StrPath) -> Document:
     """Return all that a file holds.
 
-    Raises ``BROKEN_FILE``, ``NEWER_VERSION``; OSError: it cannot be read.
+    Raises ``BROKEN_FILE``, ``NEWER_VERSION``; and OSError if the file cannot be read.
     """
     with Path(path).open("rb") as stream:
-        body = stream.read(MAX_FILE + 1)
-    if len(body) > MAX_FILE:
-        raise _broken(path, f"more than {MAX_FILE} bytes")
+        body = stream.read(MAX_FILE_BYTES + 1)
+    if len(body) > MAX_FILE_BYTES:
+        raise _broken(path, f"more than {MAX_FILE_BYTES} bytes")
     try:
         parsed: Any = json.loads(body)
     except (ValueError, RecursionError) as exc:
@@ -203,17 +206,17 @@ def _software() -> dict[str, str]:
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
     """Put a file in the place of another, whole or not at all; a symbolic link is replaced.
 
-    Raises ``NOT_WRITTEN``: it cannot be written, or ``IN_USE``: another process writes in the
-    folder and does not end; what was there is there.
+    Raises ``NOT_WRITTEN`` if the file cannot be written, or ``IN_USE`` if another process keeps
+    writing in the folder. Either leaves the previous file in place.
     """
     with _written(path):
         _whole_files.replace_file(path, body, backups=backups)
 
 
 def keep_backup(path: Path, count: int) -> None:
-    """Keep a file as ``NAME.1``, the one before as ``NAME.2``, up to ``count``; it stays there.
+    """Copy a file to ``NAME.1``, and move the one before to ``NAME.2``, up to ``count``.
 
-    Nothing is done where it is not there. Raises as :func:`replace_file`.
+    Does nothing if the file does not exist. Raises the errors of :func:`replace_file`.
     """
     with _written(path):
         _whole_files.keep_backup(path, count)
@@ -221,7 +224,7 @@ def keep_backup(path: Path, count: int) -> None:
 
 @contextlib.contextmanager
 def _written(path: Path) -> Iterator[None]:
-    """Turn a refusal of the disk into a calibration's error."""
+    """Turn an error of the file system into a CalibrationError."""
     try:
         yield
     except _whole_files.FolderInUseError as exc:

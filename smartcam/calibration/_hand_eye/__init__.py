@@ -1,1 +1,1 @@
-"""A camera on a robot's hand, or beside the robot and looking at it."""
+"""Calibrate a camera on a robot's hand, or one beside the robot that looks at it."""

@@ -1,4 +1,4 @@
-"""A camera on a robot's hand, or beside the robot and looking at it: where it is.
+"""Calibrate the pose of a camera on a robot's hand, or of one beside the robot.
 
 ::
 
@@ -7,8 +7,8 @@
     table = calibration.target_pose            # the sheet's plane, in the robot's frame
     calibration.to_plane([[640, 480]], plane=table, robot_pose=now)
 
-The robot takes the camera to ten poses or more, turned about different axes, from which it sees the
-sheet; beside the robot the camera stays, and the robot shows it the sheet.
+The robot moves the camera to ten poses or more, turned about different axes, from which it sees the
+sheet. A camera beside the robot is fixed, and the robot shows it the sheet.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
     MIN_POSES,
     check_motion,
+    of_one_place,
     scale_of,
     second_turns,
 )
@@ -78,46 +79,48 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Pose
 
-AT_ONCE = 100
-"""Poses of which one more is left out at a time, before the others are solved again."""
+POSES_PER_EXTRA_REMOVAL = 100
+"""One bad pose, and one more for each of this many poses, is left out before the others are solved
+again."""
 
-ADVISED_POSES = 8
-"""Poses below which the residuals tell little of the error."""
+MIN_ADVISED_POSES = 8
+"""With fewer poses than this, the residuals say little about the error."""
 
-ADVISED_TURN = math.radians(8.0)
-"""Rms turn of the poses about the second of their axes that is worth its name; that of some of
-eight poses differs by two degrees or three."""
+MIN_ADVISED_TURN_RADIANS = math.radians(8.0)
+"""Least RMS turn of the poses about the second of their axes without a remark; leaving out some of
+eight poses changes it by two or three degrees."""
 
 MAX_SCALE_ERROR = 0.2
-"""Part of its size that a target may be off where the user does not say."""
+"""A target's size may be off by this part unless the user gives another."""
 
-SCALE_OFF = 0.005
-"""Difference between the target's size and the nominal one that is worth a remark."""
+REMARKED_SCALE_ERROR = 0.005
+"""A target's size that differs from the nominal one by more than this part is remarked on."""
 
-SURE_SIGMAS = 5.0
-"""Standard deviations by which a target's size must differ where it is not adjusted."""
+REMARKED_SCALE_SIGMAS = 5.0
+"""A target's size is remarked on, if it is not adjusted, when it differs by this many standard
+deviations."""
 
 BAD_POSE_RATIO = 4.0
-"""A pose whose held-out error is more times the median is bad: of normal errors along two axes one
-in 60000 is."""
+"""A pose is bad if its held-out error is more than this many times the median: of normal errors
+along two axes, one in 60000 is."""
 
-EXACT_M = 1e-7
-"""Metres: what is less off, rounding alone may explain."""
+ROUNDING_ERROR_M = 1e-7
+"""Errors below this length, metres, may be rounding errors."""
 
 MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
 
 MIN_GOOD_POSES = 5
-"""Poses that must be left where others, which belong to other views, are left out."""
+"""At least this many poses must be left after leaving out those that belong to other views."""
 
 MIN_POSES_FOR_ERROR = 5
-"""Poses whose scatter tells an expected error."""
+"""The scatter of at least this many poses gives an expected error."""
 
-POOR = RobotSigmas(math.radians(0.25), 2e-3)
-"""A robot that is worse than most has these standard deviations, 0.25 degrees and 2 mm: a held-out
-error beyond what they give is worth a remark."""
+POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
+"""Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
+beyond what they cause is remarked on."""
 
-POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
+ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Standard deviations (rad, m) of target poses without a covariance: only their ratio counts."""
 
 
@@ -145,41 +148,43 @@ def calibrate_hand_eye(
     allowed_error: float | None = None,
     most_scale: float = MAX_SCALE_ERROR,
 ) -> HandEyeCalibration:
-    """Calibrate the pose of a camera on a robot, or beside it.
+    """Calibrate the pose of a camera on a robot, or beside it, from views of a target.
 
     Args:
         robot_poses: ``T_base_flange`` at each view: the flange's pose in the robot's base.
         views: views of one target, as many. A target that looks the same after half a turn is
             numbered from the same end in all of them, as the robot's motions tell.
-        setup: whether the camera is on the hand (``eye-in-hand``, the target stays), or stands
-            beside the robot (``eye-to-hand``, the target is on the hand).
-        camera: the camera's lens, which the expected errors take as exact; None: calibrated from
-            the same views, which should then tilt the target: the lens' error is in the expected
-            errors. The target's points are adjusted for this lens, as bent sheets bend it.
-        method: ``auto``: whichever of ``robot`` and ``reprojection`` predicts left-out poses
-            better; or one of these, or one of OpenCV's closed forms, see
+        setup: place of the camera: on the hand (``eye-in-hand``, with a fixed target), or fixed
+            beside the robot (``eye-to-hand``, with the target on the hand).
+        camera: the camera's lens, which the expected errors assume to be exact; None: it is
+            calibrated from the same views, which should then show the target tilted, and the
+            expected errors include those of the lens. The target's points are adjusted for such a
+            lens, since a bent sheet would distort it.
+        method: ``auto`` chooses the one of ``robot`` and ``reprojection`` that predicts left-out
+            poses better; or one of these two, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
-        adjust: what is adjusted besides the poses: the target's ``scale`` (printers change it),
-            the ``camera``, ``nothing``; ``auto``: what the held-out error asks for.
+        adjust: value that is adjusted besides the poses: the target's ``scale`` (printers change
+            it), the ``camera``, or ``nothing``; ``auto`` chooses by the held-out error.
         robot_sigmas: standard deviations of each axis of the robot's poses; None: estimated.
-        drop_bad: whether poses that are far off what the others say of them are left out (and
-            named), at most a third of them, and while 8 are left; else they are only named. Of
-            poses that are nowhere near, as those of other views, 5 must be left.
-        allowed_error: the largest error on the target of 95 of 100 points that is good enough,
-            metres; None: a hundredth of its distance. See :attr:`HandEyeCalibration.verdict`.
-        most_scale: part of its size by which the target may be off: the robot's motions tell how
-            large it is, and a target that is off by more is refused.
+        drop_bad: whether poses that are far from the others' prediction are left out and named, at
+            most a third of them, and only while 8 are left; else they are only named. After leaving
+            out poses that are much farther off, as those of other views, 5 must be left.
+        allowed_error: largest error, metres, that 95 of 100 points on the target may have; None: a
+            hundredth of the target's distance. See :attr:`HandEyeCalibration.verdict`.
+        most_scale: part by which the target's size may be off. The robot's motions show how large
+            the target is, and a larger difference is refused.
 
     The order of the poses does not matter.
 
     Raises:
         CalibrationError: ``TOO_FEW``, ``POSES_TOO_SIMILAR``, ``INSUFFICIENT_ROTATION``; ``SHAPE``:
-            not as many views as poses, or something else; ``WRONG_SIZE``; ``WRONG_FRAME``: poses of
-            several frames, or that fit only when inverted or transposed; ``MIRRORED``: the robot's
-            base is left-handed, or pictures are flipped; ``DIFFERENT_TARGETS``; ``SCALE_MISMATCH``:
-            a print of another size than said by more than ``most_scale``; ``POOR_FIT``: nothing
-            fits, as where poses and views are mixed up or lengths are in millimetres; and
-            what :func:`~smartcam.calibration.calibrate_intrinsics` says.
+            the numbers of views and poses differ, or these are something else; ``WRONG_SIZE``;
+            ``WRONG_FRAME``: poses are in several frames, or fit only when inverted or transposed;
+            ``MIRRORED``: the robot's base is left-handed, or pictures are flipped;
+            ``DIFFERENT_TARGETS``; ``SCALE_MISMATCH``: the size of the print is off by more than
+            ``most_scale``; ``POOR_FIT``: nothing fits, as when poses and views are mixed up or
+            lengths are in millimetres; and those of
+            :func:`~smartcam.calibration.calibrate_intrinsics`.
         MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
     """
     views = as_views(views, "hand-eye")
@@ -193,9 +198,9 @@ def calibrate_hand_eye(
     ordered = [views[i] for i in order]
     lens, spread, of_sheet = camera, None, list[Remark]()
     if lens is None:
-        # A sheet that is bent by a tenth of a millimetre, too little for the views to tell, makes
-        # cameras 1.7 mm off where 0.7 are expected; adjusted 0.6 and 0.6, and a flat one 0.6
-        # instead of 0.5 (measured in simulation).
+        # A sheet bent by a tenth of a millimetre, which views cannot show, makes cameras 1.7 mm off
+        # where 0.7 mm are expected. With adjusted points both are 0.6 mm; for a flat sheet the
+        # error is then 0.6 instead of 0.5 mm (measured in simulation).
         few = len(ordered[0].target.points) <= MAX_FREE_POINTS
         own = calibrate_intrinsics(ordered, sheet="free" if few else "exact")
         lens, spread = own.camera, own.covariance
@@ -258,15 +263,15 @@ def calibrate_hand_eye_from_poses(
 ) -> HandEyeCalibration:
     """Calibrate the pose of a camera on a robot, or beside it, from poses of the target.
 
-    For cameras that say where a target is instead of where its points are in the image. Errors are
-    those of the target's origin.
+    This is for cameras that return the pose of a target instead of its points in the image. Errors
+    are those of the target's origin.
 
     Args:
         robot_poses: ``T_base_flange``.
         target_poses: ``T_camera_target``, as many.
         setup: as for :func:`calibrate_hand_eye`.
-        method: as for :func:`calibrate_hand_eye`; ``reprojection`` weighs a milliradian as
-            a millimetre.
+        method: as for :func:`calibrate_hand_eye`; ``reprojection`` gives a milliradian the weight
+            of a millimetre.
         adjust: as for :func:`calibrate_hand_eye`.
         robot_sigmas: as for :func:`calibrate_hand_eye`.
         drop_bad: as for :func:`calibrate_hand_eye`.
@@ -274,7 +279,7 @@ def calibrate_hand_eye_from_poses(
         most_scale: as for :func:`calibrate_hand_eye`.
 
     Raises:
-        CalibrationError: as :func:`calibrate_hand_eye`.
+        CalibrationError: as for :func:`calibrate_hand_eye`.
     """
     target_poses = seen_poses(target_poses)
     check_positive(allowed_error, "allowed_error", "metres")
@@ -282,7 +287,7 @@ def calibrate_hand_eye_from_poses(
     transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
     seen = [target_poses[i] for i in order]
     poses = Rigid.stacked(one.rigid for one in seen)
-    scale = np.repeat(1.0 / np.array(POSE_SIGMAS), 3)
+    scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
     white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
         robot=robot,
@@ -305,9 +310,9 @@ def calibrate_hand_eye_from_poses(
 def _robot(
     robot_poses: Sequence[Transform | Pose], count: int, what: str, setup: str
 ) -> tuple[list[Transform], list[int], RobotPoses]:
-    """Return the robot's poses, an order that does not depend on how they come, and them so.
+    """Return the robot's poses, an order that depends only on their values, and the sorted poses.
 
-    Raises SHAPE, WRONG_FRAME, and what :func:`check_motion` says.
+    Raises SHAPE, WRONG_FRAME, and the errors of :func:`check_motion`.
     """
     in_hand = is_in_hand(setup, "hand-eye")
     robot_poses = as_list(robot_poses, object, "pose of the robot")
@@ -350,7 +355,7 @@ def _positive(sigmas: RobotSigmas | None) -> RobotSigmas | None:
 def _numbered_alike(
     views: Sequence[TargetView], robot: RobotPoses, located: Sequence[TargetPose]
 ) -> list[TargetView]:
-    """Return views of a target that looks the same after half a turn with one origin for all."""
+    """Return views with one origin, for a target that looks the same after half a turn."""
     target = views[0].target
     poses = Rigid.stacked(one.transform.rigid for one in located)
     arm = float(np.ptp(target.points, axis=0).max())
@@ -366,7 +371,7 @@ def _given(views: Sequence[TargetView]) -> Any:
 def _observations(
     views: Sequence[TargetView], located: Sequence[TargetPose], camera: CameraModel
 ) -> PixelObservations:
-    """Return the views' points with their noise, as large as the views themselves show it."""
+    """Return the views' points, with noise as large as the views themselves show."""
     off = np.concatenate([one.residuals for one in located])
     noise = np.concatenate([one.covariance for one in views])
     more = excess(off, noise, off.size - 6 * len(views))
@@ -389,8 +394,9 @@ def _allowed(free: Mapping[str, tuple[int, ...]], adjust: str) -> dict[str, tupl
 class _Asked(NamedTuple):
     """The options that the user gave."""
 
-    free: Mapping[str, tuple[int, ...]]  # what may be adjusted, and the numbers of its parameters
-    method: str  # which, or ``auto``
+    # values that may be adjusted, with the numbers of their parameters
+    free: Mapping[str, tuple[int, ...]]
+    method: str  # name of the method, or ``auto``
     drop_bad: bool  # whether bad poses are left out
 
 
@@ -401,19 +407,19 @@ def _without_bad(
     robot_poses: Sequence[Transform],
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
-    """Return the calibration by the poses that are not bad, with the errors of all of them."""
+    """Return the calibration from the poses that are not bad, with the errors of all poses."""
     used, remarks = _near(problem, asked, named)
     result = _solved(problem.taken(used), asked, robot_poses[0])
     while len(bad := _bad(result)) and asked.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
-        worst = worst[: 1 + len(used) // AT_ONCE]
+        worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
         fewer = np.delete(used, worst)
         most = MAX_BAD_POSE_SHARE * problem.count
-        if len(fewer) < ADVISED_POSES or problem.count - len(fewer) > most:
+        if len(fewer) < MIN_ADVISED_POSES or problem.count - len(fewer) > most:
             break
         try:
             check_motion(problem.robot.taken(fewer))
-        except CalibrationError:  # nothing is left without it
+        except CalibrationError:  # too few are left without it
             break
         for index in worst:
             number = int(used[index])
@@ -443,7 +449,7 @@ def _without_bad(
 def _near(
     problem: Problem, asked: _Asked, named: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
-    """Return the poses to begin with, and remarks on those, by number, that belong to other views.
+    """Return the poses to begin with, and remarks, by number, on those that belong to other views.
 
     Raises ``WRONG_FRAME`` or ``POOR_FIT``.
     """
@@ -458,7 +464,7 @@ def _near(
     used = np.setdiff1d(everything, gross) if drop else everything
     try:
         check_motion(problem.robot.taken(used))
-    except CalibrationError:  # nothing is left without them
+    except CalibrationError:  # too few are left without them
         drop, used = False, everything
     done = "was not used" if drop else "is used all the same"
     return used, {
@@ -472,12 +478,12 @@ def _near(
 
 
 def _bad(result: HandEyeCalibration) -> list[int]:
-    """Return the poses that the others do not predict."""
+    """Return the indices of poses that the others do not predict."""
     if result.held_out_error is None:
         return []
     errors = result.leave_one_out
     bad: list[int] = np.flatnonzero(
-        errors > BAD_POSE_RATIO * max(float(np.median(errors)), EXACT_M)
+        errors > BAD_POSE_RATIO * max(float(np.median(errors)), ROUNDING_ERROR_M)
     ).tolist()
     return bad
 
@@ -500,7 +506,7 @@ def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibrat
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
-    """Raise (``POOR_FIT``) where poses and views do not belong together."""
+    """Raise ``POOR_FIT`` if poses and views do not belong together."""
     errors = result.errors if result.held_out_error is None else result.leave_one_out
     off, most = float(np.median(errors)), most_error(problem)
     if off > most:
@@ -541,7 +547,7 @@ def _result(
 
 
 def _check_scale(scale: float, most: float) -> None:
-    """Raise (``SCALE_MISMATCH``) where the target is further from its size than is allowed."""
+    """Raise ``SCALE_MISMATCH`` if the target's size is off by more than is allowed."""
     if abs(scale - 1.0) > most:
         raise Code.SCALE_MISMATCH.refusal(
             f"hand-eye: expected the target as large as it was said, to {100 * most:g} %, got one "
@@ -555,16 +561,19 @@ def _check_scale(scale: float, most: float) -> None:
 def _covariance(chosen: Candidate) -> Array:
     """Return the covariance of steps of camera and target (12, 12), from the scatter between poses.
 
-    Where the lens was calibrated from the same views and not adjusted since, its own error is in
-    it. NaN where the poses are too few to tell.
+    If the lens was calibrated from the same views and not adjusted since, its own error is
+    included. NaN if there are too few poses.
     """
     solution, others = chosen.solution, chosen.others
     if others is None or chosen.problem.count < MIN_POSES_FOR_ERROR:
         return np.full((12, 12), np.nan)
     cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
+    places = of_one_place(chosen.problem.robot.poses)
     if chosen.method in LINEAR:  # solved without a part of the poses, not without each
         steps = steps[:MAX_FOLDS]
+    elif len(first := np.unique(places)) > 1:  # without all of a place: to first order, the sum
+        steps = np.array([steps[places == one].sum(axis=0) for one in first])
     scatter = jackknife(steps)
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
@@ -575,7 +584,7 @@ def _covariance(chosen: Candidate) -> Array:
 
 
 def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
-    """Say that the target has another size where that was not to be adjusted."""
+    """Return a remark if the target has another size, and that was not to be adjusted."""
     if asked.method not in LINEAR and any(0 in one for one in asked.free.values()):
         return
     numbers = np.arange(problem.count)
@@ -585,7 +594,7 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
     if found is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
-    if abs(found - 1.0) > max(SCALE_OFF, SURE_SIGMAS * sigma):
+    if abs(found - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {found:.4f} times that by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "
@@ -594,33 +603,35 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
 
 
 def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
-    if abs(result.target_scale - 1.0) > SCALE_OFF:
+    if abs(result.target_scale - 1.0) > REMARKED_SCALE_ERROR:
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {result.target_scale:.4f} times "
             "that by the robot's motions: measure the print; poses and errors are those of a "
             "target of that size"
         )
-    if problem.count < ADVISED_POSES:
+    places = len(np.unique(of_one_place(problem.robot.poses)))
+    if places < MIN_ADVISED_POSES:
+        alike = f" that are different, of {problem.count}" if places < problem.count else ""
         yield Code.TOO_FEW.remark(
-            f"expected {ADVISED_POSES} poses or more for an error that can be relied on, got "
-            f"{problem.count}"
+            f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
+            f"{places}{alike}"
         )
-    # a remark that one pose more or less brings or takes away helps nobody
+    # a remark that one pose more or less would change helps nobody
     turn = float(second_turns(problem.robot).max())
-    if turn < ADVISED_TURN:
+    if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(
-            f"expected the robot to turn by {math.degrees(ADVISED_TURN):g} deg rms about a second "
-            f"axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: tilt it more to "
-            "both sides"
+            f"expected the robot to turn by {math.degrees(MIN_ADVISED_TURN_RADIANS):g} deg rms "
+            f"about a second axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: "
+            "tilt it more to both sides"
         )
     if result.held_out_error is None:
         yield Code.NOT_HELD_OUT.remark("too few poses to leave one out: no held-out error")
-    elif result.held_out_error > (most := expected_error(problem, POOR)):
+    elif result.held_out_error > (most := expected_error(problem, POOR_ROBOT)):
         yield Code.POOR_FIT.remark(
             f"expected a held-out error of {1e3 * most:.3g} mm at most, as of a robot that is "
-            f"{1e3 * POOR.translation:g} mm and {math.degrees(POOR.rotation):g} deg off, got "
-            f"{1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the target or "
-            "the camera slip, is a pose one of another view?"
+            f"{1e3 * POOR_ROBOT.translation:g} mm and {math.degrees(POOR_ROBOT.rotation):g} deg "
+            f"off, got {1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the "
+            "target or the camera slip, is a pose one of another view?"
         )
 
 

@@ -14,40 +14,46 @@ from smartcam.geometry._inside import Rigid, log_rotation
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
     from smartcam.calibration._hand_eye.equations import RobotPoses
     from smartcam.geometry._inside import Array
 
 MIN_POSES = 3
-"""Two motions about axes that differ determine the camera."""
+"""Least number of poses: two motions about different axes determine the camera."""
 
-SAME_TURN = math.radians(0.5)
-"""Poses turned less against each other count as one."""
+SAME_TURN_RADIANS = math.radians(0.5)
+"""Poses that are turned by less than this against each other count as one."""
+
+SAME_PLACE_M = 0.001
+"""Metres: poses that are less apart and turned by less than that are of one place."""
 
 MAX_POSES_PAIRED = 40
-"""Poses of which each pair is taken: time grows with the square of their number."""
+"""With at most this many poses, each pair of them is used: the time grows with the square of their
+number."""
 
 MAX_POSES_COMPARED = 200
-"""Poses that are compared with each other; of more, some tell as well how they are turned."""
+"""At most this many poses are compared with each other; of more, a part shows their turns as
+well."""
 
 MIN_TURN_RADIANS = math.radians(2.0)
-"""Rms turn of the poses about the second of their axes; one axis alone determines nothing."""
+"""Least RMS turn of the poses about the second of their axes; turns about a single axis do not
+determine the camera."""
 
-# A motion of the robot between two poses, A, and what the camera sees of it, B, are the same
-# motion: A X = X B, so R_A R_X = R_X R_B and (R_A - I) t_X = R_X t_B - t_A. Each pair of poses
-# gives one, two about different axes determine X. Tsai, Park and Horaud find the rotation first,
-# and then the translation, which is linear; the other two find both at once:
-# - tsai: with P = 2 sin(angle / 2) axis, [P_A + P_B]x P' = P_B - P_A is linear, and P' gives R_X.
-#   Tsai and Lenz, A New Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye
-#   Calibration (1989).
-# - park: log R_A = R_X log R_B, so R_X = (M^T M)^(-1/2) M^T with M = sum log(R_B) log(R_A)^T.
-#   Park and Martin, Robot Sensor Calibration: Solving AX = XB on the Euclidean Group (1994).
-# - horaud: of quaternions q_A q_X = q_X q_B, an eigenvector of a 4 x 4 matrix. Horaud and Dornaika,
-#   Hand-Eye Calibration (1995).
-# - andreff: (I - R_A (x) R_B) vec(R_X) = 0 with Kronecker's product, and t_X in the same equations.
-#   Andreff, Horaud and Espiau, On-line Hand-Eye Calibration (1999).
-# - daniilidis: of dual quaternions a q = q b, both parts at once; q is of the last two right
-#   singular vectors of a 6 N x 8 matrix. Daniilidis, Hand-Eye Calibration Using Dual Quaternions
-#   (1999).
+# A motion of the robot between two poses, A, and the motion that the camera sees, B, are the same:
+# A X = X B, so R_A R_X = R_X R_B and (R_A - I) t_X = R_X t_B - t_A. Each pair of poses gives one
+# such equation; two of them about different axes determine X. Tsai, Park and Horaud find the
+# rotation first, and then the translation, which is linear; the other two find both at once: -
+# tsai: with P = 2 sin(angle / 2) axis, [P_A + P_B]x P' = P_B - P_A is linear, and P' gives R_X.
+# Tsai and Lenz, A New Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration
+# (1989). - park: log R_A = R_X log R_B, so R_X = (M^T M)^(-1/2) M^T with M = sum log(R_B)
+# log(R_A)^T. Park and Martin, Robot Sensor Calibration: Solving AX = XB on the Euclidean Group
+# (1994). - horaud: of quaternions q_A q_X = q_X q_B, an eigenvector of a 4 x 4 matrix. Horaud and
+# Dornaika, Hand-Eye Calibration (1995). - andreff: (I - R_A (x) R_B) vec(R_X) = 0 with Kronecker's
+# product, and t_X in the same equations. Andreff, Horaud and Espiau, On-line Hand-Eye Calibration
+# (1999). - daniilidis: of dual quaternions a q = q b, both parts at once; q is of the last two
+# right singular vectors of a 6 N x 8 matrix. Daniilidis, Hand-Eye Calibration Using Dual
+# Quaternions (1999).
 HAND_EYE = {
     "tsai": "CALIB_HAND_EYE_TSAI",
     "park": "CALIB_HAND_EYE_PARK",
@@ -70,10 +76,10 @@ ROBOT_WORLD = {
 
 
 def check_motion(robot: RobotPoses) -> None:
-    """Raise where the robot's poses do not determine where the camera is.
+    """Raise if the robot's poses do not determine the camera's pose.
 
-    ``TOO_FEW``: fewer than three poses; ``POSES_TOO_SIMILAR``: fewer than three whose orientations
-    differ; ``INSUFFICIENT_ROTATION``: turned about one axis only.
+    Raises ``TOO_FEW`` for fewer than three poses; ``POSES_TOO_SIMILAR`` if fewer than three differ
+    in orientation; ``INSUFFICIENT_ROTATION`` if they are turned about one axis only.
     """
     turns = _some_turns(robot)
     if len(turns) < MIN_POSES:
@@ -81,7 +87,7 @@ def check_motion(robot: RobotPoses) -> None:
             f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(turns)
         )
     against = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
-    apart = np.linalg.norm(against, axis=-1) > SAME_TURN
+    apart = np.linalg.norm(against, axis=-1) > SAME_TURN_RADIANS
     distinct: list[int] = []
     for index in range(len(turns)):
         if apart[index, distinct].all():
@@ -89,8 +95,8 @@ def check_motion(robot: RobotPoses) -> None:
     if len(distinct) < MIN_POSES:
         raise Code.POSES_TOO_SIMILAR.refusal(
             f"hand-eye: expected at least {MIN_POSES} orientations of the robot that are "
-            f"{math.degrees(SAME_TURN):g} deg apart or more, got {len(distinct)}: pure shifts do "
-            "not tell where the camera is",
+            f"{math.degrees(SAME_TURN_RADIANS):g} deg apart or more, got {len(distinct)}: pure "
+            "shifts do not tell where the camera is",
             MIN_POSES,
             len(distinct),
         )
@@ -105,8 +111,24 @@ def check_motion(robot: RobotPoses) -> None:
         )
 
 
+def of_one_place(poses: Rigid) -> NDArray[np.intp]:
+    """Return for each pose (V,) the number of the first one that is about the same.
+
+    Errors of a robot are the same at each visit of a place, so its views tell no more than one.
+    """
+    numbers = np.arange(poses.size)
+    for index in numbers[1:]:
+        turned = log_rotation(poses.rotation[:index].swapaxes(1, 2) @ poses.rotation[index])
+        moved = poses.translation[:index] - poses.translation[index]
+        near = np.linalg.norm(turned, axis=1) < SAME_TURN_RADIANS
+        near &= np.linalg.norm(moved, axis=1) < SAME_PLACE_M
+        if near.any():
+            numbers[index] = numbers[int(np.argmax(near))]
+    return numbers
+
+
 def _some_turns(robot: RobotPoses) -> Array:
-    """Return the rotations of the poses; of many, some of them."""
+    """Return the rotations of the poses, or of a part of them if there are many."""
     turns, count = robot.poses.rotation, robot.poses.size
     if count <= MAX_POSES_COMPARED:
         return turns
@@ -121,7 +143,7 @@ def second_turn(robot: RobotPoses) -> float:
 
 
 def second_turns(robot: RobotPoses) -> Array:
-    """Return the second turn (V,) without each pose in turn; of all where they are too few."""
+    """Return the second turn without each pose (V,), or that of all poses if they are few."""
     products = _turns(robot)
     whole, count = products.sum(axis=(0, 1)), len(products)
     if count <= MIN_POSES:
@@ -130,7 +152,7 @@ def second_turns(robot: RobotPoses) -> Array:
 
 
 def _turns(robot: RobotPoses) -> Array:
-    """Return the products b b^T of the turns b from each pose to each, (V, V, 3, 3)."""
+    """Return the products b b^T of the turns b from each pose to each other, (V, V, 3, 3)."""
     turns = _some_turns(robot)
     between = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
     products: Array = between[..., None] * between[..., None, :]
@@ -138,8 +160,8 @@ def _turns(robot: RobotPoses) -> Array:
 
 
 def _second(products: Array, count: int) -> Array:
-    # Rotation vectors of one axis are multiples of each other: of the sum of their products the
-    # second eigenvalue is 0. Over their number it is a mean square.
+    # Rotation vectors of one axis are multiples of each other, so the second eigenvalue of the sum
+    # of their products is 0. Divided by their number it is a mean square.
     found: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
     return found / math.sqrt(count * (count - 1))
 
@@ -147,10 +169,10 @@ def _second(products: Array, count: int) -> Array:
 def solve_linear(
     name: str, robot: RobotPoses, seen: Rigid, *, exactly: bool = False
 ) -> tuple[Rigid, Rigid] | None:
-    """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None where it fails.
+    """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None if it fails.
 
-    ``seen``: ``T_camera_target`` of each view. ``exactly``: by all of them, however many: else a
-    method that takes them in pairs gets some of many, which is enough to begin with.
+    ``seen``: ``T_camera_target`` of each view. ``exactly``: use all views, however many; otherwise
+    a method that works with pairs gets a part of them, which is enough for a start.
     """
     if name in HAND_EYE and not exactly and seen.size > MAX_POSES_PAIRED:
         some = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
@@ -191,25 +213,25 @@ LINEAR: dict[str, Callable[[str, RobotPoses, Rigid], tuple[Rigid, Rigid]]] = {
     **dict.fromkeys(HAND_EYE, _hand_eye),
     **dict.fromkeys(ROBOT_WORLD, _robot_world),
 }
-"""OpenCV's methods by their authors."""
+"""Functions for OpenCV's methods, by their authors."""
 
 
 def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
-    """Return the mean of where each view alone puts the target, ``Z``."""
+    """Return the mean ``Z`` of the target's poses by each view alone."""
     # S = X^-1 A Z, so each view alone says Z = A^-1 X S.
     each = robot.between.inverse() @ (camera @ seen)
     # The rotation nearest to the mean matrix, in the sum of squared elements: U diag(1, 1, +-1) V^T
     # of U S V^T. SciPy's Rotation.mean is the same, but refuses reflections, which a closed form
-    # may give; they are sorted out later.
-    # Source: Hartley, Trumpf, Dai and Li, Rotation Averaging (2013), on the chordal L2 mean.
+    # may give; these are sorted out later. Source: Hartley, Trumpf, Dai and Li, Rotation Averaging
+    # (2013), on the chordal L2 mean.
     left, _, right = np.linalg.svd(each.rotation.mean(axis=0))
     proper = np.diag([1.0, 1.0, float(np.linalg.det(left @ right))])
     return Rigid(left @ proper @ right, each.translation.mean(axis=0))
 
 
 def scale_of(robot: RobotPoses, seen: Rigid) -> float | None:
-    """Return the target's size over the one that was given, as the robot's motions tell it."""
-    found = solve_linear("park", robot, seen)  # its rotation asks for no lengths
+    """Return the target's size over the nominal one, as the robot's motions show it."""
+    found = solve_linear("park", robot, seen)  # the camera's rotation does not depend on lengths
     if found is None:
         return None
     # S = X^-1 A Z with all of the camera's lengths times s: R_A t_Z - t_X - s R_X t_S = -t_A.

@@ -1,13 +1,13 @@
-"""The equations of a camera and a robot: ``T_camera_target = X^-1 A Z``, and how they are solved.
+"""Set up and solve the equations of a camera and a robot: ``T_camera_target = X^-1 A Z``.
 
-``X`` is where the camera is on what carries it, ``Z`` where the target is on what carries that, and
-``A`` is the robot between the two: ``T_flange_base`` for a camera on the hand, ``T_base_flange``
-for one that looks at the hand. A view's pose changes by a turn w and a shift d in the camera's
-frame, R becomes ``exp([w]x) R`` and t ``t + d``; all derivatives pass through them, so points in an
-image and poses that come without one are adjusted by the same steps.
+``X`` is the pose of the camera on its carrier, ``Z`` that of the target on its carrier, and ``A``
+is the motion of the robot between the two: ``T_flange_base`` for a camera on the hand,
+``T_base_flange`` for one that looks at the hand. A view's pose changes by a turn w and a shift d in
+the camera's frame, R becomes ``exp([w]x) R`` and t ``t + d``; all derivatives are expressed by
+these, so points in an image and poses without an image are adjusted by the same steps.
 
-A robot that knows its poses with some noise gets a correction for each of them; they are eliminated
-from the normal equations, see :mod:`smartcam.calibration._least_squares`.
+If the robot's poses have noise, each gets a correction; the corrections are eliminated from the
+normal equations, see :mod:`smartcam.calibration._least_squares`.
 """
 
 from __future__ import annotations
@@ -40,32 +40,34 @@ Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 def is_in_hand(setup: object, what: str) -> bool:
     """Return True if the camera is on the hand, False if it looks at the robot.
 
-    ``what`` names the calibration. Raises SHAPE: there is no such setup.
+    ``what`` names the calibration. Raises SHAPE if there is no such setup.
     """
     check_choice(setup, get_args(Setup), f"{what}: setup")
     return setup == "eye-in-hand"
 
 
 MIN_GAIN = 1e-11
-"""The last step gains less than this part of the cost, where the result is given out."""
+"""A fit for a result ends when a step gains less than this part of the cost."""
 
 ROUGH_GAIN = 1e-7
-"""The last step gains less than this part of the cost where results are only compared: they are a
+"""A fit that is only compared ends when a step gains less than this part of the cost: it is then a
 hundredth of a standard deviation off."""
 
 FIRST_DAMPING = 1e-6
-"""Part of the diagonal: closed forms are near enough for steps that hardly need any."""
+"""Part of the diagonal that is added at first: closed forms are so near that hardly any damping is
+needed."""
 
-ROUNDING = 100.0
-"""Squared standard deviations of a residual: beside the cost, what a gain is compared with."""
+ROUNDING_COST = 100.0
+"""Squared standard deviations that are added to the cost with which a gain is compared, for
+rounding errors."""
 
 
 class RobotSigmas(NamedTuple):
-    """The accuracy with which a robot knows its pose: standard deviations of each axis.
+    """Accuracy of a robot's poses, as standard deviations of each axis.
 
     Attributes:
-        rotation: radians.
-        translation: metres.
+        rotation: standard deviation of the turn about each axis, radians.
+        translation: standard deviation of the shift along each axis, metres.
     """
 
     rotation: float
@@ -73,24 +75,24 @@ class RobotSigmas(NamedTuple):
 
 
 class RobotNoise(NamedTuple):
-    """Noise of robot and camera."""
+    """Noise of the robot's poses and of the camera's views."""
 
-    robot: RobotSigmas  # standard deviations of its poses
-    # factor by which the views' poses are off more than their points tell: what the points of a
-    # view have in common, such as errors of the lens, does not average out
+    robot: RobotSigmas  # standard deviations of the robot's poses
+    # factor by which the views' poses are further off than the noise of their points causes: errors
+    # that all points of a view share, such as those of the lens, do not average out
     shared: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class RobotPoses:
-    """The robot's poses, and how they stand between camera and target."""
+    """The robot's poses, with their role between camera and target."""
 
     poses: Rigid  # V times ``T_base_flange``
     in_hand: bool  # whether the camera is on the hand
 
     @property
     def between(self) -> Rigid:
-        """``A`` of each view: from what carries the target to what carries the camera."""
+        """``A`` of each view: from the target's carrier to the camera's."""
         return self.poses.inverse() if self.in_hand else self.poses
 
     def taken(self, index: Index) -> RobotPoses:
@@ -106,8 +108,8 @@ def carried(camera: Rigid, robot: RobotPoses, target: Rigid) -> Rigid:
 def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Array]:
     """Return the derivatives of the views' poses, (V, 6, 12) and (V, 6, 6).
 
-    The first with steps of camera and target, as :meth:`Rigid.turned_before` takes them, the second
-    with a step of the robot's pose.
+    The first are by steps of camera and target, as in :meth:`Rigid.turned_before`, the second by a
+    step of the robot's pose.
     """
     # S = X^-1 A Z has R_S = R_X^T R_A R_Z and t_S = R_X^T (R_A t_Z + t_A - t_X). Each step (a, b)
     # turns by R exp([a]x) and shifts by b; what it does to S is written exp([w]x) R_S, t_S + d.
@@ -146,7 +148,7 @@ def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Arra
 class Observations(ABC):
     """The camera's observations, view by view."""
 
-    whitening: Array  # what makes its errors independent with a variance of 1
+    whitening: Array  # matrices that make the errors independent, with a variance of 1
     # numbers of the parameters that are adjusted beside the poses, ascending: 0 is the target's
     # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the distortion
     free: tuple[int, ...] = field(default=(), kw_only=True)
@@ -157,11 +159,11 @@ class Observations(ABC):
         return len(self.free)
 
     def spread(self, factor: float) -> Self:
-        """Return the observations with all standard deviations larger by a factor."""
+        """Return the observations with all standard deviations multiplied by a factor."""
         return dataclasses.replace(self, whitening=self.whitening / factor)
 
     def scale(self, change: Array) -> float:
-        """Return the target's size over the nominal one, of a change (extra,)."""
+        """Return the target's size over the nominal one after a change (extra,)."""
         return 1.0 + float(change[0]) if 0 in self.free else 1.0
 
     @abstractmethod
@@ -170,23 +172,23 @@ class Observations(ABC):
 
     @abstractmethod
     def settled(self, change: Array) -> Self:
-        """Return the observations with a change (extra,) of the other parameters, then known."""
+        """Return the observations with a change (extra,) of the other parameters made and fixed."""
 
     @abstractmethod
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, M) and their derivatives (V, M, 6 + extra).
 
-        ``seen``: ``T_camera_target`` of each view. ``change`` (extra,): of the parameters beside
-        the poses.
+        ``seen``: ``T_camera_target`` of each view. ``change`` (extra,): change of the parameters
+        beside the poses.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class PixelObservations(Observations):
-    """Points in images; views with fewer than others are filled up with points of no weight.
+    """Points in images; views with fewer points than others are padded with points of no weight.
 
     Attributes:
-        whitening: (V, N, 2, 2), of each point.
+        whitening: (V, N, 2, 2), for the residual of each point.
         model: the camera.
         points: (V, N, 3), on the target, metres.
         pixels: (V, N, 2).
@@ -206,7 +208,7 @@ class PixelObservations(Observations):
         )
 
     def settled(self, change: Array) -> PixelObservations:
-        """Return the observations with a change (extra,) of the other parameters, then known."""
+        """Return the observations with a change (extra,) of the other parameters made and fixed."""
         points = self.scale(change) * self.points
         return dataclasses.replace(self, model=self.camera(change), points=points, free=())
 
@@ -219,7 +221,8 @@ class PixelObservations(Observations):
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra).
 
-        They are NaN for a change to no target or no lens: of a size or focal length below 0.
+        They are NaN for a change to an impossible target or lens, with a size or focal length below
+        0.
         """
         views, count = self.pixels.shape[:2]
         full = self._full(change)
@@ -247,12 +250,12 @@ class PixelObservations(Observations):
 
 @dataclass(frozen=True, slots=True)
 class PoseObservations(Observations):
-    """Poses of the target that come without an image.
+    """Poses of the target without an image.
 
-    Where the target's scale is adjusted, all distances from the camera are in its proportion.
+    If the target's scale is adjusted, all distances from the camera are proportional to it.
 
     Attributes:
-        whitening: (V, 6, 6), of errors ``(w, d)``.
+        whitening: (V, 6, 6), for errors ``(w, d)``.
         poses: V times ``T_camera_target``.
     """
 
@@ -265,7 +268,7 @@ class PoseObservations(Observations):
         )
 
     def settled(self, change: Array) -> PoseObservations:
-        """Return the observations with a change (extra,) of the other parameters, then known."""
+        """Return the observations with a change (extra,) of the other parameters made and fixed."""
         return dataclasses.replace(self, poses=self.poses.scaled(self.scale(change)), free=())
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
@@ -284,21 +287,21 @@ class PoseObservations(Observations):
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The poses of camera and target, with all else that was adjusted."""
+    """The poses of camera and target, with everything else that was adjusted."""
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
-    # (extra,), of the parameters beside the poses
+    # (extra,), change of the parameters beside the poses
     change: Array = field(default_factory=lambda: np.zeros(0))
-    # (V, 6), of the robot's poses; empty where it was not adjusted
+    # (V, 6), corrections of the robot's poses; empty if they were not adjusted
     corrections: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    # weighted sum of squares, of residuals and corrections; infinite before an adjustment, and
-    # where points lie behind the camera
+    # weighted sum of squares of residuals and corrections; infinite before an adjustment, and if
+    # points lie behind the camera
     cost: float = math.inf
-    # (12 + extra, 12 + extra), of ``X``, ``Z`` and the others; what the robot's corrections leave
-    # of it. None of closed forms.
+    # (12 + extra, 12 + extra), information of ``X``, ``Z`` and the other parameters after
+    # eliminating the robot's corrections; None for closed forms
     information: Array | None = None
-    # with which it was found; None where the robot's poses were taken as they are
+    # noise of the adjustment; None if the robot's poses were taken as exact
     noise: RobotNoise | None = None
 
 
@@ -307,21 +310,23 @@ def sums(
 ) -> tuple[Array, float]:
     """Return the products of an adjustment's derivatives and residuals, view by view.
 
-    (V, 6 + P + 1, 6 + P + 1): by the correction of the robot's pose, by ``X``, ``Z`` and the
-    parameters beside them (P), and the residuals as they were without the corrections; and the
-    squares of the residuals with them. The derivatives are taken at ``at``. ``poses_only`` leaves
-    out how well the points of a view fit each other, whatever its pose.
+    The first result (V, 6 + P + 1, 6 + P + 1) has the derivatives by the correction of the robot's
+    pose (6), by ``X``, ``Z`` and the other parameters (P), and the residuals without the
+    corrections (1). The second are the squares of the residuals with the corrections. The
+    derivatives are taken at ``at``. ``poses_only`` leaves out the part of the residuals that no
+    pose of the view can change.
     """
     moved = dataclasses.replace(robot, poses=robot.poses.turned_before(at.corrections))
     off, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
     outer, inner = _chain(at.camera, moved, at.target)
     # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
-    # it the equations are linearised at v; the residuals of v = 0 are, to first order, r - J v.
+    # it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J v.
     inner[:, :, :3] = inner[:, :, :3] @ right_jacobian(at.corrections[:, :3])
     own = slopes[:, :, :6] @ inner
     before = off[..., None] - own @ at.corrections[..., None]
     rows = np.concatenate([own, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
-    # Of residuals r = J w + e only the part in the columns of J tells of the pose: Q^T r, J = Q R.
+    # Of residuals r = J w + e only the part in the columns of J depends on the pose: Q^T r, J = Q
+    # R.
     if poses_only:
         rows = np.swapaxes(np.linalg.qr(slopes[:, :, :6])[0], 1, 2) @ rows
     return np.swapaxes(rows, 1, 2) @ rows, float((off**2).sum())
@@ -330,7 +335,8 @@ def sums(
 def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float, Array, Array]:
     """Return the cost, and each view's part of the equations of a step.
 
-    (V, 6 + P, 6 + P) and (V, 6 + P): of the correction of the robot's pose, then as :func:`sums`.
+    These are (V, 6 + P, 6 + P) and (V, 6 + P), for the correction of the robot's pose, then as in
+    :func:`sums`.
     """
     with np.errstate(all="ignore"):
         total, squares = sums(robot, seen, at)
@@ -339,8 +345,8 @@ def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float
     right = -total[:, :-1, -1] - (total[:, :-1, :6] @ at.corrections[..., None])[..., 0]
     if at.noise is None:
         return cost, matrix, right
-    # A correction is a residual, too, measured as 0 with the robot's variance: the mean and the
-    # covariance of what its controller says.
+    # A correction is a residual, too, measured as 0 with the robot's variance, since its controller
+    # states the mean.
     weights = 1.0 / np.repeat(at.noise.robot, 3) ** 2
     matrix[:, range(6), range(6)] += weights
     right[:, :6] -= weights * at.corrections
@@ -348,7 +354,7 @@ def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float
 
 
 def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
-    """Return the equations of a step: shared are ``X``, ``Z`` and what is beside them."""
+    """Return the equations of a step; ``X``, ``Z`` and the other parameters are shared."""
     cost, matrix, right = _by_view(robot, seen, at)
     own, rest = slice(0, 6 if at.noise else 0), slice(6, None)
     return Normal(
@@ -369,11 +375,11 @@ def adjust(
     *,
     gain: float = MIN_GAIN,
 ) -> Solution:
-    """Minimise the weighted squares by Levenberg and Marquardt's steps.
+    """Minimize the weighted squares by Levenberg and Marquardt's steps.
 
-    Its ``cost`` is infinite where the target begins behind the camera. ``noise``: None: the robot's
-    poses are exact. ``gain``: part of the cost that a step must gain, and beside it 100 times as
-    much of a residual's variance: exact samples leave nothing but rounding to gain.
+    The ``cost`` of the result is infinite if the target begins behind the camera. If ``noise`` is
+    None, the robot's poses are exact. The fit ends when a step gains less than the part ``gain`` of
+    the cost plus ROUNDING_COST, since exact samples leave only rounding errors to gain.
     """
     spread = seen if noise is None else seen.spread(noise.shared)
     change = start.change if start.change.size else np.zeros(seen.extra)
@@ -383,7 +389,7 @@ def adjust(
         lambda at: _normal(robot, spread, at),
         _stepped,
         gain=gain,
-        noise=ROUNDING,
+        noise=ROUNDING_COST,
         damping=FIRST_DAMPING,
     )
     if not math.isfinite(normal.cost):
@@ -402,11 +408,11 @@ def _stepped(at: Solution, step: Array, corrections: Array) -> Solution:
 
 
 def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solution:
-    """Return the solutions without each view in turn, stacked (V, ...); ``whole`` is of all views.
+    """Return the solutions without each view, stacked (V, ...); ``whole`` is that of all views.
 
-    The noise is that which all of them told.
+    The noise is the one estimated from all views.
     """
-    # One step of Gauss and Newton from the whole, with the view's own part taken out of the sums:
+    # One Gauss-Newton step from the whole solution, with the view's own part taken out of the sums:
     # its normal equations are a sum over views, and only steps of second order are lost.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 5.2.
     spread = seen if whole.noise is None else seen.spread(whole.noise.shared)
@@ -426,8 +432,9 @@ def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solu
 
 
 def pull_of_lens(robot: RobotPoses, seen: PixelObservations, at: Solution) -> Array:
-    """Return the derivatives of the steps of ``X`` and ``Z`` by the lens' values, (12, 4 + K)."""
-    # Of least squares the gradient g(x, l) is 0 at any lens l: dx/dl = -(dg/dx)^-1 dg/dl.
+    """Return the derivatives of ``X`` and ``Z`` by the lens' values, (12, 4 + K)."""
+    # The gradient g(x, l) of a least-squares solution is 0 for any lens l: dx/dl = -(dg/dx)^-1
+    # dg/dl.
     lens = tuple(range(1, 5 + len(seen.model.distortion)))
     freed = dataclasses.replace(seen, free=(*seen.free, *lens))
     change, none = np.zeros(freed.extra), np.zeros((robot.poses.size, 6))
@@ -441,7 +448,7 @@ def pull_of_lens(robot: RobotPoses, seen: PixelObservations, at: Solution) -> Ar
 
 
 def information(robot: RobotPoses, seen: Observations, truth: Solution) -> Array:
-    """Return Fisher's information of ``X`` and ``Z`` at a truth, (12 + extra, 12 + extra).
+    """Return Fisher's information of ``X`` and ``Z`` at the true values, (12 + extra, 12 + extra).
 
     ``robot`` and ``seen`` are without noise; ``truth`` has the noise of the robot.
     """

@@ -1,15 +1,15 @@
-"""Choose the way of solving a camera and a robot that predicts unseen poses best.
+"""Choose the hand-eye method that predicts unseen poses best.
 
-There are two ways. ``robot`` corrects each pose of the robot as far as noise allows. It is best
+There are two methods. ``robot`` corrects each pose of the robot as far as noise allows. It is best
 where the robot's only error is noise. ``reprojection`` takes the robot's poses as they are and
 minimizes the error on the target. It is best where a robot has other errors (joints with offsets,
 gears with play, a sheet of another size), which corrections of single poses do not describe.
 
-The poses decide between the two: each way is solved again without one pose, and predicts from the
-robot's given pose where the camera would see the target. The distance to where it was seen is the
-held-out error: on the target, in metres, as in picking. ``reprojection`` is taken where its errors
-are smaller by more than chance. Blends of the two predict no better: 0.2 % worse over 26
-kinds of simulated robots, up to 9 % worse on recorded ones (measured).
+The poses decide between the two: each method is solved again without one pose, and predicts from
+the robot's given pose where the camera would see the target. The distance from where the target was
+seen is the held-out error, in metres on the target, as it matters for picking. ``reprojection`` is
+taken where its errors are smaller by more than chance. Blends of the two predict no better: 0.2 %
+worse over 26 kinds of simulated robots, up to 9 % worse on recorded ones (measured).
 
 The camera's parameters and the target's scale are adjusted as well where two things hold: the
 held-out error is smaller with them, and noise alone would hardly ever change them by as much. An
@@ -52,48 +52,48 @@ if TYPE_CHECKING:
     Seen = PixelObservations | PoseObservations
 
 SIGNIFICANCE_LEVEL = 1e-4
-"""Probability with which noise alone may make more parameters differ from what was given: a scale
-that is not needed puts the camera up to eight times as far off."""
+"""Further parameters are adjusted only if noise alone would change them by as much with less than
+this probability: a scale that is not needed puts the camera up to eight times as far off."""
 
 MAX_SIZE_ERROR_RATIO = 0.05
-"""Error of a target's stated size, as a part of it, from which the fit still converges."""
+"""Largest error of a target's stated size, as a part of it, from which the fit still converges."""
 
 ROBOT, REPROJECTION = "robot", "reprojection"
 
 METHODS = (ROBOT, REPROJECTION, *LINEAR)
-"""Methods that may be asked for beside ``auto``; the last are OpenCV's closed forms."""
+"""Methods that may be chosen instead of ``auto``; the last are OpenCV's closed forms."""
 
 MAX_FOLDS = 20
-"""Groups of poses of which a closed form leaves out one after the other."""
+"""A closed form is solved again without each of at most this many groups of poses."""
 
 NOTHING = "nothing"
 """Word for a candidate in which only the poses are adjusted."""
 
 ADJUSTABLE = (NOTHING, "scale", "camera", "scale and camera")
-"""Values that may be adjusted besides the poses: the target's scale, the camera's parameters."""
+"""Choices of values to adjust besides the poses: the target's scale, the camera's parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Poses of a robot and what the camera saw at each."""
+    """Poses of a robot, with the camera's observations at each."""
 
     robot: RobotPoses  # V poses
     seen: Seen  # V views, or poses of the target without views
     poses: Rigid  # V times ``T_camera_target``, each from its own view
-    # (V, N), which of the points there are; None without views
+    # (V, N), True for points that exist; None without views
     given: NDArray[np.bool_] | None = None
-    sigmas: RobotSigmas | None = None  # of the robot, where they are known
-    # (4 + K, 4 + K), covariance of the lens where it came of the same views; else None: it is exact
+    sigmas: RobotSigmas | None = None  # noise of the robot's poses, if it is known
+    # (4 + K, 4 + K), covariance of a lens from the same views; None for an exact one
     lens: Array | None = None
 
     @property
     def count(self) -> int:
-        """V."""
+        """Number V of poses."""
         return self.poses.size
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """(V, N), of which points there are errors; without views of the target's origin."""
+        """True for points with an error, (V, N); without views, for the target's origin."""
         return np.ones((self.count, 1), dtype=bool) if self.given is None else self.given
 
     def taken(self, index: NDArray[np.intp]) -> Problem:
@@ -111,14 +111,14 @@ class Problem:
     def errors(self, solution: Solution) -> list[Array]:
         """Return a solution's errors on the target, for each view (N,), metres.
 
-        Of a view: where the rays of its points pass the target's plane, from where the points are.
-        Without views: where the target's origin is.
+        The error of a point in a view is the distance, in the target's plane, between its ray and
+        the point. Without views it is the distance of the target's origin.
         """
         off = np.linalg.norm(self.off(solution), axis=2)
         return [one[mask] for one, mask in zip(off, self.mask, strict=True)]
 
     def off(self, solution: Solution) -> Array:
-        """Return these errors as vectors, (V, N, 3), metres; 0 where there is no point.
+        """Return the errors as vectors, (V, N, 3), metres; 0 for points that do not exist.
 
         ``solution`` is one, or one for each view.
         """
@@ -145,10 +145,11 @@ class Problem:
 
 
 def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array) -> Array:
-    """Return the distances (N,), metres, of rays' crossings with a target's plane from its points.
+    """Return the distances (N,), metres, in a target's plane between rays and its points.
 
-    Infinite for a ray that does not meet the plane before the camera. ``seen``:
-    ``T_camera_target``. ``pixels`` (N, 2) are the rays', ``points`` (N, 3) on the target, metres.
+    They are infinite for a ray that does not meet the plane in front of the camera. ``seen``:
+    ``T_camera_target``. ``pixels`` (N, 2) define the rays, ``points`` (N, 3) are on the target,
+    metres.
     """
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     off: Array = np.linalg.norm(on_plane(rays, *seen) - points, axis=1)
@@ -156,10 +157,11 @@ def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array)
 
 
 def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
-    """Return the crossings of rays (..., N, 3) from the origin with a plane, in its own frame.
+    """Return the points at which rays (..., N, 3) from the origin meet a plane, in its frame.
 
-    (..., N, 3); infinite where a ray does not meet it. ``turn`` (..., 3, 3) is of the plane's
-    frame, its third column the normal, ``shift`` (..., 3) its origin.
+    The result is (..., N, 3), infinite if a ray does not meet the plane. ``turn`` (..., 3, 3) is
+    the rotation of the plane's frame, whose third column is the normal, ``shift`` (..., 3) its
+    origin.
     """
     # s r is in the plane where n (s r - o) = 0: s = n o / n r; then R^T (s r - o) is in its frame.
     normal = turn[..., 2]
@@ -173,25 +175,25 @@ def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
 
 @dataclass(slots=True)
 class Candidate:
-    """One way of solving, and how well it predicts."""
+    """One method with its solution, and how well it predicts."""
 
     method: str
-    besides: str  # one of :data:`ADJUSTABLE`
-    problem: Problem  # with what is adjusted besides set free
-    solution: Solution  # from all poses
-    # from the others, without each pose in turn, stacked (V, ...); None of too few poses
+    besides: str  # values that are adjusted, one of :data:`ADJUSTABLE`
+    problem: Problem  # problem with these values free
+    solution: Solution  # solution from all poses
+    # solutions without each pose, stacked (V, ...); None with too few poses
     others: Solution | None = None
     # (V, N, 3), held-out errors on the target, metres
     off: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @property
     def name(self) -> str:
-        """Method, and what is adjusted besides."""
+        """Method, and the values that are adjusted besides the poses."""
         return self.method if self.besides == NOTHING else f"{self.method}, {self.besides}"
 
     @property
     def errors(self) -> Array:
-        """(V,), rms held-out error of each pose, metres; infinite where there is none."""
+        """RMS held-out error of each pose, (V,), metres; infinite if it has none."""
         if self.others is None:
             return np.full(self.problem.count, np.inf)
         squares = (self.off**2).sum(axis=(1, 2)) / self.problem.mask.sum(axis=1)
@@ -200,7 +202,7 @@ class Candidate:
 
     @property
     def held_out(self) -> float:
-        """Rms held-out error of all points, metres; infinite where a pose has none."""
+        """RMS held-out error of all points, metres; infinite if a pose has none."""
         points = self.problem.mask.sum(axis=1)
         return math.sqrt(float((points * self.errors**2).sum() / points.sum()))
 
@@ -213,16 +215,16 @@ class Candidate:
         if not len(change):
             return 1.0
         # Wald's test: without an error beside noise, x^T C^-1 x of the K parameters x is chi-square
-        # with K degrees of freedom; C^-1 is Schur's complement of what X and Z take of the
-        # information. Where noise was estimated from few equations it is F (over K).
-        # Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
+        # with K degrees of freedom; C^-1 is Schur's complement of the part of X and Z in the
+        # information. If noise was estimated from few equations, it follows an F distribution (over
+        # K). Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
         # Number of Observations is Large (1943).
         mixed = whole[:12, 12:]
         own = whole[12:, 12:] - mixed.T @ solve_scaled(whole[:12, :12], mixed)
         squares = float(change @ own @ change)
         if not math.isfinite(squares):
             return 1.0
-        # half of the equations each tell one of the robot's two sigmas
+        # half of the equations each determine one of the robot's two sigmas
         freedom = None if self.problem.sigmas else max(1, 3 * self.problem.count - 6)
         return Noise(1.0, freedom).chance(max(squares, 0.0), len(change))
 
@@ -230,7 +232,7 @@ class Candidate:
 def candidates(
     problem: Problem, free: Mapping[str, tuple[int, ...]], method: str = "auto"
 ) -> tuple[Candidate | None, list[Candidate]]:
-    """Return the candidate that is to be taken, None where nothing fits; and all, it among them.
+    """Return the best candidate, or None if nothing fits, and all candidates.
 
     ``free``: numbers of the parameters of each of :data:`ADJUSTABLE` that may be adjusted.
     ``method``: ``auto``, or one of :data:`METHODS`.
@@ -256,15 +258,15 @@ def candidates(
 
 
 def _reprojection(besides: str, problem: Problem, begin: Solution) -> Candidate | None:
-    """Return the candidate that takes the robot's poses as they are given."""
+    """Return the candidate that takes the robot's poses as exact."""
     start = dataclasses.replace(begin, noise=None)
     return _candidate(REPROJECTION, besides, problem, adjust(problem.robot, problem.seen, start))
 
 
 def _reprojection_beside(robot: Candidate) -> Candidate | None:
-    """Return the reprojection's candidate with the scale and the lens that another one found.
+    """Return the candidate ``reprojection`` with the scale and the lens from another candidate.
 
-    How large a target is tells its distance, which pixels hardly tell.
+    The size of a target determines its distance, which pixels alone hardly do.
     """
     change, freed = robot.solution.change, robot.problem
     known = dataclasses.replace(freed, seen=freed.seen.settled(change))
@@ -282,7 +284,7 @@ def _reprojection_beside(robot: Candidate) -> Candidate | None:
 def _robots(
     problem: Problem, free: Mapping[str, tuple[int, ...]], begin: Solution
 ) -> list[Candidate]:
-    """Return candidates that correct the robot's poses, one for each choice of what is free."""
+    """Return candidates that correct the robot's poses, one for each choice of free values."""
     found: list[Candidate] = []
     elsewhere = _begin_of_another_size(problem) if any(0 in one for one in free.values()) else None
     for besides, numbers in free.items():
@@ -311,11 +313,11 @@ def _asked(judges: Sequence[Candidate]) -> Candidate | None:
 
 
 def _likelier(robot: Candidate, plain: Candidate) -> Candidate:
-    """Return ``plain`` where it predicts poses better by more than chance, else ``robot``.
+    """Return ``plain`` if it predicts poses better by more than chance, else ``robot``.
 
     With robots that have no error but noise, ``plain`` looks better by chance, and it puts their
-    cameras up to five times as far off. Chance is one standard error: poses are independent of
-    each other as their points are not.
+    cameras up to five times as far off. Chance is taken as one standard error over poses, which are
+    independent of each other, unlike their points.
     """
     before, after = robot.errors, plain.errors
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
@@ -348,9 +350,9 @@ def _begin(problem: Problem) -> Solution | None:
 
 
 def _begin_of_another_size(problem: Problem) -> Solution | None:
-    """Return the closed form of a target of the size that the robot's motions tell.
+    """Return the closed form for a target of the size that the robot's motions show.
 
-    None where that is near to the size that was given, or not known.
+    None if that is near the nominal size, or not known.
     """
     scale = scale_of(problem.robot, problem.poses)
     if scale is None or scale <= 0.0 or abs(scale - 1.0) < MAX_SIZE_ERROR_RATIO:
@@ -363,7 +365,7 @@ def _begin_of_another_size(problem: Problem) -> Solution | None:
 
 
 def _candidate(method: str, besides: str, problem: Problem, solution: Solution) -> Candidate | None:
-    """Return a candidate with its held-out errors; None where it does not fit."""
+    """Return a candidate with its held-out errors; None if it does not fit."""
     if not math.isfinite(solution.cost):
         return None
     found = Candidate(method, besides, problem, solution)

@@ -1,4 +1,4 @@
-"""The result of a hand-eye calibration, and its use: from pixels to the robot's base."""
+"""Use the result of a hand-eye calibration: map pixels to the robot's base."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KIND = "hand-eye"
 
 
 def _frames(context: storage.Context, of: str) -> tuple[str, str]:
-    """Return target and source of the pose of the flange, the camera or the target."""
+    """Return the target frame and source frame for the pose of flange, camera or target."""
     base, flange = context.get("frames", ("", ""))
     on_flange = (of == CAMERA) == (context.get("setup") == "eye-in-hand")
     return (base, flange) if of == "flange" else (flange if on_flange else base, of)
@@ -58,41 +58,40 @@ class HandEyeCalibration(storage.SavedCalibration):
     Attributes:
         setup: ``eye-in-hand`` or ``eye-to-hand``.
         camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
-        target_pose: ``T_base_target``; ``T_flange_target`` there: that of the target as large as
-            ``target_scale`` says, see :attr:`target`.
-        camera: the camera; None where poses of the target were given instead of views.
-        target_scale: size of the target over the nominal one, as the robot's motions tell it; 1
-            where it was not adjusted. ``camera_pose``, ``target_pose`` and all errors are those of
-            the target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
-            percent off the nominal one. Where a ruler says that the target has its nominal size, it
-            is the robot's or the lens' lengths that are off by this factor.
-        method: what the candidate is called that was taken: ``robot`` or
-            ``reprojection``, or a closed form; after a comma, what was adjusted.
-        candidates: rms held-out error of each candidate on the target, metres; None where a
-            candidate has none.
-        errors: (V,), rms error of each pose on the target, metres, with all used poses taken in;
-            NaN for a bad pose in which the target would not be before the camera.
-        mean_error: mean over all points of the used poses, metres, which others publish as 3D
+        target_pose: ``T_base_target``; ``T_flange_target`` for a camera beside the robot. It is
+            that of a target with ``target_scale`` applied, see :attr:`target`.
+        camera: the camera; None if poses of the target were given instead of views.
+        target_scale: size of the target over the nominal one, as the robot's motions show it; 1 if
+            it was not adjusted. ``camera_pose``, ``target_pose`` and all errors are those of the
+            target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
+            percent off the nominal one. If a ruler shows that the target has its nominal size, the
+            lengths of the robot or of the lens are off by this factor.
+        method: name of the chosen candidate: ``robot`` or ``reprojection``, or a closed form; after
+            a comma, the adjusted values.
+        candidates: RMS held-out error of each candidate on the target, metres; None for a candidate
+            without one.
+        errors: (V,), RMS error of each pose on the target, metres, with the solution from all used
+            poses; NaN for a bad pose in which the target would be behind the camera.
+        mean_error: mean error over all points of the used poses, metres, which others publish as 3D
             error.
-        leave_one_out: (V,), the same of a calibration from the others, with the robot's pose as it
-            was given, metres; NaN where there is none.
-        held_out_error: rms of these over all points of the used poses, metres; None where there is
-            none. It is what picking has to expect.
+        leave_one_out: (V,), RMS error of each pose, metres, with a calibration from the other poses
+            and the robot's pose as given; NaN if there is none.
+        held_out_error: RMS of the left-out errors over all points of the used poses, metres; None
+            if there is none. It is the error to expect in picking.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
-            along those of its target, m) and of ``target_pose``, by how far the solutions without
-            each of the poses scatter. A lens that was given is taken as exact unless it was
-            adjusted; the error of one that came of the same views is in it. NaN of fewer than 5
-            poses.
+            along those of its target, m) and of ``target_pose``, from the scatter of the solutions
+            without each pose. A given lens is taken as exact unless it was adjusted; the error of a
+            lens calibrated from the same views is included. NaN with fewer than 5 poses.
         robot_sigmas: standard deviations of each axis of the robot's poses, as given or estimated;
-            None where the poses were taken for exact.
+            None if the poses were taken as exact.
         robot_poses: ``T_base_flange``, as given.
-        used: whether each pose was used; False for a bad one.
+        used: whether each pose was used; False for a bad pose.
         views: views as given, but all numbered from the same end of a target that looks the same
-            after half a turn; empty where poses were given.
+            after half a turn; empty if poses were given.
         target_poses: ``T_camera_target`` of each pose, from its own view or as given.
-        allowed_error: the largest error on the target of 95 of 100 points that the user allows,
-            metres; None: :attr:`verdict` takes a hundredth of the target's distance.
-        warnings: what one should know before using it.
+        allowed_error: largest error, metres, that the user allows for 95 of 100 points on the
+            target; None: :attr:`verdict` takes a hundredth of the target's distance.
+        warnings: remarks to read before using the calibration.
     """
 
     kind: ClassVar[str] = KIND
@@ -145,7 +144,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     @property
     def target(self) -> Target | None:
-        """The target as large as ``target_scale`` says; None where poses of it were given."""
+        """Target with ``target_scale`` applied; None if poses of it were given."""
         return resized(self.views[0].target, self.target_scale) if self.views else None
 
     @property
@@ -155,12 +154,12 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     @property
     def allowed(self) -> Allowed:
-        """The largest error that is allowed, as the user said or by the target's distance."""
+        """Largest allowed error, as the user gave it or from the target's distance."""
         distances = [float(np.linalg.norm(one.translation)) for one in self.target_poses]
         return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
 
     def judged(self) -> Judgement:
-        """Return the verdict and what is advisable; of few poses the error tells nothing."""
+        """Return the verdict and the advice; with few poses the error says nothing."""
         held_out, codes = self.held_out_error, {one.code for one in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
         several = "s" * (len(left_out) > 1)
@@ -186,7 +185,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     @property
     def worst(self) -> int:
-        """Index of the pose with the largest held-out error, or error where there is none."""
+        """Index of the pose with the largest held-out error, or error if it has none."""
         errors = self.errors if np.isnan(self.leave_one_out).any() else self.leave_one_out
         return int(np.argmax(errors))
 
@@ -194,10 +193,10 @@ class HandEyeCalibration(storage.SavedCalibration):
         """Return ``T_base_camera``.
 
         Args:
-            robot_pose: ``T_base_flange``; a camera beside the robot has no need of it.
+            robot_pose: ``T_base_flange``; not needed for a camera beside the robot.
 
         Raises:
-            CalibrationError: ``WRONG_FRAME``: no pose, or one of other frames.
+            CalibrationError: ``WRONG_FRAME``: there is no pose, or it is in other frames.
         """
         if self.setup == "eye-to-hand":
             return self.camera_pose
@@ -216,22 +215,22 @@ class HandEyeCalibration(storage.SavedCalibration):
         robot_pose: Transform | Pose | None = None,
         height: float = 0.0,
     ) -> Array:
-        """Map what a camera sees to a plane, wherever the robot is.
+        """Map pixels to a plane, at any pose of the robot.
 
         Args:
             pixels: (N, 2).
-            plane: ``T_base_plane``; the plane is its z = 0. Such is ``target_pose`` of a camera on
-                the hand.
-            robot_pose: ``T_base_flange`` when the image was taken; none for a camera beside the
-                robot.
+            plane: ``T_base_plane``; the plane is its z = 0. For a camera on the hand
+                ``target_pose`` is one.
+            robot_pose: ``T_base_flange`` when the image was taken; not needed for a camera beside
+                the robot.
             height: height of the features over the plane, along its z, metres.
 
         Returns:
             (N, 3), in the robot's base, metres.
 
         Raises:
-            CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray that does not
-                meet the plane before the camera; NO_CALIBRATION: without a camera's lens.
+            CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray does not meet
+                the plane in front of the camera; NO_CALIBRATION: the calibration has no lens.
         """
         lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
         found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
@@ -244,25 +243,25 @@ class HandEyeCalibration(storage.SavedCalibration):
         robot_poses: Sequence[Transform | Pose],
         views: Sequence[TargetView | Transform],
     ) -> tuple[Array, ...]:
-        """Return by how much the calibration is off on the target, at any poses of the robot.
+        """Return the errors of the calibration on the target, at any poses of the robot.
 
-        Poses and views that it was not made from tell how good it is. The error of a point is the
-        distance, in the target's plane, from where the target should have it by the robot's pose to
-        where its ray passes.
+        Poses and views that it was not made from show how good it is. The error of a point is the
+        distance, in the target's plane, between its ray and its place by the robot's pose.
 
         Args:
             robot_poses: ``T_base_flange``.
-            views: views of the same target in the same place, as many; or ``T_camera_target``, of
-                which the error is that of the target's origin.
+            views: views of the same target in the same place, one for each pose; or
+                ``T_camera_target``, whose error is that of the target's origin.
 
         Returns:
-            Of each view (N,), of each pose of the target (1,), metres; infinite where a ray does
-            not meet the target's plane before the camera.
+            For each view (N,), for each pose of the target (1,), metres; infinite if a ray does not
+            meet the target's plane in front of the camera.
 
         Raises:
-            CalibrationError: SHAPE: not as many; ``WRONG_FRAME``: poses of other frames;
-                ``DIFFERENT_TARGETS``; ``NO_CALIBRATION``: views, without a camera's lens; and what
-                :func:`~smartcam.calibration._lens.poses.check_view` says.
+            CalibrationError: SHAPE: the numbers of poses and views differ; ``WRONG_FRAME``: poses
+                are in other frames; ``DIFFERENT_TARGETS``; ``NO_CALIBRATION``: there are views, but
+                the calibration has no lens; and those of
+                :func:`~smartcam.calibration._lens.poses.check_view`.
         """
         if len(robot_poses) != len(views):
             raise Code.SHAPE.refusal(
@@ -309,10 +308,10 @@ class HandEyeCalibration(storage.SavedCalibration):
         plane: Transform,
         robot_pose: Transform | Pose | None = None,
     ) -> Array:
-        """Return the rms error to expect of :meth:`to_plane`, of what the camera's pose adds to it.
+        """Return the RMS error to expect of :meth:`to_plane` from the camera's pose alone.
 
-        The robot's own error at ``robot_pose`` and that of the pixels come on top, and that of the
-        lens unless it was adjusted.
+        The robot's own error at ``robot_pose`` and that of the pixels are not included, nor is that
+        of the lens unless it was adjusted.
 
         Args:
             pixels: (N, 2).
@@ -320,14 +319,14 @@ class HandEyeCalibration(storage.SavedCalibration):
             robot_pose: as for :meth:`to_plane`.
 
         Returns:
-            (N,), metres; NaN where :attr:`covariance` is.
+            (N,), metres; NaN if :attr:`covariance` is.
 
         Raises:
-            CalibrationError: as :meth:`to_plane`.
+            CalibrationError: as for :meth:`to_plane`.
         """
         lens, seen = self._lens("predicted_error"), as_points(pixels, 2, "pixels")
         behind = self.camera_at(robot_pose) @ self.camera_pose.inverse()
-        # J by central differences of steps of the camera's pose; the covariance is J C J^T.
+        # J by central differences over steps of the camera's pose; the covariance is J C J^T.
         slopes, small = [], 1e-6
         for axis in range(6):
             ends = []
@@ -352,7 +351,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
 
 def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
-    """Return the crossings of pixels' rays with a plane of the camera's frame (OUT_OF_FIELD)."""
+    """Return the points at which pixels' rays meet a camera's plane; raise OUT_OF_FIELD."""
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     raised = plane.rotation[:, 2] * height + plane.translation
     found = on_plane(rays, plane.rotation, raised)
@@ -369,9 +368,9 @@ def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) ->
 
 
 def as_transform(pose: Transform | Pose, flange: str) -> Transform:
-    """Return ``T_base_flange`` of a pose of the robot, whichever way it is given.
+    """Return ``T_base_flange`` of a pose of the robot, in whichever form it is given.
 
-    Raises SHAPE: it is given in none of these.
+    Raises SHAPE if the form is unknown.
     """
     if isinstance(pose, Pose):
         return Transform.from_pose(pose, flange)

@@ -1,8 +1,8 @@
 """Estimate a robot's pose noise from what a camera on it sees.
 
-The sums of an adjustment are worked out once; for any two standard deviations of the robot they
-give the restricted likelihood of what was seen, in which neither the unknown poses of camera and
-target nor the corrections of the robot's poses are left. Its largest value is looked for.
+The sums of an adjustment are computed once. For any two standard deviations of the robot they give
+the restricted likelihood of the observations, from which the unknown poses of camera and target and
+the corrections of the robot's poses are eliminated. That likelihood is maximized.
 
 Source: Patterson and Thompson, Biometrika 58 (1971).
 """
@@ -28,38 +28,40 @@ if TYPE_CHECKING:
     from smartcam.calibration._hand_eye.equations import Observations, RobotPoses, Solution
     from smartcam.geometry._inside import Array
 
-FIRST = RobotSigmas(1e-3, 5e-4)
-"""Noise of the robot in the first adjustment: 0.06 degrees and half a millimetre."""
+FIRST_SIGMAS = RobotSigmas(1e-3, 5e-4)
+"""Noise of the robot that the first adjustment assumes: 0.06 degrees and half a millimetre."""
 
-LEAST = RobotSigmas(1e-7, 1e-8)
-"""Least noise of any robot: a hundredth of a micrometre."""
+MIN_SIGMAS = RobotSigmas(1e-7, 1e-8)
+"""Least noise that is considered for a robot: a hundredth of a micrometre."""
 
-MOST = RobotSigmas(0.3, 0.1)
-"""Largest noise of any robot: 0.3 rad and 100 mm."""
+MAX_SIGMAS = RobotSigmas(0.3, 0.1)
+"""Largest noise that is considered for a robot: 0.3 rad and 100 mm."""
 
-FIRST_SHARED = 5.0
-"""Factor of the views' shared errors in the first adjustment, where it is estimated."""
+FIRST_SHARED_FACTOR = 5.0
+"""Factor of the views' shared errors that the first adjustment assumes, if the factor is
+estimated."""
 
 MAX_SHARED_FACTOR = 300.0
-"""Largest factor of the views' shared errors: with it 100 points at 0.1 pixels would say
-nothing."""
+"""Largest factor of the views' shared errors: with it, 100 points known to 0.1 pixels would carry
+no information."""
 
 COARSE_VALUES = 5
-"""Values of each standard deviation that are tried at first."""
+"""Each standard deviation is first tried at this many values."""
 
 MAX_ROUNDS = 4
-"""Rounds of adjusting and estimating at most; the estimate hardly changes after two."""
+"""Adjusting and estimating alternate at most this many times; the estimate hardly changes after
+two."""
 
 SETTLED_RATIO = 0.02
-"""Part of the estimates by which a round must change them for another one."""
+"""Another round follows only if the last one changed the estimates by more than this part."""
 
 
 def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solution:
-    """Return the adjustment with the noise that makes what was seen most likely.
+    """Return the adjustment with the noise that makes the observations most likely.
 
-    ``seen`` is whitened. ``start``: where it begins; one that has a noise begins with it.
+    ``seen`` is whitened. The adjustment begins at ``start``, and with its noise if it has one.
     """
-    noise = start.noise or RobotNoise(FIRST, FIRST_SHARED)
+    noise = start.noise or RobotNoise(FIRST_SIGMAS, FIRST_SHARED_FACTOR)
     found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
     for number in range(MAX_ROUNDS):
         if not math.isfinite(found.cost):
@@ -83,10 +85,10 @@ def _estimate(
 ) -> RobotNoise:
     """Return the standard deviations whose restricted likelihood is largest.
 
-    ``search``: look for it everywhere, not only from ``noise`` on.
+    ``search``: look everywhere, not only from ``noise`` on.
     """
     total = sums(robot, seen, at, poses_only=True)[0]
-    low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MAX_SHARED_FACTOR])
+    low, high = np.log([*MIN_SIGMAS, 1.0]), np.log([*MAX_SIGMAS, MAX_SHARED_FACTOR])
 
     def cost(logs: Array) -> float:
         inside = np.clip(logs, low, high)

@@ -1,8 +1,8 @@
-"""The offset between the clocks of a robot and a camera, told by a robot that moves.
+"""Estimate the offset between the clocks of a robot and a camera from a robot that moves.
 
-A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on it, or the target on its
-hand, sees where it was: of all offsets of time that one is right with which poses and views fit
-one camera's place best.
+A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on it, or one that watches
+the target on its hand, sees where it really was. The right offset is the one with which poses and
+views agree best on one place of the camera.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ if TYPE_CHECKING:
     from smartcam.geometry import PoseHistory, Transform
 
 COARSE_STEPS = 41
-"""Offsets that are tried first, over the whole range."""
+"""The whole range is first searched at this many offsets."""
 
-FOLDS = 20
-"""Parts of the views that the offset is told without, for its sigma."""
+LEFT_OUT_PARTS = 20
+"""The offset is estimated again without each of this many parts of the views, for its sigma."""
 
 MIN_VIEWS_FOR_OFFSET = 10
-"""Views that an offset takes: it is one unknown more, of which each view tells a little."""
+"""An offset needs at least this many views: it is one more unknown, about which each view says
+little."""
 
-MAX_TOLD_SIGMA = 0.25
-"""Largest sigma of an offset that is told, as a part of the range."""
+MAX_SIGMA_SHARE = 0.25
+"""An offset is returned only if its sigma is at most this part of the range."""
 
 
 class TimeOffset(NamedTuple):
@@ -73,15 +74,15 @@ def estimate_time_offset(
 
     Args:
         history: ``T_base_flange`` while the pictures were taken, and ``most`` before and after.
-        target_poses: ``T_camera_target`` by each picture, with its time (``at``): ten or more,
+        target_poses: ``T_camera_target`` of each picture, with its time (``at``): ten or more,
             taken while the robot moves and turns, fast enough to matter and in several directions.
         setup: place of the camera, as for :func:`~smartcam.calibration.calibrate_hand_eye`.
-        most: the largest offset that is looked for, seconds.
+        most: largest offset to look for, seconds.
 
     Raises:
         CalibrationError: TOO_FEW; BAD_TIME: a view without a time, a history that does not reach
-            far enough, or views that tell no offset in the range, as of a robot that stood still;
-            and what ``calibrate_hand_eye`` says of poses.
+            far enough, or views that determine no offset in the range, as when the robot stood
+            still; and the errors of ``calibrate_hand_eye`` about poses.
     """
     check_positive(most, "most", "seconds")
     views = seen_poses(target_poses)
@@ -94,12 +95,12 @@ def estimate_time_offset(
     fit = _Moving(history, views, setup, most)
     everything = np.arange(len(views))
     found = fit.best(everything)
-    part = everything % FOLDS
+    part = everything % LEFT_OUT_PARTS
     folds = np.unique(part)
     others = [fit.refined(everything[part != fold], found) for fold in folds]
     scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
     sigma = max(scatter, fit.least_sigma(found, everything))
-    if abs(found) > 0.99 * most or sigma > MAX_TOLD_SIGMA * most:
+    if abs(found) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
         raise Code.BAD_TIME.refusal(
             f"time offset: expected views that tell one within {most:g} s, got {found:.3g} s with "
             f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",
@@ -110,7 +111,7 @@ def estimate_time_offset(
 
 
 class _Moving:
-    """A moving robot and the views of its camera, compared at one offset after another."""
+    """A moving robot and the views of its camera, to be compared at different offsets."""
 
     def __init__(
         self, history: PoseHistory, views: Sequence[Transform], setup: str, most: float
@@ -133,7 +134,7 @@ class _Moving:
         return RobotPoses(Rigid.stacked(poses), self._in_hand)
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
-        """Return the rms of what poses and views of some numbers differ by, metres."""
+        """Return the RMS difference between poses and views at some indices, metres."""
         robot, seen = self._robot(offset, index), self._seen.taken(index)
         found = solve_linear("shah", robot, seen)
         if found is None:
@@ -143,8 +144,8 @@ class _Moving:
         return math.sqrt(float(squares.mean()))
 
     def least_sigma(self, found: float, index: NDArray[np.intp]) -> float:
-        """Return the sigma of an offset if all errors were noise; infinite where none is better."""
-        # A mean square m + c x^2 of n values, m of noise, has its least at x with a variance m/cn.
+        """Return the sigma of an offset if all errors were noise; infinite if none is better."""
+        # The minimum x of a mean square m + c x^2 of n values with noise m has the variance m/cn.
         step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -found)
         least, beside = (self.error(one, index) ** 2 for one in (found, found + step))
         rise = (beside - least) / step**2
@@ -156,7 +157,7 @@ class _Moving:
         return self.refined(index, min(tried.tolist(), key=lambda one: self.error(one, index)))
 
     def refined(self, index: NDArray[np.intp], near: float) -> float:
-        """Return the best offset near to one."""
+        """Return the best offset near a given one."""
         step = 2.0 * self._most / (COARSE_STEPS - 1)
         low, high = max(near - step, -self._most), min(near + step, self._most)
         search = load("scipy.optimize").minimize_scalar

@@ -1,7 +1,7 @@
-"""Check whether a robot's poses and the views belong together, and which of them do not.
+"""Check whether a robot's poses and the views belong together, and find those that do not.
 
-A closed form finds camera and target from each of many small groups of poses. The answer with which
-most of all poses agree is taken, so a few poses that belong to other views do not spoil the rest.
+A closed form finds camera and target from each of many small groups of poses. The answer that most
+of all poses agree with is taken, so a few poses that belong to other views do not spoil the rest.
 """
 
 from __future__ import annotations
@@ -37,27 +37,28 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 CLOSED_FORMS: Final = ("park", "shah")
-"""Closed forms that are tried. They are of different kinds: where one fails, the other works."""
+"""Closed forms that are tried. They are of different kinds: one works when the other fails."""
 
-POSES_OF_PART: Final = 4
-"""Poses in one group: one more than a closed form needs."""
+POSES_PER_GROUP: Final = 4
+"""A group has this many poses, one more than a closed form needs."""
 
-MAX_PARTS: Final = 60
-"""Groups that are tried: where a third of the poses is wrong, one group in six is all right."""
+MAX_GROUPS: Final = 60
+"""At most this many groups are tried: if a third of the poses is wrong, one group in six has none
+of them."""
 
-GROSS_MEDIANS: Final = 10.0
-"""Multiple of the median error beyond which a pose belongs to another view."""
+MIN_GROSS_ERROR_RATIO: Final = 10.0
+"""A pose whose error is more than this many times the median belongs to another view."""
 
-OTHER_WAY: Final = 5.0
-"""Factor by which poses must fit better when inverted, or a view when numbered from the target's
-other end, to be taken as given that way."""
+MIN_INVERTED_FIT_RATIO: Final = 5.0
+"""Poses are taken for inverted, or a view for numbered from the target's other end, only if they
+then fit this many times better."""
 
 MIN_OTHER_FIT_RATIO: Final = 20.0
-"""Factor by which poses must fit better when transposed, mirrored or in another unit of length, to
-be taken as given that way: such mistakes are rarer than a pose of another view."""
+"""Poses are taken for transposed, mirrored or in another unit of length only if they then fit this
+many times better: such mistakes are rarer than a pose of another view."""
 
-WORST_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
-"""Largest noise of a robot that is any good: 2 degrees and 10 mm."""
+WORST_USABLE_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
+"""Largest noise of a usable robot: 2 degrees and 10 mm."""
 
 MILLI: Final = 1e-3
 
@@ -70,22 +71,22 @@ class Agreed(NamedTuple):
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
-    off: Array  # (V,), by how much each pose is off, metres on the target
+    off: Array  # (V,), error of each pose, metres on the target
 
     @property
     def median(self) -> float:
-        """Median of the distances that all poses are off, metres."""
+        """Median error of all poses, metres."""
         return float(np.median(self.off))
 
     def gross(self, limit: float) -> NDArray[np.intp]:
-        """Return the indices of poses that are off by more than ``limit``, far more than others."""
-        return np.flatnonzero(self.off > max(limit, GROSS_MEDIANS * self.median))
+        """Return the indices of poses whose error is above ``limit`` and far above the others'."""
+        return np.flatnonzero(self.off > max(limit, MIN_GROSS_ERROR_RATIO * self.median))
 
 
 def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     """Return poses of the target in the camera's frame as a list.
 
-    Raises SHAPE: something else; WRONG_FRAME: of several frames, or the camera's in the target's.
+    Raises SHAPE if these are no poses; WRONG_FRAME if they are in several frames, or inverted.
     """
     what = "pose of the target"
     found = [
@@ -102,7 +103,7 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
 
 
 def extent(problem: Problem) -> float:
-    """Return the error from which on a calibration is meaningless, metres.
+    """Return the error above which a calibration is meaningless, metres.
 
     It is the target's extent; without views it is half of the target's distance.
     """
@@ -112,7 +113,7 @@ def extent(problem: Problem) -> float:
 
 
 def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
-    """Return the rms error on the target that a robot of such a noise gives, metres.
+    """Return the RMS error on the target that a robot's noise causes, metres.
 
     A turn is taken to move the target in proportion to its distance from the camera.
     """
@@ -121,12 +122,12 @@ def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
 
 
 def most_error(problem: Problem) -> float:
-    """Return the error beyond which poses and views do not belong together, metres."""
-    return min(extent(problem), expected_error(problem, WORST_ROBOT))
+    """Return the error above which poses and views do not belong together, metres."""
+    return min(extent(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
 def agreement(problem: Problem) -> Agreed | None:
-    """Return the motion that most of the poses agree with; None where no closed form gives one."""
+    """Return the motion that most of the poses agree with; None if no closed form finds one."""
     # Least median over proposals of small parts: right as long as most of the poses are.
     # Source: Rousseeuw, Least Median of Squares Regression (1984).
     arm = extent(problem) if isinstance(problem.seen, PixelObservations) else 0.0
@@ -140,18 +141,18 @@ def agreement(problem: Problem) -> Agreed | None:
 
 
 def _parts(count: int) -> Iterator[NDArray[np.intp]]:
-    """Yield the numbers of all poses, and of groups of them; always the same groups."""
+    """Yield the indices of all poses, then those of groups of poses, which are always the same."""
     yield np.arange(count)
-    if count > POSES_OF_PART:
+    if count > POSES_PER_GROUP:
         random = np.random.default_rng(count)
-        for _ in range(MAX_PARTS):
-            yield np.sort(random.choice(count, POSES_OF_PART, replace=False))
+        for _ in range(MAX_GROUPS):
+            yield np.sort(random.choice(count, POSES_PER_GROUP, replace=False))
 
 
 def _better(
     problem: Problem, numbers: NDArray[np.intp], arm: float, best: Agreed | None
 ) -> Agreed | None:
-    """Return the motion of these poses if all poses agree with it better than with ``best``."""
+    """Return the motion of some poses if all poses agree with it better than with ``best``."""
     for name in CLOSED_FORMS:
         found = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
         if found is None:
@@ -173,8 +174,8 @@ def _apart(poses: Rigid, expected: Rigid, arm: float) -> Array:
 def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) -> NDArray[np.bool_]:
     """Return a mask of views that number a target from its other end: at most half of them.
 
-    The target looks the same after a half ``turn``, and each view alone may take either end for
-    the origin: the robot's motions tell. ``arm``: the target's extent, metres.
+    The target looks the same after a half ``turn``, and each view alone may take either end for the
+    origin: the robot's motions show which one. ``arm``: the target's extent, metres.
     """
     least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
     for numbers, name in itertools.product(_parts(poses.size), CLOSED_FORMS):
@@ -185,19 +186,19 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
         as_is, turned = (_apart(one, expected, arm) for one in (poses, poses @ turn))
         middle = float(np.median(np.minimum(as_is, turned)))
         if middle < least:
-            least, other = middle, OTHER_WAY * turned < as_is
+            least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
     return ~other if 2 * other.sum() > len(other) else other
 
 
 def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
-    """Yield other readings of the poses.
+    """Yield the poses in each other way that they may have been meant.
 
-    Each is the poses in this reading, the factor by which they must fit better, the error's code,
-    and words for the reading and the mistake.
+    Each item has the changed poses, the factor by which they must fit better, the error's code, and
+    words for what they are then taken for, and for the mistake.
     """
     poses, in_hand = robot.poses, robot.in_hand
     how = "the other way round: they are inverted, or the camera is on the other side"
-    yield RobotPoses(poses, not in_hand), OTHER_WAY, Code.WRONG_FRAME, how
+    yield RobotPoses(poses, not in_hand), MIN_INVERTED_FIT_RATIO, Code.WRONG_FRAME, how
     turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
     how = "with rotations transposed: their matrices or quaternions are those of the way back"
     yield RobotPoses(turned, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how
@@ -213,8 +214,8 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
 def check_poses(problem: Problem) -> Agreed:
     """Return the motion that most of the poses agree with.
 
-    Raises ``WRONG_FRAME``, ``MIRRORED``, or ``POOR_FIT``: the poses fit far better when they are
-    read otherwise, or do not fit at all.
+    Raises ``WRONG_FRAME`` or ``MIRRORED`` if the poses fit far better when they are read otherwise,
+    and ``POOR_FIT`` if they do not fit at all.
     """
     found = agreement(problem)
     off = math.inf if found is None else _on_target(problem, found)
@@ -242,8 +243,8 @@ def check_poses(problem: Problem) -> Agreed:
 def poor_fit(what: str, off: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
-    ``what``: description of what came instead. ``off``: error of the target, metres; None where it
-    is not known.
+    ``what``: description of what came instead. ``off``: error of the target, metres; None if it is
+    not known.
     """
     return Code.POOR_FIT.refusal(
         f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "

@@ -1,1 +1,1 @@
-"""A camera's lens: its model, and its calibration from views."""
+"""Model the lens of a camera, and calibrate it from views."""

@@ -1,7 +1,7 @@
 """Lenses, a rig of cameras and poses of targets, adjusted together to the least reprojection error.
 
-Where a sheet is not what it was meant to be its points are adjusted, too, in the same equations.
-Each target pose concerns its own views alone, so the six unknowns of each are eliminated; see
+If a sheet is not as it was meant to be, its points are adjusted, too, in the same equations. Each
+target pose affects only its own views, so its six unknowns are eliminated; see
 :mod:`smartcam.calibration._least_squares`.
 """
 
@@ -28,54 +28,56 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SETTLED_COST_RATIO: Final = 1e-7
-"""Part of the weighted squares by which the last step still lowers them: of 1000 coordinates it is
-a hundredth of a standard deviation."""
+"""A fit ends when a step lowers the weighted squares by less than this part: with 1000 coordinates
+it is then a hundredth of a standard deviation from the minimum."""
 
 LOOSE_SIGMA_RATIO: Final = 0.01
-"""Assumed standard deviation of a sheet's point, in parts of its distance to the next. With six
+"""Assumed standard deviation of a sheet's points, as a part of their distance to the next. With six
 recorded views a tenth makes the held-out error 1.7 times as large as an exact sheet does, a
 hundredth 1.1; with many views both give the same (measured)."""
 
 TIGHT_SIGMA_RATIO: Final = 1e-4
-"""Standard deviation of the place, direction and size of all of a sheet's points as a whole, which
-no view tells, in parts of a point's distance to the next."""
+"""Assumed standard deviation of the place, direction and size of a sheet's points as a whole, which
+no view shows, as a part of their distance to the next."""
 
 SETTLED_REFIT_RATIO: Final = 1e-5
-"""Part of the weighted squares by which the last step lowers them, in a fit without a pose."""
+"""A fit without one of the poses ends when a step lowers the weighted squares by less than this
+part."""
 
 MAX_FEW_POSES: Final = 5
-"""Poses up to which leaving one out changes the fit too much for one step."""
+"""With at most this many poses, leaving one out changes the fit too much for a single step."""
 
-MAX_BEND: Final = 1.2
-"""Cost without a pose over the cost that one step predicts, beyond which one step does not do: as
-with lenses whose coefficients make up for each other."""
+MAX_ONE_STEP_COST_RATIO: Final = 1.2
+"""A single step is not enough if the cost without a pose is more than this many times the cost that
+the step predicts, as happens when a lens' coefficients compensate each other."""
 
 Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """An array of indices."""
 
 
 class Sight(NamedTuple):
-    """One view; a camera has one of each pose at most."""
+    """One view: a camera has at most one of each pose."""
 
-    camera: int  # number of the camera
-    pose: int  # number of the target's pose
+    camera: int  # index of the camera
+    pose: int  # index of the target's pose
     view: TargetView
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """All that is adjusted."""
+    """All values that are adjusted."""
 
     cameras: tuple[CameraModel, ...]
-    rig: Rigid  # of the further cameras, from the first camera's frame into their own
-    poses: Rigid  # of the targets, into the first camera's frame; one that no view shows stays
-    # of each camera (4 + K, F): by how much fx, fy, cx, cy and the K coefficients change with each
-    # of its F unknowns; (4 + K, 0) for a lens that is known
+    rig: Rigid  # poses of the further cameras, from the first camera's frame into their own
+    # poses of the targets, into the first camera's frame; one that no view shows stays
+    poses: Rigid
+    # for each camera (4 + K, F): how fx, fy, cx, cy and the K coefficients change with each of its
+    # F unknowns; (4 + K, 0) for a lens that is known
     basis: tuple[Array, ...]
-    rigid: bool = False  # whether ``rig`` is known
-    # (T, 3), of the target, metres, where they are not as they were meant to be
+    rigid: bool = False  # whether ``rig`` is known and not adjusted
+    # (T, 3), points of the target, metres, if they are not as they were meant to be
     points: Array | None = None
-    free: bool = False  # whether ``points`` are adjusted; they are given then
+    free: bool = False  # whether ``points`` are adjusted; then they must be given
 
     @classmethod
     def single(
@@ -117,7 +119,7 @@ class Bundle:
         return self.rig.taken(camera - 1) if camera else IDENTITY
 
     def moved(self, shared: Array, poses: Array) -> Bundle:
-        """Return the bundle changed by the shared unknowns (S,) and by the poses' ones (P, 6)."""
+        """Return the bundle after steps of the shared unknowns (S,) and of the poses (P, 6)."""
         columns = self.lens_columns
         cameras = tuple(
             with_lens(camera, lens_values(camera) + basis @ shared[some]) if basis.size else camera
@@ -133,7 +135,7 @@ class Bundle:
         )
 
     def camera_changes(self, other: Bundle) -> Array:
-        """Return by how much the cameras' unknowns of another bundle are more than these."""
+        """Return the cameras' unknowns of another bundle minus those of this one."""
         lenses = [
             np.linalg.pinv(basis) @ (lens_values(to) - lens_values(camera))
             for camera, to, basis in zip(self.cameras, other.cameras, self.basis, strict=True)
@@ -163,19 +165,19 @@ def with_lens(camera: CameraModel, values: Array) -> CameraModel:
 class AdjustedBundle:
     """The result of adjusting a bundle."""
 
-    bundle: Bundle  # the values with the least weighted squares
-    residuals: list[Array]  # of each sight (N, 2), seen minus projected, pixels
-    weighted: float  # sum of the weighted squares; infinite where points lie behind a camera
-    more: float  # variance that each coordinate was given beside its own, pixels^2
-    normal: Normal  # the equations at the solution
-    freedom: int  # coordinates less unknowns
+    bundle: Bundle  # bundle with the least weighted squares
+    residuals: list[Array]  # residuals of each sight (N, 2), seen minus projected, pixels
+    weighted: float  # sum of the weighted squares; infinite if points lie behind a camera
+    more: float  # variance that was added to that of each coordinate, pixels^2
+    normal: Normal  # normal equations at the solution
+    freedom: int  # number of coordinates minus number of unknowns
 
     @property
     def by_noise(self) -> Array:
-        """Covariance of the cameras' unknowns, were each point's error its own.
+        """Covariance of the cameras' unknowns if the errors of all points were independent.
 
-        It is far too small where views err as a whole, but tells what views leave open. NaN where
-        ``weighted`` is infinite.
+        It is far too small if the points of a view share errors, but shows what the views do not
+        determine. NaN if ``weighted`` is infinite.
         """
         count = self.bundle.of_cameras
         if not math.isfinite(self.weighted):
@@ -198,14 +200,14 @@ class AdjustedBundle:
 
 
 def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) -> AdjustedBundle:
-    """Return the least squares with weights that fit their residuals.
+    """Return the least-squares solution with weights that match its residuals.
 
-    What the residuals show beside the points' covariance (a lens that is not quite of its model, a
-    sheet that is not quite flat) is taken as one variance of all points and is found together with
-    the fit.
+    Residuals beyond the points' covariance (from a lens that does not quite follow its model, or a
+    sheet that is not quite flat) are taken as one additional variance of all points, which is
+    estimated together with the fit.
     """
-    # Weights need the variance, and the variance needs the residuals: in turns. The fit depends
-    # little on the weights, so the second turn hardly changes anything.
+    # Weights need the variance, and the variance needs the residuals, so both are computed in
+    # turns. The fit depends little on the weights, so the second turn hardly changes anything.
     covariance = np.concatenate([sight.view.covariance for sight in sights])
     for _ in range(3):
         adjusted = adjust(bundle, sights, more)
@@ -219,9 +221,10 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 def adjust(
     bundle: Bundle, sights: Sequence[Sight], more: float, gain: float = SETTLED_COST_RATIO
 ) -> AdjustedBundle:
-    """Return the least squares, each point weighted by its covariance and ``more`` variance.
+    """Return the least-squares solution, each point weighted by its covariance plus ``more``.
 
-    ``gain``: part of the weighted squares by which the last step still lowers them.
+    ``more`` is a variance, pixels^2. The fit ends when a step lowers the weighted squares by less
+    than the part ``gain``.
     """
     normal_at = BundleEquations(bundle, sights, more).normal
     bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=gain)
@@ -238,18 +241,19 @@ def adjust(
 
 
 class LeftOut(NamedTuple):
-    """One pose under cameras that were fitted without its views."""
+    """One pose, with cameras that were fitted without its views."""
 
     pose: int
-    bundle: Bundle  # the cameras and the sheet, without its views
-    residuals: list[Array]  # of each of its views (N, 2), pixels; the pose alone is fitted to them
-    # of the cameras' unknowns without its views, were each point's error its own: inverse normal
-    # matrix, of variance 1
+    bundle: Bundle  # cameras and sheet, fitted without the pose's views
+    # residuals of each of the pose's views (N, 2), pixels, after fitting the pose alone to them
+    residuals: list[Array]
+    # covariance of the cameras' unknowns without the pose's views, if the errors of all points were
+    # independent with a variance of 1
     by_noise: Array
 
 
 def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut]:
-    """Leave out each pose that is seen, one after the other: by one step, or else by a new fit."""
+    """Leave out each observed pose in turn, by a single step or, if needed, a new fit."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
     # without the pose. What it leaves is of second order in how far the pose pulls the others.
@@ -269,7 +273,10 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
         without = whole.moved(shared, part[3] - part[2] @ shared)
         squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
         squares += float(shared @ part[0] @ shared)
-        if len(poses) <= MAX_FEW_POSES or not equations.normal(without).cost <= MAX_BEND * squares:
+        if (
+            len(poses) <= MAX_FEW_POSES
+            or not equations.normal(without).cost <= MAX_ONE_STEP_COST_RATIO * squares
+        ):
             without = _fitted_without(adjusted, sights, pose, own)
         found.append(LeftOut(pose, without, residuals(without, own), by_noise[:count]))
     return found
@@ -278,7 +285,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
 def _fitted_without(
     adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, own: Sequence[Sight]
 ) -> Bundle:
-    """Return the cameras as fitted to all views but a pose's own, and its pose to these."""
+    """Fit the cameras to all views but those of one pose, then this pose to its views."""
     others = [one for one in sights if one.pose != pose]
     anew = adjust(adjusted.bundle, others, adjusted.more, SETTLED_REFIT_RATIO).bundle
     without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
@@ -287,7 +294,7 @@ def _fitted_without(
 
 
 def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> Array:
-    """Return the covariance of the cameras' unknowns, as the views scatter.
+    """Return the covariance of the cameras' unknowns from the scatter between views.
 
     ``left_out``: all poses, each once.
     """
@@ -297,7 +304,7 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
 
 
 def free_points(sights: Sequence[Sight]) -> int:
-    """Return the number of unknowns of the points that are seen; as a whole they keep 7."""
+    """Return the number of unknowns of the visible points, less 7 for their pose and size."""
     return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
 
 
@@ -305,12 +312,12 @@ class _Group(NamedTuple):
     """All N points that one camera sees."""
 
     camera: int
-    poses: list[int]  # of each of its views
-    bounds: list[slice]  # points of each of its views
-    pose: Indices  # (N,)
-    ids: Indices  # (N,), on the target
-    pixels: Array  # (N, 2)
-    white: Array  # (N, 2, 2)
+    poses: list[int]  # index of the pose of each of its views
+    bounds: list[slice]  # number of points in each of its views
+    pose: Indices  # (N,), index of the pose of each point
+    ids: Indices  # (N,), index of each point on the target
+    pixels: Array  # (N, 2), pixels
+    white: Array  # (N, 2, 2), whitening of each point's residual
 
 
 def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
@@ -328,7 +335,7 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
 
 
 class BundleEquations:
-    """The parts of a bundle's equations that stay the same while the bundle is adjusted.
+    """The parts of a bundle's equations that do not change while the bundle is adjusted.
 
     ``prior``: whether free points are held where they were meant to be, within
     LOOSE_SIGMA_RATIO and TIGHT_SIGMA_RATIO.
@@ -351,14 +358,15 @@ class BundleEquations:
     def normal(self, bundle: Bundle) -> Normal:
         """Return the normal equations."""
         found, cost = Normal.nothing(bundle.shared, bundle.poses.size, 6), 0.0
-        found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
+        found.own[self._unseen] = np.eye(6)  # poses without an observation stay as they are
         matrix, right = found.shared, found.shared_right
         for group in self._groups:
             own, jacobian, by_points = self._columns(bundle, group)
             for pose, some in zip(group.poses, group.bounds, strict=True):
                 rows = jacobian[some]
                 flat = rows.reshape(-1, rows.shape[2])
-                product = flat.T @ flat  # of the pose', the shared columns and the residuals
+                # derivatives by the pose, by the shared unknowns, and the residuals
+                product = flat.T @ flat
                 found.own[pose] += product[:6, :6]
                 found.own_right[pose] += product[:6, -1]
                 found.mixed[pose][:, own] += product[:6, 6:-1]
@@ -385,7 +393,7 @@ class BundleEquations:
         return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
     def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
-        """Return the indices of a camera's shared unknowns, and the derivatives of what it sees.
+        """Return the indices of a camera's shared unknowns, and the derivatives of its pixels.
 
         Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
         points on the target (N, 2, 3).
@@ -419,9 +427,9 @@ def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
 
 
 def _prior(meant: Array) -> Array:
-    """Return the weights (3 T, 3 T) of how far a sheet's points are from where they were meant.
+    """Return the weights (3 T, 3 T) that hold a sheet's points near where they were meant to be.
 
-    Each alone hardly, and all of them as a whole: shifts, turns and a scale move no pixel.
+    Single points are held loosely; their common shift, turn and scale, which move no pixel, firmly.
     """
     spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
     near, axes = meant - meant.mean(axis=0), np.eye(3)

@@ -1,4 +1,4 @@
-"""Two calibrations of one lens: by how much they differ, and whether noise explains it."""
+"""Compare two calibrations of one lens: how much they differ, and whether noise explains it."""
 
 from __future__ import annotations
 
@@ -28,22 +28,25 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, Rigid
 
 CELLS: Final = (6, 8)
-"""Rows and columns of an image's cells, by which is told where both have seen the target."""
+"""An image is divided into this many rows and columns of cells, to find where both calibrations
+have seen the target."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
-"""Probability with which noise alone may make two calibrations differ as much."""
+"""If noise alone makes two calibrations differ this much with at most this probability, they do
+differ."""
 
 MIN_CHANCE: Final = 1e-9
-"""A chance that is less is not told: the noise is not as normal as that."""
+"""Smallest chance that is reported: the noise is not exactly normal, so smaller ones mean
+nothing."""
 
 MAX_STEPS: Final = 50
 """The fit of the motion takes at most this many steps; it usually takes five."""
 
 SETTLED_PX: Final = 1e-9
-"""Pixels: a step that moves nothing by more is the last."""
+"""The fit ends when a step moves no point by more than this many pixels."""
 
 MIN_DIFFERENCE_PX: Final = 1e-3
-"""Pixels: what moves places by less does not count as a difference."""
+"""Two lenses do not differ where they project to within this many pixels."""
 
 
 class Lens(NamedTuple):
@@ -52,7 +55,8 @@ class Lens(NamedTuple):
     Attributes:
         camera: the lens.
         covariance: (4 + K, 4 + K), covariance of the lens' values; None: not known.
-        points: (N, 3), where the target was seen before the camera, metres; None: not known.
+        points: (N, 3), places of the target's points in the camera's frame, metres; None: not
+            known.
         views: count of views from which ``covariance`` is an estimate.
     """
 
@@ -63,7 +67,7 @@ class Lens(NamedTuple):
 
     @classmethod
     def of(cls, one: IntrinsicCalibration | CameraModel) -> Lens:
-        """Return the lens of a calibration, or a bare lens; ``SHAPE``: neither."""
+        """Return the lens of a calibration, or a bare lens; raise ``SHAPE`` for anything else."""
         if isinstance(one, IntrinsicCalibration):
             views = sum(fit.used for fit in one.views)
             return cls(one.camera, one.covariance, one.target_points, views)
@@ -83,15 +87,15 @@ class LensComparison:
     Attributes:
         distance: distance of the points from the camera, metres; None: infinity.
         pixels: (h, w, 2), where the first lens sees a point.
-        difference: (h, w, 2), where the second one sees it, less that, after the motion; pixels;
-            NaN where one of them sees none.
-        expected: (h, w, 2, 2), covariance of ``difference`` that both calibrations' noise leads to;
-            None where it is not known of both.
-        motion: ``T_b_a``, the small motion of the camera that was taken off.
-        ratio: size of the differences in units of what noise leads to, root of the mean square:
-            about 1 where noise alone is at work; None without ``expected``.
-        chance: how likely noise alone makes the calibrations differ as much, 0 to 1; None without
-            ``expected``.
+        difference: (h, w, 2), the pixel of the same point in the second lens minus that in the
+            first, after ``motion``; NaN where a lens does not show the point.
+        expected: (h, w, 2, 2), covariance of ``difference`` that the noise of both calibrations
+            causes; None if one of the two is not known.
+        motion: ``T_b_a``, the small motion of the camera that was removed from the difference.
+        ratio: RMS of the differences over that expected from noise: about 1 if there is only noise;
+            None without ``expected``.
+        chance: probability, 0 to 1, with which noise alone makes the calibrations differ as much;
+            None without ``expected``.
     """
 
     distance: float | None
@@ -104,7 +108,7 @@ class LensComparison:
 
     @property
     def lengths(self) -> Array:
-        """(h, w), the differences' lengths over sqrt(2): rms of a coordinate, pixels."""
+        """Lengths of the differences over sqrt(2), as the RMS of a coordinate, (h, w), pixels."""
         lengths: Array = np.linalg.norm(self.difference, axis=2) / math.sqrt(2)
         return lengths
 
@@ -115,19 +119,19 @@ class LensComparison:
 
     @property
     def predicted(self) -> MapFigures | None:
-        """Differences that noise leads to, in the same four numbers; None if they are unknown."""
+        """Differences that noise would cause, in the same four numbers; None if unknown."""
         if self.expected is None:
             return None
         return figures(np.sqrt(np.trace(self.expected, axis1=2, axis2=3) / 2))
 
     @property
     def same(self) -> bool | None:
-        """True if noise explains the difference; None where the noise is not known."""
+        """True if noise explains the difference; None if the noise is not known."""
         return None if self.chance is None else self.chance >= SIGNIFICANCE_LEVEL
 
     @property
     def verdict(self) -> str:
-        """The same in words."""
+        """Result of the comparison in words."""
         if self.chance is None or self.ratio is None:
             return "no verdict: it takes the noise of both, as two calibrations with views have it"
         chance = f"{self.chance:.2g}" if self.chance > MIN_CHANCE else f"below {MIN_CHANCE:g}"
@@ -145,24 +149,24 @@ def compare(
     distance: float | None = None,
     shape: tuple[int, int] = SHAPE,
 ) -> LensComparison:
-    """Return by how much two calibrations of one lens differ in where they project.
+    """Compare where two calibrations of one lens project the same points.
 
-    What a small motion of the camera makes up for is taken off: the one that fits best to the
-    target's points before the camera, where both calibrations have seen it; of lenses without views
-    to points at the distance, in the largest circle about the image's middle. The noise of both is
-    taken as independent; of calibrations from the same images the difference is smaller.
+    A small motion of the camera is removed from the difference first: the one that fits best to the
+    target's points, where both calibrations have seen it. For lenses without views it is fitted to
+    points at the distance, in the largest circle around the image's centre. The noise of the two is
+    assumed to be independent; calibrations from the same images differ less.
 
     Args:
-        a: the one that the differences begin at; bare lenses are compared without a prediction.
-        b: the other one, for images of the same size.
+        a: calibration that is subtracted, or a bare lens, which is compared without a prediction.
+        b: the other calibration or lens, for images of the same size.
         distance: distance of the points, metres; None: infinity.
         shape: rows and columns of the map, 2 to 500 each, from corner to corner.
 
     Raises:
         CalibrationError: ``SHAPE``: neither calibrations nor lenses, or no such rows and columns;
             ``WRONG_SIZE``: images of two sizes; ``NOT_FINITE``: no such distance; ``OUT_OF_FIELD``:
-            the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion brings
-            the one to the other.
+            the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion maps one
+            lens to the other.
     """
     return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
 
@@ -170,7 +174,7 @@ def compare(
 def compare_lenses(
     a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
 ) -> LensComparison:
-    """Return the comparison of lenses, as :func:`compare`."""
+    """Compare two lenses, as :func:`compare` does."""
     check_distance(distance)
     first, second, far = a.camera, b.camera, distance is None
     if tuple(first.size) != tuple(second.size):
@@ -209,9 +213,9 @@ def compare_lenses(
 def rig_difference(
     a: Transform, b: Transform, first: LensComparison, second: LensComparison
 ) -> tuple[float, float]:
-    """Return by how much two calibrations of one pair differ in where the cameras stand.
+    """Return the difference between two calibrations of a pair in the pose of its cameras.
 
-    What was taken off of either camera belongs to it, so it is put in again.
+    The motions that were removed in comparing the lenses are added again.
 
     Args:
         a: ``T_second_first`` of the one calibration.
@@ -228,11 +232,12 @@ def rig_difference(
 
 
 def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
-    """Return the points that the motion is fitted to, and whether they are mere directions.
+    """Return the points that the motion is fitted to, and whether they are only directions.
 
-    They are the target's, in those cells of the image in which both have seen it, or in all where
-    those are too few. Of lenses without views they are in the largest circle about the middle of
-    the image: what lenses make of corners in which no view was would turn the camera.
+    They are the target's points in those cells of the image in which both have seen it, or in all
+    cells if those are too few. For lenses without views they are in the largest circle around the
+    image's centre: in corners without any view, lenses may project so differently that the camera
+    would seem turned.
     """
     known = [(one.camera, one.points) for one in (a, b) if one.points is not None]
     if not known:
@@ -248,7 +253,7 @@ def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
 
 
 def _cells(camera: CameraModel, points: Array) -> list[int]:
-    """Return the number of the cell in which each point is seen."""
+    """Return the index of the cell in which each point is seen."""
     part = (camera.project(points) + 0.5) / camera.size * CELLS[::-1]
     columns, rows = np.clip(np.floor(part), 0, np.array(CELLS[::-1]) - 1).astype(int).T
     found: list[int] = (rows * CELLS[1] + columns).tolist()
@@ -256,9 +261,9 @@ def _cells(camera: CameraModel, points: Array) -> list[int]:
 
 
 def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) -> Rigid:
-    """Return the motion with which the second lens sees the gauge's points as the first does.
+    """Return the motion after which the second lens projects the gauge's points as the first does.
 
-    ``far``: they are directions, so it is a turn. Gauss and Newton.
+    ``far``: the points are directions, so the motion is a turn. The method is Gauss-Newton.
     """
     seen, motion = first.project(gauge), IDENTITY
     for _ in range(MAX_STEPS):
@@ -282,7 +287,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
 
 
 def _project(camera: CameraModel, points: Array) -> Array:
-    """Return pixels (N, 2); NaN where points are, too."""
+    """Project points to pixels (N, 2); NaN stays NaN."""
     known = np.isfinite(points).all(axis=1, keepdims=True)
     return np.where(known, camera.project(np.where(known, points, [0.0, 0.0, 1.0])), np.nan)
 
@@ -295,10 +300,10 @@ def _root(covariance: Array) -> Array:
 
 
 def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]:
-    """Return the ratio of differences (N, 2) to what is expected of them, and its chance.
+    """Return the ratio of differences (N, 2) to the expected ones, and its probability.
 
-    ``spread`` (N, 2, K): S with S S^T their covariance. ``views``: that both estimates of it are
-    from, less one of each.
+    ``spread`` (N, 2, K): S with S S^T their covariance. ``views``: number of views behind both
+    estimates of it, minus one for each.
     """
     # With D the covariances of the places by themselves, Q = sum of e^T D^-1 e has the mean 2 N and
     # is distributed as the sum of l times chi^2 of 1, l the eigenvalues of D^-1/2 S S^T D^-1/2,

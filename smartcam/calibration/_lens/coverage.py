@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 ENOUGH: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
-"""Range of each quantity that is good enough.
+"""Range of each quantity that is enough.
 
 Source: ROS' camera_calibration, calibrator.py (published).
 """
 
 
 class Coverage(NamedTuple):
-    """Bars from 0 to 1, where 1 is good enough.
+    """Bars from 0 to 1; a bar of 1 is good enough.
 
     Attributes:
-        x: places from left to right.
-        y: places from top to bottom.
-        size: sizes from far to near.
-        skew: tilts from head-on to tilted.
+        x: range of places from left to right.
+        y: range of places from top to bottom.
+        size: range of sizes from far to near.
+        skew: range of tilts from head-on to tilted.
     """
 
     x: float
@@ -44,12 +44,12 @@ class Coverage(NamedTuple):
 def coverage(outlines: Sequence[Array], size: tuple[int, int]) -> Coverage:
     """Return the bars of views.
 
-    Of each view, x and y are how far the target's middle went of the way that it can go without
-    leaving the image, size is the root of its part of the image's area, and skew is twice by how
-    many radians its first corner is off a right angle. A bar is the range of these over the views,
-    in parts of what is :data:`ENOUGH`.
+    For each view, x and y are the place of the target's centre within the range that it can have
+    without leaving the image, size is the square root of its part of the image's area, and skew is
+    twice the angle, in radians, by which its first corner differs from a right angle. A bar is the
+    range of one of these over the views, divided by its value in :data:`ENOUGH`.
 
-    ``outlines``: of each view, the target's four outer points in order (4, 2), pixels. ``size``:
+    ``outlines``: the target's four outer points in order (4, 2), pixels, of each view. ``size``:
     width and height of the images, pixels.
     """
     seen = np.array([_quantities(outline, size) for outline in outlines])

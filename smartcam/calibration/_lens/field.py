@@ -1,11 +1,11 @@
-"""Points over a camera's field, and how a lens' error moves them that no pose makes up for.
+"""Compute how the error of a lens moves points over the field, beyond what a pose compensates.
 
-Two calibrations of one lens differ in more than they disagree about: a principal point that is off
-turns the camera by as much, and every pose that is found with that lens turns along. So what is
-said of an error over the field leaves out the small motion of the camera that fits it best. Where
-it fits is a choice, the gauge: points before the camera, best those of the target where the
-calibration saw it. Points far nearer or farther are then less sure, as they are for whoever finds
-the camera's pose with targets at one distance and uses it at another.
+Two calibrations of one lens may differ without disagreeing: if the principal point is off, the
+camera seems turned by as much, and every pose that is found with that lens is turned along. So an
+error over the field is given without the small motion of the camera that fits it best. The points
+that this motion is fitted to are a choice, the gauge: best are those of the target where the
+calibration saw it. Points that are much nearer or farther are then less certain, as they are for
+anybody who finds the camera's pose with targets at one distance and uses it at another.
 
 Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
 formulas here are written anew.
@@ -29,21 +29,22 @@ SHAPE: Final = (25, 33)
 """Rows and columns of a map: odd numbers, so that the middle is one of its places."""
 
 MAX_MAP_SIDE: Final = 500
-"""Rows, and columns, of a map at most."""
+"""A map has at most this many rows, and as many columns."""
 
 MAX_ROUND_TRIP_PX: Final = 1e-3
-"""Pixels by which a pixel may be off when its direction is projected again."""
+"""A pixel whose direction is projected again comes back to within this many pixels."""
 
 MIN_MOTION_PLACES: Final = 6
-"""Places that a motion is fitted to at least: three tell it."""
+"""A motion is fitted to at least this many places; three determine it."""
 
 
 class Sensitivity(NamedTuple):
     """The derivatives of projected points (N) by a lens' values and by the camera's motion."""
 
-    by_lens: Array  # (N, 2, 4 + K)
+    by_lens: Array  # (N, 2, 4 + K), derivatives by the values of the lens
     by_motion: Array  # (N, 2, 6), a turn and a shift; the latter is 0 for points at infinity
-    by_point: Array  # (N, 2, 3), pixels for each metre; of directions for each radian
+    # (N, 2, 3), derivatives by the point, pixels per metre; for directions pixels per radian
+    by_point: Array
 
     def freed(self, gauge: Sensitivity) -> Array:
         """Return ``by_lens`` without the motion that fits best at a gauge's points."""
@@ -58,7 +59,7 @@ class Sensitivity(NamedTuple):
 
 
 def check_distance(distance: float | None) -> None:
-    """Refuse a distance that is not valid; None means infinity. Raises ``NOT_FINITE``."""
+    """Raise ``NOT_FINITE`` for a distance that is not valid; None means infinity."""
     if distance is not None and not (math.isfinite(distance) and distance > 0.0):
         raise Code.NOT_FINITE.unexpected(
             "distance: expected a positive number of metres, or None for infinity",
@@ -70,7 +71,7 @@ def check_distance(distance: float | None) -> None:
 def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
     """Return pixels from corner to corner (rows, columns, 2).
 
-    Raises ``SHAPE``: fewer than 2 rows or columns, or more than 500.
+    Raises ``SHAPE`` if there are fewer than 2 rows or columns, or more than 500.
     """
     if len(shape) != 2 or not all(2 <= one <= MAX_MAP_SIDE for one in shape):
         raise Code.SHAPE.unexpected(
@@ -85,7 +86,7 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
 
 
 def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Array:
-    """Return the points (N, 3) that pixels (N, 2) show at a distance; at infinity directions.
+    """Return the points (N, 3) of pixels (N, 2) at a distance, or directions at infinity.
 
     NaN where no direction leads to a pixel: a lens' model may end before the image does, and the
     iteration that inverts it then ends elsewhere.
@@ -114,7 +115,7 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
 
 
 def known_points(points: Array) -> Array:
-    """Return the points of (N, 3) that a motion may be fitted to; ``OUT_OF_FIELD``: too few."""
+    """Return those points (N, 3) that are not NaN; raise ``OUT_OF_FIELD`` if they are too few."""
     known = points[np.isfinite(points).all(axis=1)]
     if len(known) < MIN_MOTION_PLACES:
         raise Code.OUT_OF_FIELD.refusal(

@@ -1,7 +1,7 @@
-"""Suggest the next view of the target: the one that makes the lens surest over its field.
+"""Suggest the next view of the target: the one that makes the lens most certain.
 
-Of many views that could be taken it is worked out how sure the lens would be with each, from what
-the calibration's covariance says and what the view would add, which takes no image.
+For each of many possible views the uncertainty of the lens with that view is computed, from the
+calibration's covariance and from the information that the view would add. That needs no image.
 """
 
 from __future__ import annotations
@@ -41,28 +41,30 @@ if TYPE_CHECKING:
 
 COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
 ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
-"""Rows to bring the target to, in parts of the way that it has in the image."""
+"""Rows that the target may be brought to, as parts of its range in the image."""
 
-FILLS: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
+SIZES: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
 """Parts of the image's width or height that the target may take."""
 
 MAX_TILT_DEG: Final = 35.0
-"""Degrees: more tells little more, and is hard to see."""
+"""Largest tilt of a suggested view, degrees: more adds little information and is hard to detect."""
 
 SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
-"""The target's side that is farther away, and about which axis of the camera it is tilted."""
+"""Side of the target that is farther away, and the camera's axis that the target is tilted
+about."""
 
 MARGIN_RATIO: Final = 0.02
-"""At each side of the image, this part of it stays free beside the target."""
+"""Each side of the image keeps this part free beside the target."""
 
 MAX_STEPS: Final = 12
-"""A target is brought to its place in this many steps; most are there after five."""
+"""A target is moved to its place in at most this many steps; most are there after five."""
 
-MAP: Final = (9, 12)
-"""Rows and columns of the field over which the uncertainty is counted."""
+MAP_SHAPE: Final = (9, 12)
+"""Rows and columns of the map over which the uncertainty is averaged."""
 
-MAX_SAME_RAY_ANGLE: Final = 1e-3
-"""Angle between a point and the ray of its pixel, radians, beyond which the lens' model folds."""
+MAX_SAME_RAY_RADIANS: Final = 1e-3
+"""A point that lies off the ray of its own pixel by more than this angle, radians, is where the
+lens' model is not valid."""
 
 
 class NextView(NamedTuple):
@@ -72,9 +74,8 @@ class NextView(NamedTuple):
         text: where and how the target is to be held, for people.
         transform: ``T_camera_target``.
         outline: (4, 2), the target's corners as they would be seen, pixels.
-        mean: uncertainty of a coordinate over the field with this view taken, root of the mean
-            square, pixels.
-        present: uncertainty of a coordinate over the field without this view, likewise, pixels.
+        mean: RMS uncertainty of a coordinate over the field with this view, pixels.
+        present: RMS uncertainty of a coordinate over the field without this view, pixels.
     """
 
     text: str
@@ -85,10 +86,10 @@ class NextView(NamedTuple):
 
 
 class CandidateViews(NamedTuple):
-    """Views that could be taken (C), all of whose points are in the image."""
+    """C views that could be taken; all of their points are inside of the image."""
 
     texts: list[str]
-    poses: Rigid  # T_camera_target
+    poses: Rigid  # ``T_camera_target`` of each
     outlines: Array  # (C, 4, 2), pixels
 
 
@@ -105,20 +106,20 @@ def suggest_views(
     roll: float = 0.0,
     target: Target | None = None,
 ) -> list[NextView]:
-    """Return views that could come next, the one that helps most first.
+    """Return views that could be taken next, the most useful one first.
 
-    Each is one of some hundred: nine places in the image, three distances, head-on and tilted to
-    four sides. It is taken to have the noise that the calibration's views have had, and all of the
-    target's points. What counts is :meth:`IntrinsicCalibration.uncertainty`, its mean.
+    They are taken from about a hundred: nine places in the image, three distances, head-on and
+    tilted to four sides. Each is assumed to show all of the target's points, with the noise of the
+    calibration's views. They are ranked by the mean of :meth:`IntrinsicCalibration.uncertainty`.
 
     Args:
         calibration: calibration from the views so far.
-        distance: distance at which the lens is to be sure, metres; None: infinity.
-        roll: turn of the target about the line of sight, radians; 0: upright.
-        target: target that is held; None: the target of the views.
+        distance: distance at which the uncertainty counts, metres; None: infinity.
+        roll: turn of the target about the line of sight, radians; 0 is upright.
+        target: the target to be shown; None: that of the views.
 
     Raises:
-        CalibrationError: ``NOT_FINITE``: no such distance.
+        CalibrationError: ``NOT_FINITE``: the distance is not valid.
     """
     check_distance(distance)
     camera = calibration.camera
@@ -145,25 +146,26 @@ def suggest_views(
 
 
 def _variance(calibration: IntrinsicCalibration) -> float:
-    """Return the variance of a coordinate that the views so far have had, pixels^2."""
+    """Return the variance of a coordinate in the views so far, pixels^2."""
     sigmas = np.concatenate([one.view.sigmas for one in calibration.views if one.used])
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
 def _fitted(covariance: Array) -> Array:
-    """Return by how much each value changes with each of those that were fitted (4 + K, F)."""
+    """Return the derivatives (4 + K, F) of all values by those that were fitted."""
     columns, held = np.eye(len(covariance)), np.diag(covariance) <= 0.0
-    if not held[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):  # fx and fy are one
+    # fx and fy are one unknown
+    if not held[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):
         columns[1, 0], held[1] = 1.0, True
     fitted: Array = columns[:, ~held]
     return fitted
 
 
 def _known(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, float]:
-    """Return the covariance of the fitted values (F, F), and times how much of noise alone it is.
+    """Return the covariance of the fitted values (F, F), and its ratio to that of noise alone.
 
-    As V views tell no more than V directions of the values, it is theirs by V / (V + F), and else
-    what the noise of points leads to, that many times.
+    V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it
+    comes from the views' scatter, the rest from the noise of the points times that ratio.
     """
     used = [one for one in calibration.views if one.used]
     points = None
@@ -183,9 +185,9 @@ def _known(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, floa
 
 
 def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Array:
-    """Return M with which ``trace(C M)`` is the mean of both coordinates' variances, of C."""
+    """Return M such that ``trace(C M)`` is the mean variance of a coordinate for a covariance C."""
     camera = calibration.camera
-    points = points_at(camera, places(camera.size, MAP).reshape(-1, 2), distance)
+    points = points_at(camera, places(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
     field = sensitivity(camera, known_points(points), far=distance is None)
     freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
     found: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
@@ -194,7 +196,7 @@ def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Arr
 
 def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:
     """Return each view's information on the fitted values (C, F, F), at a variance of 1 pixel^2."""
-    # The pose is unknown, too: what is left of B^T B is B^T B - B^T A (A^T A)^-1 A^T B.
+    # The pose is unknown, too, so that B^T B becomes B^T B - B^T A (A^T A)^-1 A^T B.
     shape = (poses.size, 2 * len(points), -1)
     turned = points @ poses.rotation.swapaxes(1, 2)
     there = (turned + poses.translation[:, None]).reshape(-1, 3)
@@ -210,7 +212,7 @@ def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array
 
 
 def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> CandidateViews:
-    """Return views that a camera could have of a target, ``roll`` about the line of sight."""
+    """Return possible views of a target that is turned by ``roll`` about the line of sight."""
     low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
     centre = np.append((low + high) / 2, 0.0)
     half = (high - low) / 2
@@ -219,7 +221,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     )
     around = np.column_stack([rim * half, np.zeros(len(rim))])
     tilts = {"": (0.0, 0.0), **SIDES}
-    ways = list(itertools.product(FILLS, ROWS, COLUMNS, tilts))
+    ways = list(itertools.product(SIZES, ROWS, COLUMNS, tilts))
     turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(MAX_TILT_DEG)
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
@@ -238,10 +240,10 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
 
 
 def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> Array:
-    """Return the middles of targets (C, 3) that make them appear where they are to be.
+    """Return the centres (C, 3) at which targets appear in the wanted places.
 
-    ``turned`` (C, 8, 3): their rims about their middles, in the camera's axes. ``fills`` (C,) and
-    ``parts`` (C, 2): how large, and where of the way that is left beside them.
+    ``turned`` (C, 8, 3): their rims around their centres, in the camera's axes. ``fills`` (C,) says
+    how much of the image they take, ``parts`` (C, 2) their place within the room that is left.
     """
     size = np.array(camera.size, dtype=np.float64)
     extent = float(np.linalg.norm(turned, axis=2).max())
@@ -265,14 +267,14 @@ def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> A
 
 
 def _visible(camera: CameraModel, points: Array) -> Mask:
-    """Return a mask of views whose points (C, N, 3) are in the image and on their pixels' rays."""
+    """Return a mask of views whose points (C, N, 3) lie in the image, where the model is valid."""
     flat = points.reshape(-1, 3)
     seen = camera.project(flat)
     inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)
     back = points_at(camera, np.where(inside, seen, 0.0), None)
     ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
     off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
-    good: Mask = off.max(axis=1) < MAX_SAME_RAY_ANGLE
+    good: Mask = off.max(axis=1) < MAX_SAME_RAY_RADIANS
     return good
 
 
@@ -287,4 +289,4 @@ def _words(fill: float, row: float, column: float, side: str, roll: float) -> st
     tilted = f"tilted by {MAX_TILT_DEG:.0f} degrees, its {side} side farther away"
     tilt = tilted if side else "not tilted"
     turned = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
-    return f"{place}, {FILLS[fill]}, {tilt}{turned}"
+    return f"{place}, {SIZES[fill]}, {tilt}{turned}"

@@ -1,4 +1,4 @@
-"""A camera's lens from views of a printed target."""
+"""Calibrate a camera's lens from views of a printed target."""
 
 from __future__ import annotations
 
@@ -45,28 +45,32 @@ Bar = Annotated[storage.NonNegative, Field(le=1)]
 BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
 
 MIN_VIEWS: Final = 3
-"""Two views without noise determine a lens; a third one shows the noise."""
+"""At least this many views are needed: two without noise determine a lens, a third one shows the
+noise."""
 
 MIN_TILT_RADIANS: Final = math.radians(5.0)
-"""Least angle between the steepest two planes; parallel ones leave the focal length open."""
+"""The two most different planes must enclose this angle: parallel planes leave the focal length
+open."""
 
 MIN_MOTION_SHARE: Final = 0.02
 """Views whose points are closer together than this part of the image's longer side are one view."""
 
 MAX_FOCAL_SIGMA_RATIO: Final = 0.1
-"""Standard deviation of the focal length over itself, beyond which it is not determined."""
+"""The focal length is not determined if its standard deviation is more than this part of it."""
 
 BAD_VIEW_RATIO: Final = 3.0
-"""Weighted rms of a view over the median of the others: healthy ones reach 1.6 (measured)."""
+"""A view is bad if its weighted RMS is more than this many times the median of the others: healthy
+ones reach 1.6 (measured)."""
 
 MAX_BAD_VIEW_SHARE: Final = 1 / 3
 """At most this part of the views may be left out."""
 
 MIN_REACHED_SHARE: Final = 0.9
-"""Part of the image that the lens' model reaches without a word: wide lenses may miss corners."""
+"""If the lens' model reaches less than this part of the image, a warning says so: wide lenses may
+miss corners."""
 
 POOR_FIT_RMS_PX: Final = 1.0
-"""Pixels rms, beyond which the model of the lens, or the sheet, is not what it should be."""
+"""Residual RMS, pixels, above which the model of the lens, or the sheet, may be wrong."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,13 +78,13 @@ class ViewFit(storage.Stored):
     """The fit of a lens to one view.
 
     Attributes:
-        view: the view as given, without points that a remark ``OUTLIER`` says were not used.
+        view: the view as given, without the points that an ``OUTLIER`` warning names.
         used: whether the lens is fitted to it; False for a bad view.
         transform: ``T_camera_target``.
         residuals: (N, 2), seen minus projected, pixels.
-        rms: rms of a coordinate of ``residuals``, pixels, their freedom taken off.
-        held_out: rms of a coordinate for a lens that was fitted without this view, where the pose
-            alone is fitted to it, pixels; NaN where there were too few other views.
+        rms: RMS of a coordinate of ``residuals``, pixels, corrected for their degrees of freedom.
+        held_out: RMS of a coordinate, pixels, for a lens that was fitted without this view, after
+            fitting only the pose to it; NaN if there were too few other views.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -100,22 +104,22 @@ class IntrinsicCalibration(storage.SavedCalibration):
     Attributes:
         camera: the lens.
         covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients, from how much each view
-            changes them (a jackknife): errors that all points of a view share are in it, as where
-            the sheet bends anew. 0 for what was not fitted. Of V views it has the rank V at most,
-            and of few it is rough: of ten by a quarter.
-        views: one for each given view, in their order.
-        rms: rms of the residuals of the used views, their freedom taken off: the standard deviation
-            of a coordinate, pixels. It is no accuracy: see ``held_out``.
-        sigma: standard deviation of a coordinate that the points' covariance does not explain,
-            pixels: the lens or the sheet is not quite as modelled, or the points have more noise
-            than they say.
-        held_out: held-out error, rms of a coordinate over all used views, pixels; see
-            :attr:`ViewFit.held_out`. The six parameters of each held-out pose are taken off the
-            freedom. NaN where there were too few views.
-        coverage: where and how the target was shown.
-        sheet: (T, 3), how far the target's points are from where they were meant to be, metres;
-            None where they are taken as meant.
-        warnings: what one should know.
+            changes them (a jackknife). It includes errors that all points of a view share, such as
+            a sheet that bends anew. It is 0 for values that were not fitted. From V views its rank
+            is at most V, and from few views it is rough: from ten it is known to a quarter.
+        views: fit of each given view, in their order.
+        rms: RMS of a coordinate of the residuals of the used views, pixels, corrected for their
+            degrees of freedom. It is not the accuracy: see ``held_out``.
+        sigma: standard deviation of a coordinate, pixels, that the points' covariance does not
+            explain: the lens or the sheet is not quite as modelled, or the points have more noise
+            than their covariance says.
+        held_out: held-out error, RMS of a coordinate over all used views, pixels; see
+            :attr:`ViewFit.held_out`. It is corrected for the six parameters of each held-out pose.
+            NaN if there were too few views.
+        coverage: range of places, sizes and tilts in which the target was shown.
+        sheet: (T, 3), offsets of the target's points from where they were meant to be, metres; None
+            if they are taken as exact.
+        warnings: remarks to read before using the calibration.
     """
 
     kind: ClassVar[str] = "camera"
@@ -138,9 +142,9 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def deviations(self) -> dict[str, float]:
         """Standard deviations by name: ``fx``, ``fy``, ``cx``, ``cy`` in pixels, ``k1``, ...
 
-        They hold to first order. The coefficients ``k1`` to ``k6`` of ``rational_polynomial`` make
-        up for each other so far that they may be tens of these deviations off the true ones, while
-        the lens they describe together, and ``fx`` to ``cy``, are right.
+        They hold to first order. The coefficients ``k1`` to ``k6`` of ``rational_polynomial``
+        compensate each other so much that each may be tens of its deviations off the true value,
+        while ``fx`` to ``cy``, and the lens that the coefficients describe together, are right.
         """
         names = parameter_names(self.camera.distortion_model)
         values = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
@@ -156,20 +160,21 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def uncertainty(
         self, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
     ) -> ProjectionUncertainty:
-        """Return the uncertainty of where the lens projects, as a map over its field.
+        """Return a map of the uncertainty with which the lens projects, over its field.
 
-        It follows from ``covariance`` for a fixed point. A small motion of the camera, the one that
-        fits best to the target's points where they were seen, is taken off, since every pose that
-        is found with this lens makes up for it. It is least at the distances at which the target
-        was. Where it never was, the map shows what the lens' model makes of that, and no covariance
-        knows whether a model fits there.
+        It is computed from ``covariance``, for a fixed point. A small motion of the camera, the one
+        that fits best to the target's points, is removed, since every pose that is found with this
+        lens compensates it. The uncertainty is least at the distances at which the target was
+        shown. Where it was never shown, the map extrapolates the lens' model, and no covariance can
+        say whether the model fits there.
 
         Args:
             distance: distance of the points from the camera, metres; None: infinity.
             shape: rows and columns of the map, 2 to 500 each, from corner to corner.
 
         Raises:
-            CalibrationError: ``NOT_FINITE``: no such distance; ``SHAPE``: no such rows and columns.
+            CalibrationError: ``NOT_FINITE``: the distance is not valid; ``SHAPE``: the rows or
+                columns are not.
         """
         return uncertainty(
             self.camera, self.covariance, self.target_points, distance=distance, shape=shape
@@ -177,26 +182,26 @@ class IntrinsicCalibration(storage.SavedCalibration):
 
     @property
     def target_points(self) -> Array:
-        """(N, 3), where the target's points were before the camera, of all used views, metres."""
+        """Places of the target's points in the camera's frame, all used views, (N, 3), metres."""
         return np.concatenate(
             [one.transform.apply(one.view.object_points) for one in self.views if one.used]
         )
 
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
-        """Return by how much the lens is off at any views.
+        """Return the errors of the lens at any views.
 
-        Views that it was not fitted to tell how good it is. The pose of the target alone is fitted
-        to each, as for :attr:`ViewFit.held_out`.
+        Views that the lens was not fitted to show how good it is. Only the pose of the target is
+        fitted to each, as for :attr:`ViewFit.held_out`.
 
         Args:
-            views: views of any target; of the same one where its points were adjusted (``sheet``).
+            views: views of any target; of the same one if its points were adjusted (``sheet``).
 
         Returns:
-            Of each view (N, 2), seen minus projected, pixels: 2 N - 6 of them are free.
+            For each view (N, 2), seen minus projected, pixels, with 2 N - 6 degrees of freedom.
 
         Raises:
-            CalibrationError: ``DIFFERENT_TARGETS``; and what
-                :func:`~smartcam.calibration.locate` says.
+            CalibrationError: ``DIFFERENT_TARGETS``; and those of
+                :func:`~smartcam.calibration.locate`.
         """
         return tuple(self._errors(one) for one in views)
 
@@ -239,15 +244,16 @@ def calibrate_intrinsics(
     sheet: Sheet = "auto",
     drop_bad: bool = True,
 ) -> IntrinsicCalibration:
-    """Return the lens that shows the target's points where the views have them.
+    """Calibrate a lens from views of a target.
 
-    The reprojection error is made least, each point weighted by its covariance and by what the
-    residuals show beside it. The order of the views does not matter. Points that are far from where
-    the others of their view have them are left out and named (``OUTLIER``). A view of a
-    target that looks the same after half a turn may number its points from either end.
+    The reprojection error is minimized; each point is weighted by its covariance, and by the
+    additional variance that the residuals show. The order of the views does not matter. Points that
+    lie far from where the others of their view predict them are left out and named (``OUTLIER``). A
+    view of a target that looks the same after half a turn may number its points from either end.
 
-    Where *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
-    does, nothing tells: the lens is that of the flipped pictures, and right for those alone.
+    If *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
+    does, nothing can show it: the lens is then that of the flipped pictures, and right only for
+    those.
 
     Args:
         views: views of one target, 3 or more, of images of one size; tilted in several directions,
@@ -255,12 +261,11 @@ def calibrate_intrinsics(
         distortion_model: ``plumb_bob`` for most lenses, ``rational_polynomial`` for wide ones,
             ``equidistant`` for fisheyes.
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
-        sheet: ``auto``: whether the target's points are adjusted, too, is chosen by the held-out
-            error, and they are where that lessens it by more than chance; printers stretch, and
-            paper bends. Points that few views show stay near where they were meant to be.
-            ``exact``: they are there. ``free``: they are adjusted. Where the held-out error denies
-            that they are where they were meant to be, ``SHEET_NOT_EXACT`` among the warnings says
-            so. Targets of more than 1000 points are taken as exact, untested.
+        sheet: whether the target's points are adjusted, too, since printers stretch and paper
+            bends. ``auto``: if that lowers the held-out error by more than chance. ``exact``:
+            never. ``free``: always. Adjusted points that few views show stay near where they were
+            meant to be. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an
+            exact sheet. Targets of more than 1000 points are taken as exact, untested.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named.
 
@@ -268,9 +273,9 @@ def calibrate_intrinsics(
         CalibrationError: ``TOO_FEW`` views or points; ``COLLINEAR`` points of a view;
             ``WRONG_SIZE``: images of several sizes; ``DIFFERENT_TARGETS``; ``POSES_TOO_SIMILAR``:
             the views are nearly the same; ``INSUFFICIENT_ROTATION``: the target was never tilted,
-            or so little that the focal length stays open; ``SHAPE``: no such coefficient, no such
-            model, or something else than views; ``NOT_FINITE`` pixels; ``MIRRORED``: a view as in a
-            mirror; ``POOR_FIT``: no lens of this model shows them.
+            or so little that the focal length stays open; ``SHAPE``: the coefficient or the model
+            is unknown, or these are no views; ``NOT_FINITE`` pixels; ``MIRRORED``: a view shows the
+            target as in a mirror; ``POOR_FIT``: no lens of this model fits the views.
     """
     given = as_views(views, "intrinsics")
     check_choice(sheet, get_args(Sheet), "sheet")
@@ -304,10 +309,10 @@ def calibrate_intrinsics(
 def check_views(
     views: Sequence[TargetView], what: str, least: int, size: tuple[int, int] | None = None
 ) -> None:
-    """Refuse views that do not belong together, or one that is of no use; ``what`` is for texts.
+    """Refuse views that do not belong together, and unusable ones; ``what`` is for messages.
 
-    ``least``: number of views. ``size``: of the images, pixels; None: that of the first one. Raises
-    ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
+    ``least``: least number of views. ``size``: size of the images, pixels; None: that of the first.
+    Raises ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
     if len(views) < least:
         raise Code.TOO_FEW.unexpected(f"{what}: expected {least} views or more", least, len(views))
@@ -343,7 +348,7 @@ def _check_motion(views: Sequence[TargetView]) -> None:
 def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
     """Refuse views of parallel planes, and a focal length that is not determined.
 
-    Raises ``INSUFFICIENT_ROTATION``; ``what`` is for the texts.
+    Raises ``INSUFFICIENT_ROTATION``; ``what`` is for messages.
     """
     normals = adjusted.bundle.poses.rotation[:, :, 2]
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
@@ -372,7 +377,7 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
 
 
 def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[int, float]:
-    """Return the view that fits worst, and its weighted rms over the median of the others."""
+    """Return the worst view, and its weighted RMS over the median of the others."""
     found = [
         weighted_rms(view, residuals, adjusted.more)
         for view, residuals in zip(views, adjusted.residuals, strict=True)
@@ -438,7 +443,7 @@ def _view_fit(
     place: int = 0,
     held_out: float = math.nan,
 ) -> ViewFit:
-    """Return a view's fit to the lens; a bad one's by the pose alone."""
+    """Return the fit of the lens to a view; for a bad view only its pose is fitted."""
     if adjusted is None:
         pose = locate(view, camera)
         transform, residuals, held_out = pose.transform, pose.residuals, pose.rms
@@ -456,7 +461,7 @@ def _view_fit(
 
 
 def _outline(fit: ViewFit, camera: CameraModel) -> Array:
-    """Return the target's four outer points (4, 2), hidden ones, too."""
+    """Return the target's four outer points (4, 2), also those that were hidden."""
     low, high = fit.view.target.points.min(axis=0), fit.view.target.points.max(axis=0)
     corners = np.array(
         [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]

@@ -1,8 +1,9 @@
-"""Explanations of views that fit a lens worse than noise would: flipped pictures, a zoom, or else.
+"""Explain views that fit a lens worse than noise would: flipped pictures, a zoom, or others.
 
-What is likely is no proof. So it is a remark, and says what else was tried: sheets that bend anew,
-a shutter that rolls, a lens of another model. All is told by what the pose of each view cannot make
-up for: its part of the residuals, and of what any of these would change, is taken off first.
+The likeliest explanation is not proven. So it is given as a warning, which says what else was
+tried: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each view is
+eliminated first, from the residuals and from the changes that each cause would make, so only what
+no pose can compensate is compared.
 """
 
 from __future__ import annotations
@@ -35,47 +36,48 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-WAYS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
+FLIPS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
 """Ways to flip a picture, each with the axes of the image whose direction changes."""
 
 DEFORMATIONS: Final = 5
-"""Number of ways in which a sheet deforms: x stretches, y leans, and three ways to bend."""
+"""Number of ways in which a sheet deforms: stretching along x, shearing, and three ways to bend."""
 
 SHUTTER: Final = 2
-"""Ways in which a picture leans and stretches from row to row, where the shutter rolls."""
+"""Number of ways in which a rolling shutter deforms a picture: leaning and stretching from row to
+row."""
 
-FURTHER: Final = DEFORMATIONS + SHUTTER + SMOOTH
-"""Values beside a lens' own by which its misfit may be explained."""
+FURTHER_VALUES: Final = DEFORMATIONS + SHUTTER + SMOOTH
+"""Number of values, beyond those of the lens, that may explain its misfit."""
 
 MIN_VIEWS_TO_EXPLAIN: Final = 4
-"""Views, of which the misfit is explained at all."""
+"""The misfit of fewer views than this is not explained."""
 
 ZOOM_COST_RATIO: Final = 1.5
-"""Squares over those with two focal lengths, from which on these are told: recorded views reach
-1.08, a shutter that rolls 1.32, a zoom of 3 % 1.87 (measured)."""
+"""A zoom is reported if two focal lengths reduce the squares by this factor: recorded views reach
+1.08, a rolling shutter 1.32, a zoom of 3 % 1.87 (measured)."""
 
 FITTED_COST_RATIO: Final = 1.2
-"""Squares over those with a lens that is fitted to the views, from which on a known one is wrong:
-lenses from other views reach 1.04 on recorded pairs, a focal length that is 1 % off 2 where noise
-is 0.05 pixels."""
+"""A known lens is wrong if one fitted to the views reduces the squares by this factor: lenses from
+other views reach 1.04 on recorded pairs; a focal length that is 1 % off reaches 2 with a noise of
+0.05 pixels."""
 
 MIN_VIEWS_FOR_LENS: Final = 3
-"""Views that such a lens is fitted to at least."""
+"""A lens for that comparison is fitted to at least this many views."""
 
 MAX_ROUNDS: Final = 20
-"""Most rounds in which lens and flips are chosen in turn."""
+"""Lens and flips are chosen in turn, in at most this many rounds."""
 
 
 class Fitted(NamedTuple):
-    """A view and what was fitted to it."""
+    """A view, with the pose and the points that were fitted to it."""
 
     view: TargetView
     camera: CameraModel
     pose: Rigid  # ``T_camera_target``
-    points: Array  # (T, 3), of the target, metres
+    points: Array  # (T, 3), points of the target, metres
 
     def equations(self, more: float) -> Equations:
-        """Return the view's equations; ``more``: variance beside the points' own, pixels^2."""
+        """Return the view's equations; ``more``: variance added to the points' own, pixels^2."""
         flat = self.points[self.view.ids]
         turned = flat @ self.pose.rotation.T
         seen = linearize(turned + self.pose.translation, self.camera)
@@ -92,7 +94,7 @@ class Fitted(NamedTuple):
 
 
 def _deformations(flat: Array) -> Array:
-    """Return the moves of points (N, 3) as the sheet stretches, shears and bends (N, 3, D)."""
+    """Return the moves of points (N, 3) as the sheet stretches, shears and bends, (N, 3, D)."""
     x, y = (flat[:, :2] / np.ptp(flat, axis=0).max()).T
     moves = np.zeros((len(flat), 3, DEFORMATIONS))
     moves[:, 0, 0], moves[:, 0, 1] = x, y
@@ -103,35 +105,35 @@ def _deformations(flat: Array) -> Array:
 class Equations(NamedTuple):
     """The linear equations of one view, in standard deviations."""
 
-    by_pose: Array  # (N, 2, 6)
-    # (N, 2, ...), by the lens' values, deformations of the sheet, a shutter that rolls, and smooth
-    # changes of the image
+    by_pose: Array  # (N, 2, 6), derivatives by the pose
+    # (N, 2, ...), derivatives by the lens' values, deformations of the sheet, a rolling shutter,
+    # and smooth changes of the image
     by_shared: Array
     residuals: Array  # (N, 2), seen minus projected
-    deviations: Array  # (N,), what one of them is, pixels
+    deviations: Array  # (N,), standard deviation of each point, pixels
 
 
 def lens_alone(equations: Equations) -> Mask:
-    """Return a mask of the shared unknowns that are a lens' values."""
+    """Return a mask of the shared unknowns that are values of the lens."""
     count = equations.by_shared.shape[2]
-    of_lens: Mask = np.arange(count) < count - FURTHER
+    of_lens: Mask = np.arange(count) < count - FURTHER_VALUES
     return of_lens
 
 
 class Reduced(NamedTuple):
     """Normal equations of views for the values of a lens and a sheet, without their poses.
 
-    Where the values change by x, the weighted squares of view i are
-    ``squares[i] - 2 right[i] x + x matrix[i] x``.
+    If the values change by x, the weighted squares of view i are ``squares[i] - 2 right[i] x + x
+    matrix[i] x``.
     """
 
-    matrix: Array  # (V, L, L)
-    right: Array  # (V, L)
-    squares: Array  # (V,)
+    matrix: Array  # (V, L, L), J^T J
+    right: Array  # (V, L), J^T r
+    squares: Array  # (V,), weighted squares before any change
 
     @classmethod
     def of(cls, equations: Sequence[Equations]) -> Reduced:
-        """Return the reduced equations of views, the best pose of each taken in."""
+        """Return the equations of views after eliminating the pose of each."""
         parts = []
         for one in equations:
             rows = one.by_pose.reshape(-1, 6)
@@ -142,14 +144,14 @@ class Reduced(NamedTuple):
         return cls(found[:, :-1, :-1], found[:, :-1, -1], found[:, -1, -1])
 
     def misfits(self, change: Array) -> Array:
-        """Return the weighted squares of each view (V,) where the values change by (L,)."""
+        """Return the weighted squares of each view (V,) if the values change by (L,)."""
         misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
         return misfits
 
     def best(self, free: Mask, places: Sequence[int] = ()) -> tuple[Array, float]:
-        """Return the change of the free values (L,) with the least squares, and these.
+        """Return the change of the free values (L,) with the least squares, and those squares.
 
-        At some places each view may have a value of its own.
+        The values at the indices ``places`` may differ between the views.
         """
         # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
@@ -165,25 +167,25 @@ class Reduced(NamedTuple):
 
 
 class _FlippedLens(NamedTuple):
-    """Change of a lens' values by a flip: by ``shift``, and of their changes by ``mirror``."""
+    """Effect of a flip on a lens' values: ``shift`` is added, ``mirror`` a factor of changes."""
 
-    mirror: Array  # (L,), 1 or -1
-    shift: Array  # (L,)
+    mirror: Array  # (L,), 1 or -1 for each value
+    shift: Array  # (L,), in the unit of each value
 
     @classmethod
     def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
-        """Return the changes of a lens' values that flipping pictures along some axes makes."""
-        values = np.concatenate([lens_values(camera), np.zeros(FURTHER)])
+        """Return the effect of flipping pictures along some axes."""
+        values = np.concatenate([lens_values(camera), np.zeros(FURTHER_VALUES)])
         mirror, goal = np.ones(len(values)), values.copy()
         for axis in axes:
             mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
             if camera.distortion_model != "equidistant":
-                place = (7, 6)[axis]  # p2 stands for a tilt along x, p1 for one along y
+                place = (7, 6)[axis]  # p2 describes a tilt along x, p1 one along y
                 mirror[place], goal[place] = -1.0, -values[place]
         return cls(mirror, goal - values)
 
     def best(self, reduced: Reduced, free: Mask, flipped: Mask) -> tuple[Mask, float]:
-        """Return a mask of views that are better flipped, from a guess, and the squares of all."""
+        """Improve a guess which views are flipped; return the mask and the squares of all views."""
         # Lens and flips are chosen in turn, which only lowers the squares.
         # Source: Lloyd, Least Squares Quantization in PCM (1982).
         basis = np.eye(len(self.mirror))[:, free]
@@ -208,21 +210,21 @@ def misfit_remarks(
 ) -> Iterator[Remark]:
     """Yield a remark if flipped pictures, or a zoom, explain the views better than all else.
 
-    A picture of a board that looks the same in a mirror is found when it is flipped, too; its
-    points are then what a camera with a mirrored lens sees. But so large a misfit has other causes,
-    too: each is fitted as well, and what explains it best counts.
+    In a flipped picture a board is found as well if it looks the same in a mirror; its points are
+    then those of a camera with a mirrored lens. But a misfit that large may have other causes: each
+    is fitted as well, and the one that explains most counts.
 
-    ``more``: variance beside the points' own, pixels^2. ``free`` (4 + K,): the lens' values that
-    were fitted. ``names``: of the views.
+    ``more``: variance in addition to the points' own, pixels^2. ``free`` (4 + K,): mask of the
+    lens' values that were fitted. ``names``: names of the views.
     """
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
     equations = [one.equations(more) for one in fitted]
     reduced, count = Reduced.of(equations), sum(one.residuals.size for one in equations)
     lens, views = len(free), len(fitted)
-    places = np.split(lens + np.arange(FURTHER), np.cumsum([DEFORMATIONS, SHUTTER]))
+    places = np.split(lens + np.arange(FURTHER_VALUES), np.cumsum([DEFORMATIONS, SHUTTER]))
     sheet, shutter, smooth = (one.tolist() for one in places)
-    usual = np.zeros(lens + FURTHER, dtype=np.bool_)
+    usual = np.zeros(lens + FURTHER_VALUES, dtype=np.bool_)
     usual[:lens], usual[sheet] = free, True
     other = usual.copy()
     other[smooth] = True
@@ -250,10 +252,10 @@ def misfit_remarks(
             f"{before / max(after, 1e-300):.3g} {told}"
         )
         return
-    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in WAYS.values()]
+    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in FLIPS.values()]
     tried = [
         (how, *min((flip.best(reduced, usual, one) for one in guesses), key=lambda one: one[1]))
-        for (how, axes), flip in zip(WAYS.items(), flips, strict=True)
+        for (how, axes), flip in zip(FLIPS.items(), flips, strict=True)
         for guesses in [list(_guesses(reduced, [2 + axis for axis in axes]))]
     ]
     how, flipped, after = min(tried, key=lambda one: one[2])
@@ -267,7 +269,7 @@ def misfit_remarks(
 
 
 def _zoomed(reduced: Reduced, free: Mask) -> tuple[int, float]:
-    """Return from which view on focal lengths of their own explain most, and the squares then."""
+    """Return the view from which on other focal lengths explain most, and the squares with them."""
     found = []
     for first in range(2, len(reduced.squares) - 1):
         parts = [slice(None, first), slice(first, None)]
@@ -277,7 +279,7 @@ def _zoomed(reduced: Reduced, free: Mask) -> tuple[int, float]:
 
 
 def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
-    """Yield views that may be flipped: those that want the principal point elsewhere."""
+    """Yield guesses which views are flipped: those that fit another principal point."""
     for place in places:
         weight = np.maximum(reduced.matrix[:, place, place], np.finfo(np.float64).tiny)
         wish = reduced.right[:, place] / weight
@@ -289,8 +291,8 @@ def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
 def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[Remark]:
     """Yield a remark if a known lens is not the camera's (``WRONG_LENS``).
 
-    ``fitted``: the views that it shows; ``what``: it is, for texts; ``more``: variance beside their
-    points' own, pixels^2.
+    ``fitted``: views through that lens; ``what``: name of the lens, for messages; ``more``:
+    variance in addition to the points' own, pixels^2.
     """
     if len(fitted) < MIN_VIEWS_FOR_LENS:
         return

@@ -1,4 +1,4 @@
-"""Locate a target before a camera of known lens."""
+"""Locate a target in front of a camera with a known lens."""
 
 from __future__ import annotations
 
@@ -33,26 +33,27 @@ TARGET: Final = "target"
 PoseInCamera = Annotated[Transform, storage.motion(lambda _: (CAMERA, TARGET))]
 
 MIN_POINTS: Final = 4
-"""A plane's pose has need of four of its points."""
+"""The pose of a plane needs at least this many of its points."""
 
 MIN_SPREAD_RATIO: Final = 1e-3
 """Points are on a line if their spread across it is less than this part of the spread along it."""
 
 MAX_OUTSIDE_RATIO: Final = 0.1
-"""Part of the image's sides by which a point may lie outside of it."""
+"""A point may lie outside of the image by this part of the image's sides."""
 
 MIN_AGREEMENT: Final = 0.5
-"""A view's agreement with its target must be below minus this; above plus this the view shows the
-sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
+"""The agreement of a view with its target, from -1 to 1, must be below minus this value; above plus
+this value the view shows the sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
 
-MAX_NUDGE: Final = 1e-9
-"""Rays are moved by at most this part of the focal length to keep a solver from rounding errors."""
+MAX_RAY_SHIFT_RATIO: Final = 1e-9
+"""Rays are moved by at most this part of the focal length, to avoid rounding errors in a solver."""
 
 MAX_UNSURE_RATIO: Final = 4.0
-"""Squares of residuals of one pose over those of the other, up to which both are refined first."""
+"""Both poses are refined if the squared residuals of one are at most this many times those of the
+other."""
 
-MAX_SAME_TURN: Final = 1e-3
-"""Turn between two poses, rad, up to which both are the same minimum."""
+MAX_SAME_TURN_RADIANS: Final = 1e-3
+"""Two poses turned by less than this angle, rad, are the same minimum."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,15 +63,14 @@ class TargetPose:
     Attributes:
         transform: ``T_camera_target``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the target in the camera's frame:
-            the rotation is ``exp([turn]x) R``. It follows from the points' covariance, and is
-            larger where the residuals are larger than that explains. Errors of the lens are not in
-            it.
+            the rotation is ``exp([turn]x) R``. It is computed from the points' covariance, enlarged
+            if the residuals are larger than that explains. It does not include errors of the lens.
         residuals: (N, 2), seen minus projected, pixels.
-        rms: rms of the residuals' lengths over sqrt(2), their freedom taken off: the standard
-            deviation of a coordinate, pixels.
-        ambiguity: rms of this pose over that of the other one that a plane far away or seen head-on
-            may have: near 1 where the points cannot tell which is right; 0 where there is no other.
-        other: the other pose; None where there is none.
+        rms: RMS of a coordinate of the residuals, pixels, corrected for their degrees of freedom.
+        ambiguity: RMS of this pose over that of the other possible pose, which a plane far away or
+            seen head-on has: near 1 if the points cannot show which is right; 0 if there is no
+            other.
+        other: the other possible pose; None if there is none.
     """
 
     transform: Transform
@@ -84,8 +84,9 @@ class TargetPose:
 def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     """Return the pose of a target in the camera's frame.
 
-    Both poses that a plane's image leaves open are refined by the reprojection error, each point
-    weighted by its covariance and by what the residuals show beside it; the better one counts.
+    The image of a plane is explained by two poses. Both are refined by the reprojection error, each
+    point weighted by its covariance and by the additional variance that the residuals show; the
+    better one is returned.
 
     Args:
         view: view of at least 4 points of the target that are not on a line.
@@ -94,8 +95,8 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     Raises:
         CalibrationError: ``TOO_FEW`` points; ``COLLINEAR`` points; ``WRONG_SIZE``: the image has
             another size than the camera's, or points lie far outside of it; ``MIRRORED``: the
-            picture was flipped; ``POOR_FIT``: the points are taken for others, or no pose puts them
-            before the camera; ``SHAPE``: no view, or no camera.
+            picture was flipped; ``POOR_FIT``: the points have wrong numbers, or no pose puts them
+            in front of the camera; ``SHAPE``: the arguments are no view and no camera.
     """
     checked(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
@@ -117,7 +118,8 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         found = [adjust(one.bundle, sights, more) for one in found]
     best, pose = found[0], found[0].bundle.poses
     other = next(
-        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN), None
+        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
+        None,
     )
     rms = view_rms(best.residuals[0])
     return TargetPose(
@@ -135,15 +137,15 @@ def _transform(one: AdjustedBundle) -> Transform:
 
 
 def view_rms(residuals: Array) -> float:
-    """Return the rms of a coordinate of residuals (N, 2), six for the pose taken off."""
+    """Return the RMS of a coordinate of residuals (N, 2), corrected for the six of a pose."""
     # E[sum r^2] = sigma^2 (2 N - 6): each fitted parameter takes one square away.
     return math.sqrt(float((residuals**2).sum()) / (2 * len(residuals) - 6))
 
 
 def check_view(view: TargetView, size: tuple[int, int]) -> None:
-    """Refuse a view that leaves the pose open, or whose image is not of a size (pixels).
+    """Refuse a view that does not determine the pose, or whose image has not ``size``, pixels.
 
-    Raises as :func:`locate` says.
+    Raises the errors of :func:`locate`.
     """
     called = f"pose of the target{_of(checked(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
@@ -170,7 +172,7 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
 
 
 def _check_inside(view: TargetView, called: str) -> None:
-    """Refuse points (``WRONG_SIZE``) that are far outside of the image."""
+    """Raise ``WRONG_SIZE`` for points that are far outside of the image."""
     sides = np.array(view.size)
     off = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
     row = int(np.argmax(off))
@@ -185,7 +187,7 @@ def _check_inside(view: TargetView, called: str) -> None:
 
 
 def _check_sides(view: TargetView, called: str) -> None:
-    """Refuse the sheet in a mirror (``MIRRORED``), and points taken for others (``POOR_FIT``)."""
+    """Raise ``MIRRORED`` for a mirrored sheet, and ``POOR_FIT`` for points with wrong numbers."""
     turn = view.agreement
     if turn > MIN_AGREEMENT:
         raise Code.MIRRORED.refusal(
@@ -221,7 +223,7 @@ def _of(view: TargetView) -> str:
 
 
 def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
-    """Return the two poses that a plane's image leaves open, each in an array of one.
+    """Return the two poses that explain a plane's image, each in an array of one.
 
     The likelier one comes first.
 
@@ -229,15 +231,17 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     """
     rays = camera.directions(view.points)
     found = _ippe(view.object_points, rays)
-    if not found:  # on exact rays OpenCV takes the root of a negative rounding error
-        found = _ippe(view.object_points, rays + MAX_NUDGE * np.sin(np.arange(len(rays)))[:, None])
+    if not found:  # with exact rays OpenCV would take the root of a negative rounding error
+        found = _ippe(
+            view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
+        )
     return found
 
 
 def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
-    """Return of each view the pose that shows its points where they are, not yet refined.
+    """Return the likelier of the two poses of each view, not yet refined.
 
-    Raises ``POOR_FIT``: there is none before the camera.
+    Raises ``POOR_FIT`` if no pose puts the target in front of the camera.
     """
     return Rigid.stacked(_likeliest(view, camera) for view in views)
 

@@ -1,4 +1,4 @@
-"""Projection with its derivatives, and residuals in units of their noise: what all fits share.
+"""Project points with derivatives, and scale residuals by their noise, for all fits.
 
 A pose is a rotation R (3, 3) and a translation t (3,) that lead from the target to the camera. Its
 six small changes are a turn w and a shift d in the camera's frame: R becomes exp([w]x) R, and t
@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_SIGMA_PX = 1e-4
-"""Pixels: standard deviations are not taken smaller, so that views without noise have weights."""
+"""Least standard deviation that is assumed, pixels, so that views without noise have finite
+weights."""
 
 SIGNIFICANCE_LEVEL = 0.01
-"""Probability with which noise alone may pass for an error beside it."""
+"""Residuals beyond the points' covariance count as an error if noise alone causes them with less
+than this probability."""
 
 
 DEGREE = 5
@@ -33,9 +35,9 @@ SMOOTH = (DEGREE + 1) * (DEGREE + 2)
 
 
 class Projection(NamedTuple):
-    """Points in an image and what moves them."""
+    """Projected points, with their derivatives."""
 
-    pixels: Array  # (N, 2); NaN for what lies behind the camera
+    pixels: Array  # (N, 2), pixels; NaN for points behind the camera
     by_point: Array  # (N, 2, 3), derivative by the point in the camera's frame, pixels per metre
     by_lens: Array  # (N, 2, 4 + K), derivative by fx, fy, cx, cy and the K coefficients
 
@@ -65,8 +67,8 @@ def linearize(points: Array, camera: CameraModel) -> Projection:
 def pose_changes(by_point: Array, turned_points: Array) -> Array:
     """Return the derivatives of pixels by the six changes of a pose (N, 2, 6).
 
-    ``by_point`` (N, 2, 3): by the points in the camera's frame. ``turned_points`` (N, 3): R @
-    points, without the translation.
+    ``by_point`` (N, 2, 3): derivatives by the points in the camera's frame. ``turned_points`` (N,
+    3): R @ points, without the translation.
     """
     # p = R m + t becomes exp([w]x) R m + t + d, to first order p + w x (R m) + d. So a pixel's
     # derivative by d is that by p, g, and by w it is (R m) x g, since g (w x q) = w (q x g).
@@ -88,8 +90,8 @@ def smooth_changes(pixels: Array, size: tuple[int, int]) -> Array:
 def whitening(covariance: Array, more: float) -> Array:
     """Return matrices (N, 2, 2) that make residuals independent, of variance 1.
 
-    ``covariance`` (N, 2, 2): of the residuals. ``more``: variance that each coordinate has beside
-    it, pixels^2.
+    ``covariance`` (N, 2, 2) is that of the residuals; ``more`` is a variance that is added to each
+    coordinate, pixels^2.
     """
     # With C^-1 = L L^T (Cholesky) the residuals L^T r have the covariance L^T C L = I, and their
     # squares add up to r^T C^-1 r.
@@ -99,11 +101,12 @@ def whitening(covariance: Array, more: float) -> Array:
 
 
 def excess(residuals: Array, covariance: Array, freedom: int) -> float:
-    """Return the variance that residuals have beside what their covariance explains, pixels^2.
+    """Return the variance of residuals, pixels^2, that their covariance does not explain.
 
-    It is what makes the sum of their weighted squares equal to their freedom; 0 where chance makes
-    them as large in 1 of 100 cases or more. ``residuals`` (N, 2), pixels; ``covariance`` (N, 2, 2);
-    ``freedom``: coordinates less fitted parameters; 0 or less says nothing.
+    Added to each coordinate, it makes the sum of the weighted squares equal to their degrees of
+    freedom. It is 0 if chance makes residuals as large in 1 of 100 cases or more. ``residuals`` are
+    (N, 2), pixels, ``covariance`` is (N, 2, 2), and ``freedom`` is the number of coordinates minus
+    that of fitted parameters; with 0 or less nothing can be said.
     """
     # Along each point's principal axes: find s^2 of sum e_j^2 / (l_j + s^2) = freedom, which falls
     # with s^2, so there is one root at most; at sum e_j^2 / freedom it is negative or 0.

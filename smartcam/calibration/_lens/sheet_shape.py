@@ -1,9 +1,9 @@
 """Estimate the points of a printed sheet from the views, since printing is not exact.
 
-Printers stretch, paper bends. Where many views show the same points off in the same way, the sheet
-is off, and a lens that is fitted to the points as they were meant takes the blame. Then the points
-are adjusted together with lenses and poses. As a whole they keep place, direction and size of the
-points that were meant, so no scale is lost.
+Printers stretch, paper bends. If many views show the same points off in the same way, the sheet is
+wrong, and a lens that is fitted to the points as they were meant absorbs that error. Then the
+points are adjusted together with lenses and poses. As a whole they keep the place, direction and
+size that were meant, so the scale stays.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 Sheet: TypeAlias = Literal["auto", "exact", "free"]
-"""Assumption about a sheet's points: where they were meant to be, free, or chosen by the fit."""
+"""Treatment of a sheet's points: as they were meant, adjusted, or chosen by the fit."""
 
 MIN_POSES: Final = 4
-"""Fewest views with which leaving one out still shows what chance does."""
+"""Fewer views than this, each left out in turn, do not show how much is chance."""
 
 MAX_FREE_POINTS: Final = 1000
-"""A target with free points has at most this many: the equations of more take gigabytes."""
+"""A target with free points has at most this many: the equations for more would take gigabytes."""
 
 
 class Shape(NamedTuple):
-    """The points of a fit, and the evidence that they are not where they were meant to be."""
+    """The fitted points of a sheet, and the evidence that they are not as they were meant."""
 
     adjusted: AdjustedBundle
-    left_out: list[LeftOut]  # each pose
-    off: Array | None  # (T, 3), metres, by how much they are adjusted
+    left_out: list[LeftOut]  # left-out fit of each pose
+    off: Array | None  # (T, 3), adjustment of the points, metres
     remarks: list[Remark]
 
 
 def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet) -> Shape:
-    """Return the fit with the target's points as meant or as seen.
+    """Return the fit with the target's points either as meant or adjusted.
 
-    ``adjusted`` has the points as they were meant. ``sheet``: ``auto``: adjusted where views that
-    were left out are shown better with them, by more than chance between views is.
+    ``adjusted`` has the points as they were meant. With ``sheet`` ``auto``, points are adjusted if
+    that predicts left-out views better, by more than the chance between views.
 
-    Raises ``SHAPE``: more points than may be free.
+    Raises ``SHAPE`` if there are more points than may be adjusted.
     """
     count = len(sights[0].view.target.points)
     if sheet == "free" and count > MAX_FREE_POINTS:
@@ -97,11 +97,11 @@ def _remark(off: Array, what: str) -> Remark:
 
 
 def adjust_shape(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
-    """Return the least squares in which the target's points are adjusted, too.
+    """Return the least-squares solution in which the target's points are adjusted, too.
 
-    ``bundle`` is near the solution; its ``points`` are where the target's points start from, None
-    for where they were meant to be. ``more``: first guess of the variance beside the points'
-    covariance, pixels^2; found anew.
+    ``bundle`` is near the solution; the target's points start from its ``points``, or from where
+    they were meant to be if that is None. ``more`` is a first guess of the variance in addition to
+    the points' covariance, pixels^2, which is estimated anew.
     """
     meant = sights[0].view.target.points
     points = meant if bundle.points is None else bundle.points
@@ -111,9 +111,9 @@ def adjust_shape(bundle: Bundle, sights: Sequence[Sight], more: float) -> Adjust
 
 
 def _as_meant(bundle: Bundle, meant: Array) -> Bundle:
-    """Return a bundle that shows the same, its points with place, direction and size as meant."""
+    """Return an equivalent bundle whose points have the place, direction and size meant."""
     # Points q = s A p + a are shown as p is by poses (R A^T, s t - R A^T a) and a rig (R_c, s t_c):
-    # R A^T q + s t - R A^T a = s (R p + t), and what is s times as far is in the same pixel.
+    # R A^T q + s t - R A^T a = s (R p + t), and a point s times as far away is in the same pixel.
     if bundle.points is None:
         return bundle
     size, turn, shift = likest(bundle.points, meant)
@@ -124,14 +124,14 @@ def _as_meant(bundle: Bundle, meant: Array) -> Bundle:
 
 
 def as_meant(points: Array, meant: Array) -> Array:
-    """Return points with place, direction and size of those that were meant."""
+    """Return the points, moved to the place, direction and size that were meant."""
     size, turn, shift = likest(points, meant)
     fitted: Array = size * points @ turn.T + shift
     return fitted
 
 
 def likest(points: Array, meant: Array) -> tuple[float, Array, Array]:
-    """Return the size, turn and shift that take points (T, 3) to where they were meant to be."""
+    """Return the scale, turn and shift that bring points (T, 3) nearest to those meant."""
     # Least squares of s R a + t - b: with the points centred and sum b a^T = U S V^T it is
     # R = U diag(1, 1, det(U V^T)) V^T and s = sum b (R a) / sum |a|^2.
     # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point

@@ -1,4 +1,4 @@
-"""Unknowns of a lens, and a first fit of them to views of a target."""
+"""Define the unknowns of a lens, and fit them a first time to views of a target."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, DistortionModel
 
 FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
-"""Focal lengths that OpenCV begins with, in parts of the image's longer side: None where its own
-closed form says, then fields of view of 53, 103, 28, 75 and 14 degrees."""
+"""Focal lengths that OpenCV begins with, as parts of the image's longer side: None for that of its
+own closed form, then those of fields of view of 53, 103, 28, 75 and 14 degrees."""
 
 MAX_VIEWS_OF_OPENCV: Final = 20
-"""Views that OpenCV is given; all are adjusted afterwards."""
+"""OpenCV gets at most this many views; afterwards the fit is adjusted to all."""
 
 MAX_GOOD_RMS_PX: Final = 0.5
-"""Pixels rms, up to which no other beginning is tried."""
+"""No further focal length is tried once the RMS is at most this many pixels."""
 
 
 def parameter_names(model: DistortionModel) -> tuple[str, ...]:
     """Return the names of what :func:`~smartcam.calibration._lens.bundle.lens_values` gives.
 
-    Raises ``SHAPE``: no such model.
+    Raises ``SHAPE`` if there is no such model.
     """
     return ("fx", "fy", "cx", "cy", *coefficient_names(model))
 
 
 def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
-    """Return by how much each value of a lens changes with each unknown (4 + K, F).
+    """Return the derivatives (4 + K, F) of the values of a lens by its unknowns.
 
     ``fixed``: names of coefficients that stay 0; ``aspect``: fx and fy are one unknown. Raises
-    ``SHAPE``: no such model, or a name that it does not have.
+    ``SHAPE`` if there is no such model, or if it has no coefficient of that name.
     """
     names, own, held = parameter_names(model), coefficient_names(model), set(fixed)
     unknown = sorted(held.difference(own, {"aspect"}))
@@ -71,11 +71,11 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
 def fit_lens(
     views: Sequence[TargetView], model: DistortionModel, fixed: Iterable[str] = ()
 ) -> AdjustedBundle:
-    """Return the lens and the poses that show the views' points where they are.
+    """Return the lens and the poses that fit views best.
 
-    OpenCV finds what bends most; everything is adjusted from there, with weights.
+    OpenCV finds the strongest coefficients; from there everything is adjusted, with weights.
 
-    Raises ``POOR_FIT``: no beginning leads anywhere; and as :func:`lens_basis` says.
+    Raises ``POOR_FIT`` if no focal length leads to a fit, and the errors of :func:`lens_basis`.
     """
     basis = lens_basis(model, fixed)
     found: list[AdjustedBundle] = []
@@ -99,7 +99,7 @@ def _fit(
     views: Sequence[TargetView], model: DistortionModel, basis: Array, length: float | None
 ) -> AdjustedBundle:
     guess = _first(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
-    # what stays 0 is 0, and fx is fy where they are one
+    # what must stay 0 is set to 0, and fy to fx if they are one unknown
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
@@ -111,7 +111,7 @@ def _fit(
 def _first(
     views: Sequence[TargetView], model: DistortionModel, length: float | None
 ) -> CameraModel:
-    """Return OpenCV's lens, with the two coefficients that bend most alone (and p1, p2)."""
+    """Return OpenCV's lens with only the two strongest coefficients (and p1, p2)."""
     cv2: Any = load("cv2")
     (width, height), matrix = views[0].size, None
     if length is not None:

@@ -1,7 +1,6 @@
-"""Findings in views once a lens is fitted: points that are off, views that are copies.
+"""Find suspicious views once a lens is fitted: points that are off, views that are copies.
 
-A point is told by what the pose of its view cannot make up for: that part of the residuals is taken
-off first.
+A point is judged by the part of its residual that the pose of its view cannot compensate.
 """
 
 from __future__ import annotations
@@ -40,61 +39,64 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-OFF: Final = ((7.0, 1.5), (12.0, 0.25))
-"""Standard deviations and pixels by which a point that is not the target's is off, either pair: of
-the points of 200 recorded views, whose noise is not quite normal, the farthest is 9.6 and 0.8 off,
-or 5.9 and 1.8 (measured)."""
+STRAY_LIMITS: Final = ((7.0, 1.5), (12.0, 0.25))
+"""A point is a stray if it is off by both the standard deviations and the pixels of either pair. In
+200 recorded views, whose noise is not quite normal, the farthest points are 9.6 deviations and 0.8
+pixels off, or 5.9 and 1.8 (measured)."""
 
 MAX_STRAY_SHARE: Final = 0.2
 """At most this part of a view's points are strays: with more, the view is bad as a whole."""
 
 MIN_POINTS_KEPT: Final = 8
-"""Points that must be left where others are strays: with fewer, each may be the wrong one."""
+"""Strays are left out only if this many points are left: with fewer, any of them may be the wrong
+one."""
 
-MEDIAN: Final = 2.0 * math.log(2.0)
+MEDIAN_SQUARED_LENGTH: Final = 2.0 * math.log(2.0)
 """Median of the squared length of two independent normal numbers with a variance of 1."""
 
-MAX_NAMED: Final = 5
-"""Points that a text names at most."""
+MAX_POINTS_IN_MESSAGE: Final = 5
+"""A message names at most this many points."""
 
 MAX_RMS_PX: Final = 10.0
-"""Pixels rms, beyond which points are not those of the target: a lens' wrong model leaves less."""
+"""Residual RMS, pixels, above which points are not the target's: the wrong model of a lens leaves
+less."""
 
-WORST_PART: Final = 0.015
-"""Residuals, rms, beyond which the points are not those of the target, as a part of the longer side
-of the image: it counts where it is more pixels than MAX_RMS_PX."""
+MAX_RMS_SHARE: Final = 0.015
+"""The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
 
-WORST_SIGMAS: Final = 20.0
-"""Residuals, rms, beyond which the points are not those of the target, as a multiple of the points'
-standard deviation: it counts where it is more pixels than MAX_RMS_PX."""
+MAX_RMS_SIGMAS: Final = 20.0
+"""The limit MAX_RMS_PX as a multiple of the points' standard deviation; the larger holds."""
 
 MAX_TARGET_METRES: Final = 20.0
-"""Metres that no target is long: a board in millimetres is 200."""
+"""No target is longer than this many metres; a board whose squares are given in millimetres seems
+200 m long."""
 
-OFF_MIDDLE: Final = 0.2
-"""A principal point this part of the image's sides off the middle may be of another image."""
+DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
+"""A principal point that lies this part of the image's sides off the centre may belong to another
+image."""
 
-SURE_SIGMAS: Final = 5.0
-"""Standard deviations by which such a principal point must be off the middle to be doubted."""
+DOUBTED_CENTRE_SIGMAS: Final = 5.0
+"""Such a principal point is doubted only if it is this many standard deviations off the centre."""
 
 
 class Stray(NamedTuple):
-    """A point of a view that is not where the others have it."""
+    """A point of a view that is not where the others predict it."""
 
-    number: int  # of the view
-    row: int  # of the point in the view
-    ident: int  # its number on the target
-    off: float  # pixels
+    number: int  # index of the view
+    row: int  # index of the point in the view
+    ident: int  # number of the point on the target
+    off: float  # distance from the predicted place, pixels
 
 
 def strays(
     fitted: Sequence[Fitted], more: float, used: Sequence[bool], *, lens: bool = True
 ) -> list[Stray]:
-    """Return the points that are far off what all others say.
+    """Return the points that lie far from where all others predict them.
 
-    ``more``: variance beside the points' own, pixels^2. ``used``: the views that it is of; of the
-    others, a view may be bad for a few of its points. ``lens``: whether the lens is fitted to the
-    views; else a point is not a stray if a camera that fits the other points brings to its place.
+    ``more``: variance in addition to the points' own, pixels^2. ``used``: mask of the views that it
+    was estimated from; another view may be bad because of a few of its points. ``lens``: whether
+    the lens was fitted to the views; if not, a point is no stray when a lens that fits the other
+    points predicts its place.
     """
     equations = [one.equations(more) for one in fitted]
     off = _stray_squares(equations, used)
@@ -110,7 +112,7 @@ def strays(
 
 
 def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> list[Equations]:
-    """Return the equations with what the lens leaves that fits the points best that are kept."""
+    """Return the equations after fitting the lens to the kept points."""
     some = [
         Equations(*(part[rows] for part in one)) for one, rows in zip(equations, kept, strict=True)
     ]
@@ -125,10 +127,10 @@ def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> li
 
 
 def squares_off(equations: Equations, scale: float) -> Array:
-    """Return the squared lengths (N,) by which points are off, 0 where that is little.
+    """Return the squared distances (N,) of points from their predicted places, 0 for small ones.
 
-    That is from where the other points of the view have them. ``scale``: squared length of one
-    standard deviation along each axis.
+    The other points of the view predict the places. ``scale``: squared length of one standard
+    deviation along each axis.
     """
     kept = np.full(len(equations.residuals), np.isfinite(equations.residuals).all())
     least = max(MIN_POINTS_KEPT, (1.0 - MAX_STRAY_SHARE) * len(kept))
@@ -146,16 +148,16 @@ def squares_off(equations: Equations, scale: float) -> Array:
 def _far(equations: Equations, squares: Array, scale: float) -> Mask:
     pixels = equations.deviations * np.sqrt(squares)
     times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
-    far: Mask = np.any([(times > most) & (pixels > least) for most, least in OFF], axis=0)
+    far: Mask = np.any([(times > most) & (pixels > least) for most, least in STRAY_LIMITS], axis=0)
     return far
 
 
 def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list[Array]:
-    """Return the squared lengths (N,) by which points of each view are off, 0 for most."""
+    """Return the squared distances (N,) from their predicted places in each view, 0 for most."""
     of_used = itertools.compress(equations, used)
-    # the median stays what it is, whatever a few strays do to the variance of all
+    # unlike the variance of all points, the median is hardly changed by a few strays
     middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
-    return [squares_off(one, float(middle) / MEDIAN) for one in equations]
+    return [squares_off(one, float(middle) / MEDIAN_SQUARED_LENGTH) for one in equations]
 
 
 def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
@@ -174,7 +176,7 @@ def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetV
 
 
 def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> Iterator[Remark]:
-    """Yield the remarks on strays; ``names``: of the views."""
+    """Yield the remarks on strays; ``names`` are those of the views."""
     counts = collections.Counter(one.ident for one in found)
     often = {ident for ident, count in counts.items() if count >= max(3, len(names) / 2)}
     for ident in sorted(often):
@@ -187,10 +189,14 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
     rest = [one for one in found if one.ident not in often]
     if rest:
         each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
-        more = f", and {len(each) - MAX_NAMED} more" if len(each) > MAX_NAMED else ""
+        more = (
+            f", and {len(each) - MAX_POINTS_IN_MESSAGE} more"
+            if len(each) > MAX_POINTS_IN_MESSAGE
+            else ""
+        )
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:MAX_NAMED])}{more}: each {done}"
+            f"{', '.join(each[:MAX_POINTS_IN_MESSAGE])}{more}: each {done}"
         )
 
 
@@ -223,9 +229,9 @@ def examined(
     *,
     drop: bool,
 ) -> IntrinsicCalibration:
-    """Return a calibration of a lens without the points that are far off, and with remarks on them.
+    """Return the calibration without stray points, and with remarks on them.
 
-    ``again`` calibrates it from other views. ``drop``: whether the points are left out. Raises
+    ``again`` calibrates from other views. ``drop``: whether stray points are left out. Raises
     ``POOR_FIT``: the points are not the target's.
     """
     views, used = [one.view for one in found.views], [one.used for one in found.views]
@@ -242,22 +248,27 @@ def examined(
     )
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
-        found, said = again(without(views, off)), []  # which says it of them
+        found, said = again(without(views, off)), []  # check_rms says it of these views
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
-    """Yield the remarks on views that are copies, or show a target as large as a house."""
+    """Yield the remarks on copied views, and on targets as large as a house."""
     groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
     for view, name in zip(views, names, strict=True):
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(one) for one in groups.values() if len(one) > 1]
     if copies:
-        more = f", and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
+        more = (
+            f", and {len(copies) - MAX_POINTS_IN_MESSAGE} more"
+            if len(copies) > MAX_POINTS_IN_MESSAGE
+            else ""
+        )
         yield Code.COINCIDENT.remark(
-            f"views that are the same to the last digit: {'; '.join(copies[:MAX_NAMED])}{more}: "
+            "views that are the same to the last digit: "
+            f"{'; '.join(copies[:MAX_POINTS_IN_MESSAGE])}{more}: "
             "they count as often as they are there, and errors come out too small"
         )
     length = float(np.ptp(views[0].target.points, axis=0).max())
@@ -272,7 +283,7 @@ def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
     size = np.array(found.camera.size)
     middle, sigmas = found.camera.matrix[:2, 2], np.sqrt(np.diag(found.covariance)[2:4])
     off = np.abs(middle - (size - 1) / 2)
-    if ((off > OFF_MIDDLE * size) & (off > SURE_SIGMAS * sigmas)).any():
+    if ((off > DOUBTED_CENTRE_OFFSET_SHARE * size) & (off > DOUBTED_CENTRE_SIGMAS * sigmas)).any():
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
             f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "
@@ -281,7 +292,7 @@ def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
 
 
 def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
-    """Raise (``POOR_FIT``) where residuals are so large that the points are not the target's."""
+    """Raise ``POOR_FIT`` if the residuals are so large that the points cannot be the target's."""
     most = most_rms(views)
     if rms > most:
         raise Code.POOR_FIT.refusal(
@@ -294,9 +305,9 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
 
 
 def most_rms(
-    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = WORST_PART
+    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
 ) -> float:
-    """Return the residuals, rms of a coordinate in pixels, beyond which views are impossible."""
+    """Return the RMS of a coordinate, pixels, above which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
-    return max(worst, part * longer, WORST_SIGMAS * noise)
+    return max(worst, part * longer, MAX_RMS_SIGMAS * noise)

@@ -23,14 +23,13 @@ if TYPE_CHECKING:
 
 
 class MapFigures(NamedTuple):
-    """A map in four numbers, of a coordinate; NaN where the lens' model does not reach.
+    """Four numbers that sum up a map, for a coordinate; NaN where the lens' model does not reach.
 
     Attributes:
-        centre: value in the middle of the image.
-        corners: the mean of the four corners (root of the mean square), or of those of them that
-            the model reaches.
-        worst: the largest.
-        mean: over the field (root of the mean square).
+        centre: value at the centre of the image.
+        corners: RMS of the four corners, or of those that the model reaches.
+        worst: largest value.
+        mean: RMS over the field.
     """
 
     centre: float
@@ -46,11 +45,11 @@ class ProjectionUncertainty:
     Attributes:
         size: width and height of the images, pixels.
         distance: distance of the points from the camera, metres; None: infinity.
-        pixels: (h, w, 2), the places.
-        covariance: (h, w, 2, 2), of where a point is projected that is truly seen there, pixels^2;
-            NaN where no direction leads to a pixel.
-        by_point: (h, w, 2, 3), by how much a point's pixel moves with the point, pixels for each
-            metre along the axes of the camera's frame; at infinity for each radian.
+        pixels: (h, w, 2), places of the map.
+        covariance: (h, w, 2, 2), of the projection of a point that truly appears at that place,
+            pixels^2; NaN where no direction leads to the pixel.
+        by_point: (h, w, 2, 3), derivative of the pixel by the point, in pixels per metre along the
+            axes of the camera's frame; at infinity per radian.
     """
 
     size: tuple[int, int]
@@ -61,15 +60,15 @@ class ProjectionUncertainty:
 
     @property
     def sigma(self) -> Array:
-        """(h, w), standard deviation of a coordinate, pixels."""
+        """Standard deviation of a coordinate, (h, w), pixels."""
         sigma: Array = np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 2)
         return sigma
 
     @property
     def across(self) -> Array:
-        """(h, w), what ``sigma`` is at the distance, across the line of sight, metres.
+        """The same as a length at the distance, across the line of sight, (h, w), metres.
 
-        Of points at infinity it is the angle, radians.
+        For points at infinity it is an angle, radians.
         """
         # A pixel's derivative by the point, J (2, 3), is 0 along the ray, so J^+ gives the least
         # shift, which is across it.
@@ -82,12 +81,12 @@ class ProjectionUncertainty:
 
     @property
     def figures(self) -> MapFigures:
-        """``sigma`` in four numbers, pixels."""
+        """Four numbers that sum up ``sigma``, pixels."""
         return figures(self.sigma)
 
 
 def figures(sigma: Array) -> MapFigures:
-    """Return a map (h, w) of standard deviations, or lengths, in four numbers."""
+    """Sum up a map (h, w) of standard deviations, or of lengths, by four numbers."""
     rows, columns = sigma.shape
     corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
     known = sigma[np.isfinite(sigma)]
@@ -111,10 +110,10 @@ def uncertainty(
     distance: float | None = None,
     shape: tuple[int, int] = SHAPE,
 ) -> ProjectionUncertainty:
-    """Return the map of a lens whose values (fx, fy, cx, cy, coefficients) have a covariance.
+    """Return the map of a lens, from the covariance of its values (fx, fy, cx, cy, coefficients).
 
-    ``gauge``: (N, 3), the points before the camera that the motion is fitted to. The rest is as
-    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty` says, errors as well.
+    ``gauge``: (N, 3), points in the camera's frame that the motion is fitted to. All else, errors
+    included, is as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     check_distance(distance)
     pixels = places(camera.size, shape)

@@ -1,1 +1,1 @@
-"""A camera's plane in the robot's space, from points that both know."""
+"""Calibrate a camera's plane in the robot's space, from points known to both."""

@@ -1,4 +1,4 @@
-"""From localizations in a camera's plane to poses of a robot.
+"""Map localizations in a camera's plane to poses of a robot.
 
 ::
 
@@ -6,8 +6,8 @@
     poses = calibration.to_robot(result.value)
     calibration.predicted_error([[0.10, 0.05]])     # metres, rms
 
-A point is seen by the camera and touched by the robot; three are needed, nine tell how good it is.
-Of six and more, ``robust=True`` leaves out those that are wrong.
+Each point is seen by the camera and touched by the robot. Three points are needed; nine show how
+good the calibration is. With six or more, ``robust=True`` leaves out those that are wrong.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from smartcam.calibration._homography import element_derivatives
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.diagnostics import (
     MAX_SIGMA,
-    TYPICAL_SIGMA,
+    TYPICAL_SIGMA_M,
     Evidence,
     check_side,
     findings,
@@ -37,6 +37,7 @@ from smartcam.calibration._plane.diagnostics import (
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, Candidates, rms, squares
+from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._plane.robust import agreeing
 from smartcam.calibration._plane.validation import (
@@ -67,30 +68,31 @@ KIND = "plane"
 
 PlaneModel: TypeAlias = Literal["auto", "rigid", "similarity", "affine", "homography"]
 
-POINTS_AT_ONCE = 16_384
-"""Points whose covariances are worked out at once: 5 MB in between."""
+POINTS_PER_BLOCK = 16_384
+"""Covariances are computed for this many points at a time, which takes 5 MB."""
 
-ENOUGH: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
-"""Points that a verdict takes: fewer fit a map of the model even where two of them are wrong, with
-one and the same mistake (shown by simulation)."""
+MIN_POINTS_FOR_VERDICT: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
+"""A verdict needs this many points: fewer may fit the model although two of them are wrong by the
+same mistake (shown by simulation)."""
 
-TOUCHES_APART = 4.0
-"""Sigmas of a touch from the mean of the touches of its point: noise does it once in a thousand."""
+MAX_TOUCH_SIGMAS = 4.0
+"""A touch further than this many sigmas from the mean of its point's touches is remarked on: noise
+alone does it once in a thousand."""
 
 MIN_DIRECTION_LENGTH = 1e-9
-"""Length of a direction below which a direction is not one."""
+"""A vector shorter than this has no direction."""
 
 STALE_LEVEL = 0.01
 """Probability with which a calibration that still holds is called stale."""
 
 
 class Drift(NamedTuple):
-    """The comparison of points touched again with the calibration.
+    """Result of comparing points that were touched again with the calibration.
 
     Attributes:
         offsets: touched minus expected (K, 3), metres.
-        expected: rms length of an offset that touches and calibration explain, metres.
-        chance: how likely touches and calibration alone give offsets as large as these, 0 to 1.
+        expected: RMS length of the offsets that errors of touches and calibration explain, metres.
+        chance: probability, 0 to 1, with which these errors alone give offsets as large.
         z: ``chance`` in standard deviations of a normal distribution.
         stale: True if ``chance`` is less than the level asked for.
     """
@@ -106,7 +108,7 @@ class Drift(NamedTuple):
 class PlaneCalibration(storage.SavedCalibration):
     """The result of :func:`fit_plane`; immutable.
 
-    ``==`` asks for one and the same object; compare :meth:`to_data` for the same contents.
+    ``==`` is True only for the same object; compare the contents by :meth:`to_data`.
 
     Attributes:
         model: ``rigid``, ``similarity``, ``affine``, ``homography``, or ``touches`` for
@@ -118,26 +120,27 @@ class PlaneCalibration(storage.SavedCalibration):
         place: centre and size of the points, in both spaces.
         unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
             points, row by row, for touches with a variance of 1 m^2.
-        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except of
-            points left out.
-        leave_one_out: (N, 3), robot minus what a calibration from the other points says, metres;
-            NaN where the others alone give no fit. The point's own touch is part of it. Of a point
-            left out it is the residual.
-        freedom: coordinates of the points that count, minus parameters.
-        touch_sigma: sigma of one coordinate of a touch of weight 1, metres: as given or, where
-            ``sigma_given`` is false, estimated from the residuals; None where there is no telling.
-        sigma_given: whether the sigma was given.
-        candidates: rms held-out error of each compared model, metres; None where a model has none.
-        nominal_scale: metres for each unit of the camera's points as the user expects them.
-        tool_z: (3,), direction of the tool's axis into the plane; None where it is not known.
+        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except those
+            of points left out.
+        leave_one_out: (N, 3), robot minus the place mapped by a calibration from the other points,
+            metres; NaN if these give no fit. It includes the error of the point's own touch. For a
+            point left out it is the residual.
+        freedom: number of coordinates of the points that count, minus that of parameters.
+        touch_sigma: standard deviation of one coordinate of a touch of weight 1, metres: as given
+            or, if ``sigma_given`` is false, estimated from the residuals; None if it cannot be
+            estimated.
+        sigma_given: whether ``touch_sigma`` was given.
+        candidates: RMS held-out error of each compared model, metres; None for a model without one.
+        nominal_scale: expected metres per unit of the camera's points.
+        tool_z: (3,), direction of the tool's axis into the plane; None if it is not known.
         height: height of the plane over the touched one, metres; see :meth:`at_height`.
         robot_frame: name of the frame that poses are given in.
-        camera_frame: name of the frame that they must come in; None for any.
+        camera_frame: name of the frame that localizations must come in; None for any.
         y_down: whether the camera's y axis pointed down and was turned up before the points came,
             as :func:`smartcam.connect` does with ``y_down``; None: not known.
         allowed_error: the largest error of 95 of 100 points that the user allows, metres; None:
             :attr:`verdict` takes a hundredth of the touched field.
-        warnings: what one should know before using it; their texts number the points from 1, as
+        warnings: remarks to read before using the calibration; they number the points from 1, as
             pictures and wizards do.
     """
 
@@ -186,7 +189,7 @@ class PlaneCalibration(storage.SavedCalibration):
 
     @property
     def rotation(self) -> Array:
-        """R_robot_camera (3, 3): x as the camera's x at the centre, z the plane's normal."""
+        """R_robot_camera (3, 3): x is the camera's x at the centre, z the plane's normal."""
         return self._map.frame
 
     @property
@@ -203,12 +206,12 @@ class PlaneCalibration(storage.SavedCalibration):
 
     @property
     def scale(self) -> float:
-        """Metres for each unit of the camera's points, at their centre."""
+        """Metres per unit of the camera's points, at their centre."""
         return self._map.scale
 
     @property
     def held_out_error(self) -> float | None:
-        """Rms length of :attr:`leave_one_out`, metres; None where a point has none."""
+        """Rms length of :attr:`leave_one_out`, metres; None if a point has none."""
         value = rms(self.leave_one_out, self.weights)
         return None if math.isnan(value) else value
 
@@ -219,9 +222,9 @@ class PlaneCalibration(storage.SavedCalibration):
 
     @property
     def worst(self) -> int:
-        """Index of the point with the largest held-out error, or residual where there is none.
+        """Index of the point with the largest held-out error, or residual if there is none.
 
-        Points left out are not asked.
+        Points that were left out do not count.
         """
         held_out = not np.isnan(self.leave_one_out).any()
         errors = self.leave_one_out if held_out else self.residuals
@@ -233,10 +236,10 @@ class PlaneCalibration(storage.SavedCalibration):
         return self.judged().verdict
 
     def judged(self, predicted: float | None = None, where: str = "") -> Judgement:
-        """Return the verdict and what is advisable.
+        """Return the verdict and the advice.
 
-        ``predicted``: rms error to expect, metres; None: at the points. ``where``: of what the
-        promise is, for people.
+        ``predicted``: RMS error to expect, metres; None: that at the points. ``where``: the place
+        that the verdict is about, for people.
         """
         counted, out = self.weights > 0.0, [1 + index for index in self.outliers]
         if predicted is None and self.touch_sigma is not None:
@@ -245,7 +248,7 @@ class PlaneCalibration(storage.SavedCalibration):
         without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
         held_out, more = self.held_out_error, "touch more points"
         points = len(np.unique(self.camera_points[counted], axis=0))
-        if points < (least := ENOUGH.get(self.model, 0)):
+        if points < (least := MIN_POINTS_FOR_VERDICT.get(self.model, 0)):
             held_out = None
             more = f"two wrong ones of {points} points can look right: touch {least} or more"
         return judge(
@@ -263,15 +266,15 @@ class PlaneCalibration(storage.SavedCalibration):
 
         Args:
             points: (N, 2), in the unit that the calibration was made in; or (N, 3) with a third
-                component 1, which a contiguous array of many points is mapped faster from.
+                component 1, which is faster for a contiguous array of many points.
             out: (N, 3), contiguous float64, written and returned; None for a new array.
 
         Returns:
             (N, 3), metres. NaN gives NaN.
 
         Raises:
-            CalibrationError: SHAPE; OUT_OF_FIELD: a point behind the plane's horizon; NOT_FINITE:
-                one comes out as no number.
+            CalibrationError: SHAPE; OUT_OF_FIELD: a point behind the plane's horizon; NOT_FINITE: a
+                result is no finite number.
         """
         return self._map.transform(points, out)
 
@@ -279,7 +282,7 @@ class PlaneCalibration(storage.SavedCalibration):
         """Map points of the robot's space to the camera's.
 
         Args:
-            points: (N, 3), metres; of a point beside the plane its foot counts.
+            points: (N, 3), metres; a point off the plane is projected onto it first.
 
         Returns:
             (N, 2), in the camera's unit.
@@ -301,19 +304,18 @@ class PlaneCalibration(storage.SavedCalibration):
         """Return localizations with their poses in the robot's space.
 
         Their z axis is the plane's normal, their x axis the part's. The header is in the robot's
-        frame; number and time stay. Where a pose has a ``sigma``, and the touches' sigma is known,
-        the robot's has one, too, with the calibration's own error in it.
+        frame; number and time do not change. Where a pose has a ``sigma``, and the touches' sigma
+        is known, the robot's has one, too, with the calibration's own error in it.
 
         Args:
             localizations: localizations of the camera, one or many.
-            tool_flip: turn each by pi about its own x, so that z points into the plane, as a
-                tool's does that picks it.
+            tool_flip: turn each pose by pi about its own x, so that z points into the plane, like
+                the z of a tool that picks the part.
 
         Raises:
             CalibrationError: WRONG_FRAME: they come in another frame than ``camera_frame``;
                 OUT_OF_PLANE: a pose is not in the camera's plane; OUT_OF_FIELD: a pose is behind
-                    the
-                plane's horizon; NOT_FINITE: a pose would hold what is no number.
+                the plane's horizon; NOT_FINITE: a value of a pose would be no finite number.
         """
         if isinstance(localizations, Localization):
             return self._poses((localizations,), tool_flip)[0]
@@ -349,12 +351,15 @@ class PlaneCalibration(storage.SavedCalibration):
             comes on top.
 
         Raises:
-            CalibrationError: SHAPE or NOT_FINITE; UNVERIFIED: nothing tells the touches' sigma.
+            CalibrationError: SHAPE or NOT_FINITE; UNVERIFIED: the touches' sigma is not known.
         """
         # J C J^T with the map's Jacobian by its parameters; C is derived in fitting.fit
         seen = as_points(points, 2, "camera points")
         return np.concatenate(
-            [self._joint(seen[i : i + POINTS_AT_ONCE]) for i in range(0, len(seen), POINTS_AT_ONCE)]
+            [
+                self._joint(seen[i : i + POINTS_PER_BLOCK])
+                for i in range(0, len(seen), POINTS_PER_BLOCK)
+            ]
             or [np.zeros((0, 3, 3))]
         )
 
@@ -380,13 +385,13 @@ class PlaneCalibration(storage.SavedCalibration):
         return self.touch_sigma**2
 
     def predicted_error(self, points: ArrayLike) -> Array:
-        """Return the rms error to expect of mapped points, for touches with noise alone.
+        """Return the RMS error to expect of mapped points if touches have no errors but noise.
 
         Args:
             points: (K, 2), of the camera.
 
         Returns:
-            (K,), metres: root of the summed variances along the three axes.
+            (K,), metres: square root of the summed variances along the three axes.
 
         Raises:
             CalibrationError: as :meth:`covariance_at`.
@@ -397,20 +402,21 @@ class PlaneCalibration(storage.SavedCalibration):
     def check(
         self, camera_points: ArrayLike, robot_points: ArrayLike, *, level: float = STALE_LEVEL
     ) -> Drift:
-        """Return the drift of points touched again from where the calibration expects them.
+        """Compare points that were touched again with where the calibration expects them.
 
-        Offsets are compared with their covariance: that of the new touches, and that of the
-        calibration, which the points have in common. Of several points both all offsets are
-        tested and the one shift that fits them best, each at half the level: a camera that was
-        knocked shifts all of them, and the more are touched the surer that is noticed.
+        Offsets are compared with the covariance of the new touches plus that of the calibration,
+        which all points share. With several points two tests are made, each at half the level: of
+        all offsets, and of the one shift that fits them best, since a camera that was knocked
+        shifts all points. The more points are touched, the more surely that is noticed.
 
         Args:
             camera_points: (K, 2), or one point (2,).
             robot_points: (K, 3) or (3,), where the robot touches them, metres.
-            level: how seldom a calibration that still holds may be called stale, between 0 and 1.
+            level: probability, between 0 and 1, with which a calibration that still holds may be
+                called stale.
 
         Raises:
-            CalibrationError: as :meth:`covariance_at`; NOT_FINITE: no such level.
+            CalibrationError: as :meth:`covariance_at`; NOT_FINITE: the level is not valid.
         """
         if not 0.0 < level < 1.0:
             raise Code.NOT_FINITE.unexpected(
@@ -446,10 +452,10 @@ class PlaneCalibration(storage.SavedCalibration):
     def at_height(self, height: float, camera_position: ArrayLike) -> PlaneCalibration:
         """Return the calibration for features that lie over the touched plane.
 
-        What is seen at height h lies where the ray from the camera passes the plane raised by h.
+        A feature seen at height h lies where the ray from the camera meets the plane raised by h.
 
         Args:
-            height: over the touched plane, towards the camera, metres.
+            height: height over the touched plane, towards the camera, metres.
             camera_position: (3,), the camera's centre of projection in the robot's space, metres.
 
         Raises:
@@ -482,7 +488,7 @@ class PlaneCalibration(storage.SavedCalibration):
             )
         if self.unit_covariance.shape != (12, 12):
             raise storage.refused(called, "unit_covariance: expected rows of 12", None)
-        _ = self._map  # refused here, not with the first part
+        _ = self._map  # refused here, not only when the first part comes
 
 
 @takes(
@@ -507,46 +513,50 @@ def fit_plane(
     y_down: bool | None = None,
     allowed_error: float | None = None,
 ) -> PlaneCalibration:
-    """Return the map from the camera's plane to the robot, fitted to points that both have seen.
+    """Fit the map from the camera's plane to the robot's space to points known to both.
 
     Args:
-        camera_points: (N, 2), where the camera sees them: metres, pixels or whatever it speaks.
-        robot_points: (N, 3), where the robot touches them, metres. Any order, the same in both.
+        camera_points: (N, 2), places of the points for the camera, in metres, pixels or any unit.
+        robot_points: (N, 3), places of the same points in the same order for the robot, metres.
         model: ``rigid`` (3 points or more, scale as ``nominal_scale``, 1 without), ``similarity``
             (3), ``affine`` (3), ``homography`` (4: a tilted camera whose lens is corrected for), or
             ``auto``: the one with the smallest held-out error; a more general one must also fit
-            better than noise alone explains in 99 of 100 cases. ``rigid`` takes part where
+            better than noise alone explains in 99 of 100 cases. ``rigid`` is compared only if
             ``nominal_scale`` is given.
         touch_sigma: standard deviation of one coordinate of a touch, robot and camera together,
-            metres; None: estimated from the residuals. Where these have fewer than 6 degrees of
-            freedom, 0.2 mm stand for the missing ones; residuals that speak of more than 0.5 mm and
-            a thousandth of the field are called POOR_FIT, as mistakes may cause them.
+            metres; None: estimated from the residuals. If these have fewer than 6 degrees of
+            freedom, 0.2 mm are assumed for the missing ones. An estimate above 0.5 mm and a
+            thousandth of the field (squares added) is reported as POOR_FIT, since mistakes may
+            cause it.
         weights: (N,), one over the relative variance of each touch.
-        nominal_scale: metres for each unit of the camera's points, as it should be.
-        tool_z: (3,) or (N, 3), direction of the tool's axis, into the plane, when it touched. Three
-            dimensions have room for a mirrored plane, so only this tells whether y points the wrong
-            way.
+        nominal_scale: expected metres per unit of the camera's points.
+        tool_z: (3,) or (N, 3), direction of the tool's axis, into the plane, when it touched. In
+            space a mirrored plane fits as well as the right one, so only this axis shows whether y
+            points the wrong way.
         robust: leave out points that do not agree with the others (6 points or more, of which more
             than half agree; MSAC). They keep their place among the points, with the weight 0, and
-            each is named by a warning OUTLIER. Which they are does not depend on ``model``. Give
-            ``touch_sigma``: without it fewer are found, and only such as are further off.
+            each is named by a warning OUTLIER. Which points these are does not depend on ``model``.
+            Give ``touch_sigma``: without it fewer wrong points are found, and only those further
+            off.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
         y_down: whether the camera's y axis points down and was turned up before the points came;
-            None: not known. Kept, and compared where the calibration is used; nothing is turned.
+            None: not known. The value is stored, and compared when the calibration is used; nothing
+            is turned here.
         allowed_error: the largest error of 95 of 100 points that is good enough, metres; None: a
             hundredth of the touched field. See :attr:`PlaneCalibration.verdict`.
 
-    Touches of one and the same point of the camera, or with one and the same pose of the robot
-    close to each other, count as one, their mean: what is wrong with the point is in all of them.
+    Repeated touches of one camera point, or touches at one pose of the robot close to each other,
+    count as a single point, their mean: an error of the point is in all of them.
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
-            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, SCALE_MISMATCH where
-            ``rigid`` was asked for, or with ``robust`` OUTLIER: no map agrees with more than half
-            of the points; OUT_OF_FIELD: one left out is behind the plane's horizon.
+            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, UNIT_UNKNOWN: a field of more
+            than 20 m, SCALE_MISMATCH where ``rigid`` was asked for, or with ``robust`` OUTLIER: no
+            map agrees with more than half of the points; OUT_OF_FIELD: a point that was
+            left out is behind the plane's horizon.
         MissingExtraError: SciPy is not installed.
-        ValueError: no model has that name.
+        ValueError: ``model`` is unknown.
     """
     if model != "auto" and model not in MODELS:
         raise ConfigurationError(
@@ -560,11 +570,17 @@ def fit_plane(
     marks, touched = once.camera, once.robot
     kept = np.arange(len(marks))
     least = MODELS["similarity" if model == "auto" else model].least
-    if len(marks) < len(camera):  # that they are the same is to be said of the points as they came
+    # the message that points are the same must speak of the points as they came
+    if len(marks) < len(camera):
         check_samples(camera, robot, least, touch_sigma)
     if robust:
         kept = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
     check_samples(marks[kept], touched[kept], least, touch_sigma)
+    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
+    # of all points: those in a wrong order agree with one another as well as those in the right one
+    order = better_order(marks, touched, most)
+    if order is not None and set(order.moved).isdisjoint(kept):
+        order = None
     side = None if tool_z is None else mean_axis(tool_z, len(camera))
     place, pairs = normalize(marks[kept], touched[kept], once.weights[kept])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
@@ -577,7 +593,6 @@ def fit_plane(
     held_out = candidates.held_out(fitted)
     matrix = place.outward(fitted.matrix)
     plane = PlaneMap(matrix, place.camera)
-    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
@@ -592,7 +607,7 @@ def fit_plane(
         side=None if side is None else check_side(plane.frame[:, 2], side),
         numbers=1 + once.first[kept],
     )
-    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA / place.robot_size)
+    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
     if robust and touch_sigma is None and estimate is not None:
         check_lever(lever(touched[kept]), place.robot_size * estimate)
     off = np.setdiff1d(np.arange(len(marks)), kept)
@@ -627,9 +642,10 @@ def fit_plane(
         allowed_error=allowed_error,
         warnings=findings(evidence),
     )
-    remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
+    remarks = [] if order is None else [order.remark(1 + once.first)]
+    remarks += [_left_out(found, index, parts[index]) for index in found.outliers]
     apart = np.linalg.norm(beside, axis=1)
-    if apart.max() > TOUCHES_APART * most:
+    if apart.max() > MAX_TOUCH_SIGMAS * most:
         text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"
         remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
@@ -643,7 +659,7 @@ def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
 
 
 def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Return the remark on a point left out: how far off it lies, and how far touching explains."""
+    """Return the remark on a point left out: how far off it is, and how much touching explains."""
     distance = float(np.linalg.norm(found.residuals[index]))
     variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
     variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
@@ -654,7 +670,7 @@ def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
 
 
 def _estimated(fitted: Fit, weights: Array, typical: float) -> float | None:
-    """Return the sigma that the residuals speak of, None without a degree of freedom."""
+    """Estimate the sigma from the residuals; None without a degree of freedom."""
     if not fitted.freedom:
         return None
     return sigma_of(squares(fitted.residuals, weights), fitted.freedom, typical)
@@ -663,8 +679,8 @@ def _estimated(fitted: Fit, weights: Array, typical: float) -> float | None:
 def mean_axis(tool_z: ArrayLike, count: int) -> Array:
     """Return the mean direction (3,) of a tool's axis, of length 1.
 
-    ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE, NOT_FINITE, or COINCIDENT: it
-    has no length.
+    ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE, NOT_FINITE, or COINCIDENT if
+    the mean has no length.
     """
     given = np.asarray(tool_z, dtype=np.float64)
     if given.shape == (count, 3):

@@ -1,6 +1,6 @@
-"""Test a calibration that could be made for what its user should know: its warnings.
+"""Test a finished calibration, and return the warnings that its user should know.
 
-Each test calls a healthy calibration suspicious in at most one of 100 cases.
+Each test warns of a healthy calibration in at most one of 100 cases.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from smartcam.calibration._plane.fitting import fit
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
-from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code, Remark
@@ -31,87 +30,85 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
-"""A scale may be off the nominal one by this part, as printers and heights of parts make it."""
+"""A scale may be off the nominal one by this part: printers and heights of parts change it by as
+much."""
 
-MAX_SCALE_OFF = 0.1
-"""A scale off the nominal one by more than this part comes of mixed-up units or sheets."""
+MAX_SCALE_ERROR = 0.1
+"""A scale that is off the nominal one by more than this part comes from mixed-up units or
+sheets."""
 
 MIN_TOOL_COSINE = 0.17
-"""Cosine between tool and normal below which the tool's axis does not tell the side."""
+"""If the cosine between tool and normal is smaller, the tool's axis does not show the side."""
 
 MAX_POINTS_FOR_PAIRS = 25
-"""Points up to which each pair of them is left out in turn; of more, two hardly move the map."""
+"""With at most this many points, each pair is left out in turn; with more, two points hardly move
+the map."""
 
 MIN_POINTS_LEFT = 3
-"""More points must be left where some are left out: three fit a similarity nearly always."""
+"""More points than this must be left when some are left out: three fit a similarity nearly
+always."""
 
 MIN_DEGREES_OF_FREEDOM = 6
 """An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
 
-TYPICAL_SIGMA = 0.0002
-"""Metres: sigma of a careful touch, used for the degrees of freedom that an estimate lacks."""
+TYPICAL_SIGMA_M = 0.0002
+"""Sigma of a careful touch, metres, assumed for the degrees of freedom that an estimate lacks."""
 
 
 class Limit(NamedTuple):
-    """The largest standard deviation of a touch's coordinate, unless the caller gives another."""
+    """The largest plausible standard deviation of a touch's coordinate."""
 
-    touch: float  # of the robot's tip, metres
-    part: float  # of the camera, a part of the field
+    touch: float  # part from the robot's tip, metres
+    part: float  # part from the camera, as a part of the field
 
     def of(self, field: float) -> float:
-        """Return the limit for a field of some metres."""
+        """Return the limit for a field of the given size, metres."""
         return math.hypot(self.touch, self.part * field)
 
 
 MAX_SIGMA = Limit(0.0005, 0.001)
-"""Larger residuals may be mistakes: a robot that is led by hand and a camera of 640 x 480 pixels
-stay within it."""
+"""Larger residuals may be mistakes: a hand-guided robot and a camera of 640 x 480 pixels stay below
+this limit."""
 
 _TINY = 1e-8
 
 
 class Evidence(NamedTuple):
-    """The evidence that the tests look at; lengths in units of ``place``."""
+    """The data that the tests examine; lengths are in units of ``place``."""
 
     pairs: Pairs
     fitted: Fit  # the fit that was chosen
     candidates: Candidates  # the fits of the other models
-    preferred: ModelName  # the model that the points ask for
+    preferred: ModelName  # the model that the user asked for
     asked: bool  # whether the user named the model
-    held_out: Array  # (N, 3), of the chosen fit
-    sigma: float | None  # of a touch; None where it was not given
-    most: float  # the same where it was given, else the most that it may be
+    held_out: Array  # (N, 3), residuals of the chosen fit
+    sigma: float | None  # standard deviation of a touch's coordinate; None if it was not given
+    most: float  # the same if it was given, else the largest plausible one
     place: Normalization  # centre and size of the points
-    nominal_scale: float | None  # metres for each unit of the camera; None where it was not given
-    # the cosine between tool and normal, None where the tool's axis was not given
+    nominal_scale: float | None  # metres per unit of the camera's points; None if it was not given
+    # cosine between tool and normal; None if the tool's axis was not given
     side: float | None
-    numbers: NDArray[np.intp]  # (N,), what texts call the points
+    numbers: NDArray[np.intp]  # (N,), names of the points in messages
 
 
 def findings(evidence: Evidence) -> tuple[Remark, ...]:
     """Return the warnings, the most serious first."""
-    tests = (_order, _planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
+    tests = (_planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
     return tuple(remark for test in tests for remark in test(evidence))
 
 
 def sigma_of(squared: float, freedom: int, typical: float) -> float:
-    """Return the sigma that residuals speak of, by the sum of their squares.
+    """Estimate the sigma of residuals from the sum of their squares.
 
-    ``typical``: the sigma that stands for degrees of freedom that they lack; of few residuals all
-    may be small by chance.
+    ``typical``: sigma assumed for the degrees of freedom that are missing; few residuals may all be
+    small by chance.
     """
     missing = max(0, MIN_DEGREES_OF_FREEDOM - freedom)
     return math.sqrt((squared + missing * typical**2) / (freedom + missing))
 
 
-def _order(evidence: Evidence) -> Iterator[Remark]:
-    found = better_order(evidence.pairs.camera, evidence.pairs.robot, evidence.most)
-    if found is not None:
-        yield found.remark(evidence.numbers, 1e3 * evidence.place.robot_size)
-
-
 def check_side(normal: Array, tool_z: Array) -> float:
-    """Return the cosine between a tool's axis and the plane's normal (MIRRORED: the same side)."""
+    """Return the cosine between tool and plane's normal; raise MIRRORED if they point alike."""
     cosine = float(normal @ tool_z) / float(np.linalg.norm(tool_z))
     if cosine > MIN_TOOL_COSINE:
         raise Code.MIRRORED.refusal(
@@ -124,11 +121,11 @@ def check_side(normal: Array, tool_z: Array) -> float:
 
 
 def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: bool) -> str | None:
-    """Return the remark on a scale that is not the nominal one, None where it is.
+    """Return the remark on a scale that is not the nominal one; None if it is.
 
-    Scales are metres for each unit of the camera; ``uncertainty`` is the standard deviation of
-    ``measured`` over it. Raises SCALE_MISMATCH: it is off by more than a tenth, or at all where it
-    must be ``exact``.
+    Scales are in metres per unit of the camera; ``uncertainty`` is the standard deviation of
+    ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
+    or at all if it must be ``exact``.
     """
     off = measured / nominal - 1.0
     if abs(off) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
@@ -136,13 +133,13 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
-    if exact or abs(off) > MAX_SCALE_OFF:
+    if exact or abs(off) > MAX_SCALE_ERROR:
         raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 
 
 def _planarity(evidence: Evidence) -> Iterator[Remark]:
-    """Compare what is out of the plane with the given noise, or with what is left inside it."""
+    """Compare the residuals out of the plane with the given noise, or with those inside it."""
     flat, weights, count = evidence.candidates.get("affine"), evidence.pairs.weights, -3
     count += len(weights)
     if flat is None or not count:
@@ -165,7 +162,7 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _fit(evidence: Evidence) -> Iterator[Remark]:
-    """Look for one point that is far worse than the others, then at all of them together."""
+    """Look for one point that is far worse than the others, then test all of them together."""
     fitted, weights = evidence.fitted, evidence.pairs.weights
     total = squares(fitted.residuals, weights)
     chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]
@@ -189,7 +186,7 @@ def _fit(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
-    """Ask whether one touch or two that are wrong explain as much as a tilted camera does."""
+    """Test whether one or two wrong touches explain as much as a tilted camera."""
     fitted, pairs = evidence.fitted, evidence.pairs
     count = len(pairs.camera)
     if (
@@ -220,7 +217,7 @@ def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _chance_among(evidence: Evidence, squared: float, total: float) -> float:
-    """Return the probability of one residual's square, by the others where they are enough."""
+    """Return the probability of one residual's square, from the others if they are enough."""
     freedom = evidence.fitted.freedom - 3
     sigma = evidence.sigma if freedom < MIN_DEGREES_OF_FREEDOM else None
     noise = touch_noise(sigma, max(total - squared, 0.0), freedom)
@@ -228,7 +225,7 @@ def _chance_among(evidence: Evidence, squared: float, total: float) -> float:
 
 
 def _studentized(fitted: Fit) -> Array:
-    """Return each residual's square in units of its own variance (N,), 0 where it has none."""
+    """Return each residual's square over its own variance (N,), 0 if that is 0."""
     values, vectors = np.linalg.eigh(fitted.blocks)
     along = np.einsum("nij,ni->nj", vectors, fitted.residuals)
     known = values > _TINY * values.max()
@@ -237,7 +234,7 @@ def _studentized(fitted: Fit) -> Array:
 
 
 def _model(evidence: Evidence) -> Iterator[Remark]:
-    """Say that one scale for the whole field does not do, or another model than asked for does."""
+    """Warn if the field has no single scale, or if another model than the chosen one fits."""
     used, preferred = evidence.fitted.model, evidence.preferred
     if preferred not in {"affine", "homography"} or (evidence.asked and used == preferred):
         return
@@ -297,9 +294,9 @@ def _side(evidence: Evidence) -> Iterator[Remark]:
 
 
 def remark_side(side: float | None) -> Iterator[Remark]:
-    """Say that the tool's axis does not tell the side of the plane.
+    """Warn that the tool's axis does not show the side of the plane.
 
-    ``side``: the cosine between tool and normal, None where the tool's axis was not given.
+    ``side``: the cosine between tool and normal, None if the tool's axis was not given.
     """
     if side is None or abs(side) <= MIN_TOOL_COSINE:
         yield Code.SIDE_UNKNOWN.remark(

@@ -1,4 +1,4 @@
-"""A picture of a plane calibration, as SVG: what was touched, how well it fits, how good it is.
+"""Draw a plane calibration as SVG: the touched points, their residuals, the predicted error.
 
 It shows the camera's plane as the camera sees it, x to the right and y up. Errors are far too small
 to be seen, so residuals and ellipses are drawn larger, by a factor that the picture names.
@@ -21,28 +21,29 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 FIELD_WIDTH_PX: Final = 900.0
-"""The field is drawn this wide, pixels; its height follows from the points."""
+"""Width of the drawn field, pixels; its height follows from the points."""
 
 BORDER: Final = 60.0
 LEGEND_HEIGHT_PX: Final = 130.0
-"""Pixels below the field, for the legend."""
+"""Height of the legend below the field, pixels."""
 
 MARGIN_RATIO: Final = 0.15
-"""Free margin around the points that are shown, in parts of their extent."""
+"""Free margin around the points, as a part of their extent."""
 
 MAX_COLUMNS: Final = 30
-"""Cells of the heat map across; as many down as make them square, at most twice that."""
+"""The heat map has at most this many cells across, and at most twice as many down, so that they are
+square."""
 
 ELLIPSE_SIGMAS: Final = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations in which 95 % of a plane's normal distribution lie."""
 
 ELLIPSE_POINTS: Final = 24
-"""Points of an ellipse."""
+"""An ellipse is drawn with this many points."""
 
 MIN_ENLARGED_RATIO: Final = 1e-9
 """Errors below this part of the field's width are not drawn larger."""
 
-LOW, HIGH = (240, 247, 252), (246, 196, 140)
+LOW_COLOUR, HIGH_COLOUR = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
 
 STYLE: Final = """\
@@ -56,7 +57,7 @@ stroke-width: 2 }
 .ellipse { fill: none; stroke: #7d3c98 } .part { stroke: #0b7a4b; fill: none; stroke-width: 1.5 }
 .part-name { fill: #0b7a4b }"""
 
-HEADS: Final = "".join(
+ARROW_HEADS: Final = "".join(
     f'<marker id="{kind}-head" refX="8" refY="4" orient="auto" '
     f'markerUnits="userSpaceOnUse"><path d="M0 0 L8 4 L0 8" class="{kind}"/></marker>'
     for kind in ("camera", "robot")
@@ -68,7 +69,7 @@ class _DrawnPlane:
     """The part of the camera's plane that is drawn, and its map to pixels of the picture.
 
     Args:
-        shown: (N, 2), points that are in it.
+        shown: (N, 2), points that must be inside of the drawn part.
     """
 
     def __init__(self, shown: Array) -> None:
@@ -82,7 +83,7 @@ class _DrawnPlane:
         self.foot: float = 2 * BORDER + self.height
 
     def pixels(self, points: Array) -> Array:
-        """Return points (..., 2) in pixels."""
+        """Map points (..., 2) to pixels."""
         corner = np.array([BORDER, BORDER + self.height])
         pixels: Array = corner + (points - self.low) * self.zoom * [1.0, -1.0]
         return pixels
@@ -93,16 +94,14 @@ def draw(
 ) -> str:
     """Return a picture of a calibration.
 
-    Grey is the camera's frame, blue the directions of the robot's axes as they lie in the plane:
-    an axis that rises from the plane is shorter. Black points were touched; from each a red line
-    goes to where the touch says that it is, its residual. The background is the predicted error,
-    violet ellipses hold 95 % of it. Where nothing tells how well points were touched, both are
-    missing. Points that a robust fit left out are grey crosses, without residual and ellipse; one
-    that lies far beyond the others is not shown.
+    The camera's frame is grey, the directions of the robot's axes in the plane are blue: an axis
+    that rises from the plane is shorter. Touched points are black; the red line from each is its
+    residual. The background shows the predicted error, and violet ellipses hold 95 % of it. Both
+    are missing if the touches' sigma is not known. Points that a robust fit left out are grey
+    crosses without residual and ellipse; one that lies far beyond the others is not shown.
 
-    ``parts``: localizations in the camera's frame that are shown, too, in green. ``title``: a line
-    on top. The SVG document says its size and refers to no other file; lines end with a line
-    feed.
+    ``parts`` are localizations in the camera's frame, drawn in green. ``title`` is a line on top.
+    The SVG document has a fixed size and loads no other file; lines end with a line feed.
     """
     found = list(parts)
     counted = calibration.weights > 0.0
@@ -122,7 +121,7 @@ def draw(
         else 1.0
     )
     shapes = [
-        f"<defs>{HEADS}</defs>",
+        f"<defs>{ARROW_HEADS}</defs>",
         *_heat(calibration, field),
         *_axes(calibration, field),
         *(
@@ -137,10 +136,10 @@ def draw(
 
 
 def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
-    """Return the outlines of the 95 % ellipses about points, as the camera would see them.
+    """Return the outlines of the 95 % ellipses around points, in the camera's plane.
 
-    They are (N, ELLIPSE_POINTS, 2), from each point; none where nothing tells how well points were
-    touched.
+    They are (N, ELLIPSE_POINTS, 2), relative to each point; empty if the touches' sigma is not
+    known.
     """
     if calibration.touch_sigma is None:
         return np.zeros((0, ELLIPSE_POINTS, 2))
@@ -148,7 +147,7 @@ def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
     covariances = inside.T @ calibration.covariance_at(points) @ inside
     values, vectors = np.linalg.eigh(covariances)
     lengths = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    # the symmetric root: axes alone may point to either side
+    # the symmetric root, since eigenvectors alone may point to either side
     half = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
     angles = np.linspace(0.0, math.tau, ELLIPSE_POINTS, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
@@ -182,9 +181,9 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
 
 
 def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
-    """Return a cell with a colour between the two, in steps that rounding does not change."""
+    """Return a cell; its colour goes in steps, so that rounding does not change it."""
     level = round(20 * part) / 20
-    channels = (round(a + level * (b - a)) for a, b in zip(LOW, HIGH, strict=True))
+    channels = (round(a + level * (b - a)) for a, b in zip(LOW_COLOUR, HIGH_COLOUR, strict=True))
     colour = "".join(f"{channel:02x}" for channel in channels)
     return rectangle((x, y), (wide, tall), f'fill="#{colour}"')
 
@@ -192,15 +191,15 @@ def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
 def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the axes of the camera and of the robot.
 
-    The camera's are at its origin where that is shown, else at a corner; the robot's, as they lie
-    in the plane, below the field's lower right corner.
+    The camera's axes are at its origin if that is shown, else at a corner; the robot's, projected
+    into the plane, are below the field's lower right corner.
     """
     start = field.pixels(np.clip(np.zeros(2), field.low, field.high))
     yield from _axis(start, np.array([70.0, 0.0]), "camera", "camera x")
     yield from _axis(start, np.array([0.0, -70.0]), "camera", "y")
     start = np.array([BORDER + FIELD_WIDTH_PX - 90, field.foot + 35])
     for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
-        if np.linalg.norm(axis) < 0.05:  # it stands on the plane
+        if np.linalg.norm(axis) < 0.05:  # the axis is at a right angle to the plane
             yield circle(start, 4, "robot")
             yield _text(start, name, "robot-name", beside=(7, 15))
         else:

@@ -1,14 +1,14 @@
-"""From pairs of points to the map between them, and how well it is known; pure.
+"""Fit the map between pairs of points, with its covariance; without any I/O.
 
-A camera that looks at a plane maps it to its image by a homography. Together with where the plane
-lies in the robot's space that is one matrix: ``w (x, y, z, 1) = matrix (u, v, 1)``, with 11 degrees
-of freedom. The models are parts of that: affine (9) has ``w = 1``, similarity (7) has axes of equal
-length at right angles, rigid (6) has a scale that is known beforehand.
+A camera that looks at a plane maps it to its image by a homography. Together with the pose of the
+plane in the robot's space that is one matrix: ``w (x, y, z, 1) = matrix (u, v, 1)``, with 11
+degrees of freedom. The models are special cases: affine (9) has ``w = 1``, similarity (7) has axes
+of equal length at right angles, rigid (6) has a scale that is known beforehand.
 
-All four are fitted by least squares in the robot's space, which for equal independent noise on each
-axis of each touch is the most likely answer; noise of the camera counts as noise of the touch.
-Points are centred and scaled first. The covariance is that of the matrix' 12 elements, whatever the
-model.
+All four are fitted by least squares in the robot's space, which is the most likely answer if the
+noise of the touches is independent and equal on each axis; noise of the camera counts as noise of
+the touch. Points are centred and scaled first. The covariance is that of the matrix' 12 elements,
+for every model.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ ModelName: TypeAlias = Literal["rigid", "similarity", "affine", "homography"]
 MIN_CONDITION = 1e-4
 """Smallest over largest singular value of a fit's column-scaled Jacobian.
 
-Healthy layouts have 0.03 and more; a parameter that is not determined gives rounding errors, below
-1e-10 (measured).
+Healthy layouts have 0.03 and more; if a parameter is not determined, the ratio is a rounding error
+below 1e-10 (measured).
 """
 
 MAX_STEPS = 50
 """The refinement of a homography takes at most this many steps; it usually takes 3 to 8."""
 
 MAX_HALVINGS = 20
-"""A step that makes the sum of squares larger is tried in at most this many sizes, each half of the
-one before; after them the sum is as small as rounding lets it be."""
+"""A step that makes the sum of squares larger is halved at most this many times; after that,
+rounding allows no smaller sum."""
 
 MIN_STEP = 1e-13
-"""The refinement ends where a step changes the matrix' elements, which are about 1, by less than
+"""The refinement ends when a step changes the matrix' elements, which are about 1, by less than
 this; the next step would be a thousand times smaller."""
 
 MAX_FULL_REFITS = 200
-"""Points up to which a homography is fitted anew without each of them.
+"""With at most this many points, a homography is fitted again without each of them.
 
-Above it the residuals are corrected by their leverage, which is off by the square of a leverage
-that is below 0.1 then.
+With more, the residuals are corrected by their leverage, which is below 0.1 then; the error is its
+square.
 """
 
 
@@ -60,12 +60,13 @@ class Normalization(storage.Stored):
     """The frames in which the fit is made: centres and sizes that bring the points near to 1."""
 
     camera: storage.Vector2  # centre of the camera's points (2,)
-    camera_size: storage.Positive  # their rms distance from it, in the camera's unit
+    # RMS distance of the camera's points from their centre, in the camera's unit
+    camera_size: storage.Positive
     robot: storage.Vector3  # centre of the robot's points (3,), metres
-    robot_size: storage.Positive  # their rms distance from it, metres
+    robot_size: storage.Positive  # RMS distance of the robot's points from their centre, metres
 
     def outward(self, matrix: Array) -> Array:
-        """Return the matrix (4, 3) between the points as they are, from that of the fit."""
+        """Convert the fit's matrix into the one (4, 3) between the original points."""
         result = np.concatenate([self.robot_size * matrix[:3], matrix[3:]]) @ self._shrink()
         result[:3] += np.outer(self.robot, result[3])
         return result
@@ -84,14 +85,14 @@ class Normalization(storage.Stored):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Points of camera and robot that belong together, as the fit sees them."""
+    """Pairs of camera's and robot's points, as the fit uses them."""
 
-    camera: Array  # (N, 2), centred, of rms length 1
-    robot: Array  # (N, 3), centred, of rms length 1
-    weights: Array  # (N,), one over the relative variance of each
+    camera: Array  # (N, 2), camera's points, centred, of RMS length 1
+    robot: Array  # (N, 3), robot's points, centred, of RMS length 1
+    weights: Array  # (N,), one over the relative variance of each pair
 
     def without(self, *index: int) -> Pairs:
-        """Return all but some."""
+        """Return all pairs but some."""
         keep = ~np.isin(np.arange(len(self.camera)), index)
         return Pairs(self.camera[keep], self.robot[keep], self.weights[keep])
 
@@ -106,12 +107,12 @@ class Fit:
     """A fitted map."""
 
     model: ModelName
-    matrix: Array  # (4, 3); between centred points
-    residuals: Array  # (N, 3); robot minus mapped
-    # (12, 12); of the matrix' elements row by row, for a touch variance of 1
+    matrix: Array  # (4, 3), between centred points
+    residuals: Array  # (N, 3), robot minus mapped
+    # (12, 12), of the matrix' elements row by row, for a touch variance of 1
     unit_covariance: Array
-    blocks: Array  # (N, 3, 3); variance of each residual for a touch variance of 1
-    freedom: int  # coordinates minus parameters
+    blocks: Array  # (N, 3, 3), variance of each residual for a touch variance of 1
+    freedom: int  # number of coordinates minus number of parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,18 +120,19 @@ class Model:
     """One kind of map."""
 
     parameters: int  # degrees of freedom
-    least: int  # points it has need of
-    # gives the matrix of pairs, scale known beforehand (used by ``rigid`` only)
+    least: int  # least number of points
+    # function of pairs and of a scale, used by ``rigid`` only, that returns the matrix
     solve: Callable[[Pairs, float], Array]
-    # gives the directions (12, parameters) in which a matrix may change
+    # function that returns the directions (12, parameters) in which a matrix may change
     tangent: Callable[[Array], Array]
 
 
 def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
-    """Return the most likely map of one model; COLLINEAR: the points do not determine it.
+    """Return the most likely map of one model; raise COLLINEAR if the points do not determine it.
 
-    ``pairs`` are as many as it has need of at least, in both spaces neither the same nor in a line.
-    ``scale``: robot's over camera's length, in their units; for ``rigid`` only.
+    There must be as many ``pairs`` as the model needs, in both spaces neither all the same nor all
+    in a line. ``scale`` is the ratio of a length in the robot's unit to that in the camera's, for
+    ``rigid`` only.
     """
     model = MODELS[name]
     matrix = model.solve(pairs, scale)
@@ -165,9 +167,9 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
 
 
 def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Array, Array]:
-    """Return the weighted residuals' Jacobian by a model's parameters, and its columns' lengths.
+    """Return the Jacobian of the weighted residuals by the parameters, and its columns' lengths.
 
-    Its columns are divided by these.
+    The columns are divided by their lengths.
     """
     model = MODELS[name]
     jacobian = element_derivatives(matrix, pairs.camera) @ model.tangent(matrix)
@@ -178,10 +180,10 @@ def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Arra
 
 
 def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
-    """Return each point minus what a fit of all the others says of it, (N, 3).
+    """Return each point minus the place that a fit of all others predicts, (N, 3).
 
-    NaN where the others alone determine no map. Equal to fitting anew: affine by its leverage,
-    rigid and similarity by taking the point out of the sums, a homography by fitting anew.
+    NaN if the others alone determine no map. Without fitting again, ``affine`` uses leverages and
+    ``rigid`` and ``similarity`` take the point out of the sums; a ``homography`` is fitted again.
     """
     if len(pairs.camera) <= MODELS[fitted.model].least:
         return np.full_like(pairs.robot, np.nan)
@@ -215,10 +217,10 @@ def _held_out_anew(fitted: Fit, pairs: Pairs, index: int) -> Array:
 
 
 def _held_out_of_sums(pairs: Pairs, scale: float | None) -> Array:
-    """Fit all subsets at once: sums over all minus what the point brought to them."""
+    """Fit all subsets at once, from the sums over all points minus one point's share."""
     u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
     # sum w (p - p') (u - u')^T = sum w p u^T - W p' u'^T, with the means p' and u' and W = sum w;
-    # of each subset these are the sums over all points less what one point brought to them.
+    # for each subset these are the sums over all points minus one point's share.
     total = w.sum() - w
     mean_u, mean_p = ((w * u).sum(0) - w * u) / total, ((w * p).sum(0) - w * p) / total
     cross = np.einsum("ni,nj->nij", w * p, u)
@@ -245,7 +247,7 @@ def scaled_axes(cross: Array, square: Array, scale: float | None) -> Array:
 
 
 def _solve_similarity(pairs: Pairs, scale: float | None) -> Array:
-    """Umeyama's solution; from two dimensions to three no reflection can come of it."""
+    """Return Umeyama's solution, which from two dimensions to three is never a reflection."""
     u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
     mean_u, mean_p = (w * u).sum(0) / w.sum(), (w * p).sum(0) / w.sum()
     centred = w * (u - mean_u)
@@ -272,7 +274,7 @@ def _solve_homography(pairs: Pairs, scale: float) -> Array:
 
 
 def _refined_homography(pairs: Pairs, matrix: Array) -> Array:
-    """Refine a solution until the sum of squares does not get less."""
+    """Refine a solution until the sum of squares no longer decreases."""
     root = np.sqrt(pairs.weights)[:, None]
     residuals = root * (pairs.robot - apply_homography(matrix, pairs.camera))
     tangent = _homography_tangent(matrix)
@@ -298,9 +300,9 @@ def _refined_homography(pairs: Pairs, matrix: Array) -> Array:
 def _linear_homography(pairs: Pairs, scale: float) -> Array:
     """Return the direct linear solution in the plane that fits the robot's points best."""
     # In the plane through the robot's points x (h3 u) = h1 u and y (h3 u) = h2 u are linear in the
-    # nine elements; the least singular vector has the least sum of squares at length 1. Back in
-    # space, p = mean + axes (x, y), so the upper rows are axes h12 + mean h3.
-    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 4.1.
+    # nine elements; of vectors of length 1 the last singular vector has the least sum of squares.
+    # Back in space, p = mean + axes (x, y), so the upper rows are axes h12 + mean h3. Source:
+    # Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 4.1.
     root = np.sqrt(pairs.weights)[:, None]
     mean = (pairs.weights[:, None] * pairs.robot).sum(0) / pairs.weights.sum()
     axes = np.linalg.svd(root * (pairs.robot - mean), full_matrices=False)[2][:2].T
@@ -315,7 +317,7 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
     solution = np.linalg.svd(equations, full_matrices=False)[2][-1].reshape(3, 3)
     w = pairs.homogeneous @ solution[2]
     if abs(solution[2, 2]) < MIN_CONDITION or w.min() * w.max() <= 0:
-        return _solve_affine(pairs, scale)  # a point beyond the horizon: noise, not a view
+        return _solve_affine(pairs, scale)  # a point beyond the horizon comes from noise
     solution = solution / solution[2, 2]
     top = axes @ solution[:2] + np.outer(mean, solution[2])
     return np.concatenate([top, solution[2:]])
@@ -323,7 +325,7 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
 
 def rigid_tangent(matrix: Array) -> Array:
     """Return derivatives of a matrix' elements by a shift and a turn about the centre, (12, 6)."""
-    # exp([w]x) a = a + w x a to first order: of the columns a, not of the centre, which only shifts
+    # exp([w]x) a = a + w x a to first order: for the columns a, while the centre only shifts
     tangent = np.zeros((4, 3, 6))
     for axis in range(3):
         tangent[axis, 2, axis] = 1.0

@@ -1,8 +1,8 @@
-"""A camera's plane in the robot's space: points there and back, poses there.
+"""Map points between a camera's plane and the robot's space, and poses to the robot's space.
 
-The heading of a part is the direction in the plane that its direction in the image becomes at that
-place. For a similarity that is the frame of the plane times the turn about z; a tilted camera bends
-angles a little, which the map's derivative says.
+The heading of a part in the plane is its direction in the image, mapped at that place. For a
+similarity that is the frame of the plane times the turn about z; a tilted camera changes angles a
+little, by the derivative of the map.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_POINTS_OF_NUMPY = 512
-"""Points up to which numpy is faster than calling OpenCV, and no second library is loaded."""
+"""With at most this many points, numpy is faster than OpenCV, which is then not loaded."""
 
-POINTS_AT_ONCE = 65_536
-"""Points that are mapped at once: what is in between stays in the processor's cache, and calls are
-rare enough (16,384 take half as long again, 10^6 a quarter; measured)."""
+POINTS_PER_BLOCK = 65_536
+"""Number of points that are mapped at a time: intermediate values stay in the processor's cache,
+and calls are few (blocks of 16,384 points take half as long again, of 10^6 a quarter; measured)."""
 
-# half the time of the NamedTuples' own; the cast because a bare tuple is generic
+# takes half the time of the NamedTuples' own; the cast is needed since a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
@@ -48,7 +48,7 @@ class PlaneMap:
 
     Args:
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
-        centre: (2,), a point that the camera sees; ``w`` is positive there.
+        centre: (2,), a point in the camera's field, where ``w`` is positive.
 
     Raises:
         CalibrationError: NOT_FINITE: the matrix maps the centre nowhere, or all points to a line.
@@ -72,7 +72,7 @@ class PlaneMap:
         """Position (3,) of the centre, metres."""
         derivative = derivatives(matrix, centre[None])[0]
         self.scale: float = math.sqrt(np.linalg.norm(np.cross(derivative[:, 0], derivative[:, 1])))
-        """Metres for each unit of the camera there."""
+        """Metres per unit of the camera at the centre."""
         self.frame: Array = tangent_frames(derivative[None], np.array([[1.0, 0.0]]))[0]
         """Rotation (3, 3): x as the camera's x at the centre, z the plane's normal."""
         inside = self.frame[:, :2].T
@@ -86,7 +86,7 @@ class PlaneMap:
         self._turn = Quaternion(*quaternion_from_matrix(self.frame).tolist())
 
     def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
-        """Return camera points in the robot's space, (N, 3); see ``PlaneCalibration.transform``."""
+        """Map camera points to the robot's space, (N, 3); see ``PlaneCalibration.transform``."""
         given = np.asarray(points, dtype=np.float64)
         if given.ndim != 2 or given.shape[1] not in {2, 3}:
             given = as_points(points, 2, "camera points")
@@ -100,19 +100,19 @@ class PlaneMap:
                 _check_mapped(given, result)
             return result
         source = _Homogeneous(given)
-        for begin in range(0, len(given), POINTS_AT_ONCE):
-            block = given[begin : begin + POINTS_AT_ONCE]
+        for begin in range(0, len(given), POINTS_PER_BLOCK):
+            block = given[begin : begin + POINTS_PER_BLOCK]
             farthest = self._farthest(block)
             least = self._least_depth(farthest)
             if not least > 0:
                 self._check_horizon(block)
-            self._fill(source.block(begin), result[begin : begin + POINTS_AT_ONCE])
+            self._fill(source.block(begin), result[begin : begin + POINTS_PER_BLOCK])
             if not (least > 0 and self._most * max(farthest, 1.0) / least < MAX_COORDINATE):
-                _check_mapped(block, result[begin : begin + POINTS_AT_ONCE])
+                _check_mapped(block, result[begin : begin + POINTS_PER_BLOCK])
         return result
 
     def _farthest(self, points: Array) -> float:
-        """Return the largest coordinate; NaN where there is one that must not pass for 0."""
+        """Return the largest coordinate; NaN if there is a NaN that must not pass for 0."""
         if self.projective:  # OpenCV divides by NaN, and gives 0
             return max(float(points.max()), -float(points.min()))
         cv2 = load("cv2")
@@ -120,7 +120,7 @@ class PlaneMap:
         return size
 
     def _least_depth(self, farthest: float) -> float:
-        """Return the least ``w`` of points whose coordinates are no larger."""
+        """Return the least ``w`` of points whose coordinates are at most ``farthest``."""
         u, v, one = self._depth
         return one - (abs(u) + abs(v)) * farthest
 
@@ -136,7 +136,7 @@ class PlaneMap:
             cv2.transform(source, self.matrix[:3], dst=target)
 
     def _check_horizon(self, points: Array) -> None:
-        """Raise where a point lies behind the plane's horizon; NaN passes."""
+        """Raise if a point lies behind the plane's horizon; NaN passes."""
         if not self.projective or not len(points):
             return
         w = points[:, :2] @ self.matrix[3, :2] + self.matrix[3, 2]
@@ -144,7 +144,7 @@ class PlaneMap:
             raise _behind_horizon(points[int(np.argmin(w)), :2].tolist())
 
     def inverse(self, points: ArrayLike) -> Array:
-        """Map robot points (N, 3) to the camera's (N, 2); the foot of each counts."""
+        """Map robot points (N, 3), projected onto the plane, to the camera's (N, 2)."""
         given = as_points(points, 3, "robot points")
         inside = (given - self.origin) @ self.frame[:, :2]
         seen = inside @ self._back[:, :2].T + self._back[:, 2]
@@ -180,7 +180,7 @@ class PlaneMap:
             if seen is not last:
                 header = _header(seen, robot_frame, camera_frame)
                 last = seen
-            # in the plane, from its origin
+            # in the plane, relative to its origin
             x, y = a * u + b * v + c, d * u + e * v + f
             direction_u, direction_v = qw * qw - qz * qz, 2.0 * qz * qw
             along, across = a * direction_u + b * direction_v, d * direction_u + e * direction_v
@@ -198,7 +198,8 @@ class PlaneMap:
             m, r = tz * k + tw * s, tw * k - tz * s
             orientation = (r, m, -j, -i) if flip else (i, j, m, r)
             position = (ox + xx * x + yx * y, oy + xy * x + yy * y, oz + xz * x + yz * y)
-            if not isfinite(sum(position) + (i + j + m + r)):  # the sum of numbers is one
+            # the sum of all numbers is one operation, and is not finite if one of them is not
+            if not isfinite(sum(position) + (i + j + m + r)):
                 raise not_finite(f"pose of {feature_id!r:.60}", (*position, *orientation))
             result = new(Pose, (header, new(Position, position), new(Quaternion, orientation)))
             found.append(new(Localization, (feature_id, quality, photo_index, result)))
@@ -206,9 +207,9 @@ class PlaneMap:
 
 
 class _Homogeneous:
-    """Points with a third component 1, a block at a time.
+    """Points with a third component 1, converted block by block.
 
-    A point's two coordinates are copied as one complex number, which takes a sixth of the time.
+    The two coordinates of a point are copied as one complex number, in a sixth of the time.
 
     Args:
         points: (N, 2), or (N, 3) which is used as it is.
@@ -219,7 +220,7 @@ class _Homogeneous:
         self._whole = points.shape[1] == 3
         if not self._whole:
             self._pairs = self._points.view(np.complex128)[:, 0]
-            self._buffer = np.ones((min(POINTS_AT_ONCE, len(points)), 3))
+            self._buffer = np.ones((min(POINTS_PER_BLOCK, len(points)), 3))
             self._places: NDArray[np.complex128] = np.ndarray(
                 (len(self._buffer),), np.complex128, self._buffer, strides=(24,)
             )
@@ -227,14 +228,14 @@ class _Homogeneous:
     def block(self, begin: int) -> Array:
         """Return the next points (n, 3), contiguous, valid until the next call."""
         if self._whole:
-            return self._points[begin : begin + POINTS_AT_ONCE]
-        pairs = self._pairs[begin : begin + POINTS_AT_ONCE]
+            return self._points[begin : begin + POINTS_PER_BLOCK]
+        pairs = self._pairs[begin : begin + POINTS_PER_BLOCK]
         self._places[: len(pairs)] = pairs
         return self._buffer[: len(pairs)]
 
 
 def _check_mapped(given: Array, result: Array) -> None:
-    """Raise where a point came out as no number that was one; of NaN comes NaN."""
+    """Raise if a point of finite numbers was mapped to none; NaN may give NaN."""
     known = np.isfinite(given).all(axis=1)
     result[~known] = np.nan
     wrong = known & ~np.isfinite(result).all(axis=1)

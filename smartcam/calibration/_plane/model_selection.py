@@ -1,8 +1,8 @@
-"""Choose the model that the points ask for.
+"""Choose the model that the points justify.
 
 The rule, from the simplest model upwards: a more general one is taken if its held-out error is
 smaller, and if noise alone would reduce the sum of squared residuals by as much in fewer than three
-of 1000 calibrations. A general model always fits better; that it predicts better is what counts.
+of 1000 calibrations. A general model always fits better, but it must also predict better.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SIGNIFICANCE_LEVEL = 0.003
-"""Probability with which noise alone may choose a more general model. A simulation of nine touches
-in the middle third of a field chose it: the wrong choices cost 1 % of the error here, and 4 % at
-0.01; a tilt of one degree is found with both."""
+"""Probability with which noise alone may choose a more general model. The value comes from a
+simulation of nine touches in the middle third of a field: wrong choices cost 1 % of the error at
+this level and 4 % at 0.01; both levels find a tilt of one degree."""
 
 ROUNDING_RATIO = 1e-9
-"""Residuals below this part of the points' extent are rounding, not noise."""
+"""Residuals below this part of the points' extent are rounding errors, not noise."""
 
 
 def squares(residuals: Array, weights: Array) -> float:
-    """Return the weighted sum of squares of (N, 3)."""
+    """Return the weighted sum of squares of residuals (N, 3)."""
     return float((weights[:, None] * residuals**2).sum())
 
 
 def rms(residuals: Array, weights: Array) -> float:
-    """Return the weighted rms length of (N, 3); NaN where one of them is."""
+    """Return the weighted RMS length of residuals (N, 3); NaN if one of them is NaN."""
     return math.sqrt(squares(residuals, weights) / float(weights.sum()))
 
 
 def touch_noise(sigma: float | None, squared: float, freedom: int) -> Noise | None:
-    """Return the touches' noise: from ``sigma``, else from a sum of squares and its freedom.
+    """Return the touches' noise from ``sigma``, or else from a sum of squares and its freedom.
 
-    None where both are missing.
+    None if both are missing.
     """
     if sigma is not None:
         return Noise(max(sigma, ROUNDING_RATIO) ** 2)
@@ -50,12 +50,12 @@ def touch_noise(sigma: float | None, squared: float, freedom: int) -> Noise | No
 
 
 class Candidates:
-    """The fits of several models to the same points, and what they say of points left out.
+    """The fits of several models to the same points, with their predictions of left-out points.
 
     Args:
         pairs: the points.
-        scale: the nominal one in the units of ``pairs``, None where none was given: then there is
-            no ``rigid``.
+        scale: nominal scale in the units of ``pairs``; None if it was not given: then there is no
+            ``rigid``.
     """
 
     def __init__(self, pairs: Pairs, scale: float | None) -> None:
@@ -67,10 +67,10 @@ class Candidates:
             for name, model in MODELS.items()
             if len(pairs.camera) >= model.least and (name != "rigid" or scale is not None)
         ]
-        """The models that there are points enough for, from the simplest."""
+        """Models for which there are enough points, the simplest first."""
 
     def get(self, name: ModelName) -> Fit | None:
-        """Return a model's fit, None where the points do not determine it."""
+        """Return a model's fit; None if the points do not determine it."""
         if name not in self._fits:
             try:
                 self._fits[name] = fit(name, self._pairs, self._scale)
@@ -79,13 +79,13 @@ class Candidates:
         return self._fits[name]
 
     def held_out(self, fitted: Fit) -> Array:
-        """Return each point minus what a fit of the others says of it, (N, 3)."""
+        """Return each point minus the place that a fit of the others predicts, (N, 3)."""
         if fitted.model not in self._held_out:
             self._held_out[fitted.model] = held_out(fitted, self._pairs, self._scale)
         return self._held_out[fitted.model]
 
     def require(self, name: ModelName) -> Fit:
-        """Return a model's fit; COLLINEAR: the points do not determine it."""
+        """Return a model's fit; raise COLLINEAR if the points do not determine it."""
         return self.get(name) or fit(name, self._pairs, self._scale)
 
     def simplest(self) -> ModelName:
@@ -94,12 +94,12 @@ class Candidates:
         return "similarity" if math.isnan(self.error(first)) else first
 
     def error(self, name: ModelName) -> float:
-        """Return a model's held-out error; NaN where it has none."""
+        """Return a model's held-out error; NaN if it has none."""
         fitted = self.get(name)
         return math.nan if fitted is None else rms(self.held_out(fitted), self._pairs.weights)
 
     def choose(self, sigma: float | None, first: ModelName) -> ModelName:
-        """Return the model that the points ask for, ``first`` or a more general one.
+        """Return the model that the points justify, ``first`` or a more general one.
 
         ``sigma``: standard deviation of a touch, in the units of ``pairs``.
         """
@@ -115,7 +115,7 @@ class Candidates:
         return chosen
 
     def errors(self, names: Sequence[ModelName]) -> dict[ModelName, float]:
-        """Return the held-out errors of models; NaN where there is none."""
+        """Return the held-out errors of models; NaN for a model without one."""
         return {name: self.error(name) for name in names}
 
 

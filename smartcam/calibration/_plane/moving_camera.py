@@ -1,14 +1,14 @@
-"""A camera that the robot carries: what it sees from another place than where it was calibrated.
+"""Use a camera that the robot carries from another pose than the one it was calibrated at.
 
 The calibration holds for the robot's pose at which it was made, ``T_cal``. At another pose,
-``T_now``, the camera and everything that it sees have moved by the rigid motion ``T_now T_cal^-1``,
-in the robot's frame: so it comes *behind* the static chain (derived). Before it, as the thesis
-3.2.5.2 has it, it would be right only with the camera's place on the robot, which a plane's
-calibration does not know.
+``T_now``, the camera and everything that it sees have moved by the rigid motion ``T_now T_cal^-1``
+in the robot's frame. So this motion is applied *after* the static chain (derived). The thesis,
+3.2.5.2, applies it before, which would be right only with the camera's place on the robot, and a
+plane's calibration does not know that.
 
 That holds as long as the plane of the parts is where the camera thinks it is: the motion must map
-the plane onto itself. Shifts within the plane and turns about its normal do; a camera that is
-raised, or tilted, sees the same pixels for other places, and is refused.
+the plane onto itself, as shifts within the plane and turns about its normal do. After a camera is
+raised or tilted, the same pixels show other places, so such poses are refused.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ class MovingCamera:
     """A calibrated camera on a robot that moves.
 
     Args:
-        static: what leads to the robot's frame from where the camera was calibrated.
-        calibrated_at: the robot's pose then, ``T_base_flange``: of any part of the robot to which
-            the camera is fixed.
+        static: solver from the camera, where it was calibrated, to the robot's frame.
+        calibrated_at: pose of the robot at the calibration, ``T_base_flange``, or that of any part
+            of the robot to which the camera is fixed.
         field: (N, 3), three points or more in the plane, in the robot's frame, metres: those that
-            were touched. The plane through them must stay, and it is looked at where they are.
-        tolerance: metres that the plane may move out of itself at any point of the field. A fifth
-            of a millimetre is what a touch by hand is good for.
-        max_lag: seconds between a pose of the robot and the image at most. At 250 mm/s the robot
-            does 5 mm in 20 ms, a quarter of a millimetre in one.
+            were touched. The plane must not move at these points.
+        tolerance: largest distance that the plane may move out of itself at any point of the field,
+            metres. A touch by hand is accurate to a fifth of a millimetre.
+        max_lag: longest time between a pose of the robot and the image, seconds. At 250 mm/s the
+            robot moves 5 mm in 20 ms, a quarter of a millimetre in one.
 
     Raises:
         CalibrationError: ``SHAPE``, ``NOT_FINITE``, ``TOO_FEW`` or ``COLLINEAR`` points of the
@@ -91,24 +91,24 @@ class MovingCamera:
             )
         self._normal: Array = axes[2]
         height = (points - self._centre) @ self._normal
-        self._field = points - np.outer(height, self._normal)  # without the noise of the touches
+        self._field = points - np.outer(height, self._normal)  # without the touches' noise
 
     def now(self, pose: Transform, image_at: datetime | None = None) -> Chain:
-        """Return the chain for an image that was taken at a pose.
+        """Return the chain of solvers for an image that was taken at a pose.
 
         Args:
-            pose: the robot's pose then, of the same frames as ``calibrated_at``.
-                :meth:`~smartcam.calibration.PoseHistory.at` gives the pose at the
-                time of an image from those before and after it.
-            image_at: when the image was taken. A localization's header has the time of its arrival,
-                which is later; ``Result.triggered_at`` is nearer. None where the robot stood still
-                from the image to the pose.
+            pose: the robot's pose at the image, in the same frames as ``calibrated_at``.
+                :meth:`~smartcam.calibration.PoseHistory.at` gives the pose at the time of an image
+                from those before and after it.
+            image_at: time of the image. A localization's header has the time of its arrival, which
+                is later; ``Result.triggered_at`` is nearer. None if the robot stood still between
+                the image and the pose.
 
         Raises:
             CalibrationError: ``WRONG_FRAME``: a pose of other frames; ``NOT_SIMULTANEOUS``: pose
                 and image are more than ``max_lag`` apart, or the pose has no time; ``BAD_TIME``:
-                the image's has no time zone;
-                ``PLANE_MOVED``: the plane of the parts would not be where the camera saw it.
+                the time of the image has no time zone; ``PLANE_MOVED``: the plane of the parts
+                would not be where the camera saw it.
         """
         self._check_frames(pose)
         if image_at is not None:
@@ -155,7 +155,7 @@ class MovingCamera:
             )
 
     def _check_plane(self, motion: Transform) -> None:
-        """Raise where the plane leaves itself, or comes back upside down."""
+        """Raise if a motion moves the plane out of itself, or turns it upside down."""
         off = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
         cosine = float((motion.rotation @ self._normal) @ self._normal)
         if off <= self._tolerance and cosine > 0:

@@ -1,10 +1,10 @@
-"""Touches that belong to other marks than they were given for: exchanged, shifted or turned about.
+"""Find touches that belong to other marks than they were given for: exchanged or shifted ones.
 
-Where the touches of two marks are exchanged, or all of them are shifted by one, least squares
-spread the mistake over all points. Here the order itself is looked for: from the order as given,
-from each shift of it, and from each of these backwards, the exchange of two touches that makes the
-sum of squares least is made, until none makes it less. An order is worth a word only where a
-simple map explains it and the order as given is far from that.
+If the touches of two marks are exchanged, or all of them are shifted by one, least squares spread
+the mistake over all points. This module searches for the right order. It starts from the order as
+given, from each shift of it, and from each of these reversed. Each step exchanges the two touches
+that lower the sum of squares most, until no exchange lowers it. An order is reported only if a
+simple map explains it and explains the order as given far worse.
 """
 
 from __future__ import annotations
@@ -25,29 +25,34 @@ if TYPE_CHECKING:
     Order = NDArray[np.intp]
 
 SIGNIFICANCE_LEVEL = 1e-6
-"""Largest chance that noise alone makes another order look far better than the one given."""
+"""Another order is reported only if noise alone would make it look that much better with at most
+this probability."""
 
 MIN_NOISE_CHANCE = 0.001
-"""Least chance that the noise of touches is as large as what the better order leaves over."""
+"""Another order is reported only if the touches' noise leaves residuals as large with at least this
+probability."""
 
 MAX_POINTS_TO_ORDER = 40
-"""Points up to which an order is looked for: a step compares the square of their number."""
+"""The order of at most this many points is searched: the work of a step grows with the square of
+their number."""
 
 SURE_ORDER_RATIO = 2
-"""An order is sure if every other one that does as well moves as many times the touches."""
+"""An order is sure if every other order that fits as well moves at least this many times as many
+touches."""
 
 MIN_POINTS_FOR_AFFINE = 6
-"""Points from which an affine map may explain another order; it fits any four nearly."""
+"""An affine map explains another order only with at least this many points: it nearly fits any
+four."""
 
 
 class Reordered(NamedTuple):
-    """An order that explains the touches better.
+    """An order that explains the touches better than the given one.
 
     Attributes:
         order: (N,), for each mark the index of the touch that belongs to it.
-        before: sigma of a touch that the order as given speaks of, in the unit of the touches.
-        after: sigma of a touch that the better order speaks of, in the unit of the touches.
-        sure: True if every other order that does as well moves far more touches: marks in a regular
+        before: sigma of a touch, estimated with the order as given, metres.
+        after: sigma of a touch, estimated with the better order, metres.
+        sure: True if every other order that fits as well moves far more touches: marks in a regular
             grid look alike from several sides.
     """
 
@@ -61,10 +66,10 @@ class Reordered(NamedTuple):
         """Indices of the marks that get another touch."""
         return tuple(np.flatnonzero(self.order != np.arange(len(self.order))).tolist())
 
-    def remark(self, numbers: NDArray[np.intp], mm: float = 1e3) -> Remark:
-        """Return a remark that tells of the better order.
+    def remark(self, numbers: NDArray[np.intp]) -> Remark:
+        """Return a remark that reports the better order.
 
-        ``numbers`` (N,): what texts call the points. ``mm``: millimetres for each unit of touches.
+        ``numbers`` (N,): numbers of the points in messages.
         """
         moved = [int(numbers[i]) for i in self.moved]
         which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
@@ -72,15 +77,15 @@ class Reordered(NamedTuple):
         several = "" if self.sure else "; more than one order does as well: touch them anew"
         return Code.WRONG_ORDER.remark(
             f"the touches of points {which} look {how}: as given they speak of a touch with a "
-            f"sigma of {mm * self.before:.3g} mm, put right of {mm * self.after:.3g} mm{several}"
+            f"sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{several}"
         )
 
 
 def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
-    """Return the order of touches that explains them far better than the one given, if any does.
+    """Return an order of touches that explains them far better than the given one, if there is one.
 
-    ``camera`` (N, 2), ``robot`` (N, 3), in the order as given. ``sigma``: the most that one
-    coordinate of a touch may be off, in the robot's unit.
+    ``camera`` (N, 2), ``robot`` (N, 3), metres, in the order as given. ``sigma``: largest
+    plausible standard deviation of a touch's coordinate, metres.
     """
     count = len(camera)
     if not 3 < count <= MAX_POINTS_TO_ORDER:
@@ -91,7 +96,7 @@ def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
     for model in models:
         given, freedom = model.squares(np.arange(count)[None])[0], 3 * count - model.parameters
         if Noise(sigma**2).chance(given, freedom) > SIGNIFICANCE_LEVEL:
-            return None  # a simple map explains the order as given
+            return None  # a simple map explains the given order already
         orders, squares = model.search()
         scale = max(squares.min() / freedom, (ROUNDING_RATIO * model.extent) ** 2)
         noise = Noise(scale, freedom)
@@ -109,7 +114,7 @@ def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
 
 
 class _Similarity:
-    """Sums of squares of similarities, for many orders at once."""
+    """Sums of squares of the residuals from similarities, for many orders at once."""
 
     parameters = 7
 
@@ -127,10 +132,11 @@ class _Similarity:
         return self._left(np.einsum("kni,nj->kij", self._touches[orders], self._camera))
 
     def _left(self, cross: Array) -> Array:
-        """Return the rest of the touches' squares, by sums of products (..., 3, 2)."""
-        # With marks of squares 1 the best scale is the sum of the singular values of C = sum p u^T,
-        # and takes its square off. (s1 + s2)^2 = tr C^T C + 2 sqrt(det C^T C).
-        # Source: Umeyama, Least-Squares Estimation of Transformation Parameters (1991).
+        """Return the sums of squares that similarities leave, from products (..., 3, 2)."""
+        # If the squares of the marks add up to 1, the best scale is the sum of the singular values
+        # of C = sum p u^T, and its square is what the fit removes. (s1 + s2)^2 = tr C^T C + 2
+        # sqrt(det C^T C). Source: Umeyama, Least-Squares Estimation of Transformation Parameters
+        # (1991).
         inner = np.swapaxes(cross, -1, -2) @ cross
         root = np.sqrt(np.maximum(np.linalg.det(inner), 0.0))
         left = self._total - np.trace(inner, axis1=-2, axis2=-1) - 2.0 * root
@@ -144,7 +150,7 @@ class _Similarity:
         return orders, self.squares(orders)
 
     def _descended(self, order: Order) -> Order:
-        """Return an order after all exchanges that make its sum of squares less."""
+        """Return an order after all exchanges that lower its sum of squares."""
         first, second = np.triu_indices(len(order), 1)
         order, least = order.copy(), float(self.squares(order[None])[0])
         while True:
@@ -163,7 +169,7 @@ class _Similarity:
 
 
 class _Affine(_Similarity):
-    """Sums of squares of affine maps, as of a camera that is tilted, for many orders at once."""
+    """Sums of squares of the residuals from affine maps, as of a tilted camera, for many orders."""
 
     parameters = 9
 

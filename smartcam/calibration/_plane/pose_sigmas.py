@@ -1,4 +1,4 @@
-"""The errors that poses have in the robot's space: those of the camera and of the calibration."""
+"""Compute the errors of poses in the robot's space, from those of camera and calibration."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
-STEP: Final = 1e-4
-"""Length of the steps that derivatives are taken by, in parts of the touched field."""
+STEP_SHARE: Final = 1e-4
+"""Length of the steps of numerical derivatives, as a part of the touched field."""
 
 
 def robot_sigmas(
@@ -32,8 +32,8 @@ def robot_sigmas(
     """Return the errors of poses in the robot's space.
 
     Args:
-        seen: localizations of the camera, whose poses say their errors.
-        transform: maps points of the camera (N, 2) to the robot's space.
+        seen: localizations of the camera, whose poses have sigmas.
+        transform: function that maps points of the camera (N, 2) to the robot's space.
         normal: the plane's normal (3,).
         by_matrix: derivatives of mapped points by the calibration's parameters, (N, 3, K).
         covariance: covariance of these parameters, (K, K).
@@ -42,7 +42,7 @@ def robot_sigmas(
     """
     points = np.array([one.pose.position[:2] for one in seen])
     angles = np.array([one.pose.orientation.theta for one in seen])
-    step = STEP * size
+    step = STEP_SHARE * size
 
     def ahead(at: Array, turn: Array) -> Array:
         return at + step * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -55,7 +55,7 @@ def robot_sigmas(
     left = np.cross(normal, along) / lengths[:, None]
 
     def pose_change(off_place: Array, off_along: Array) -> Array:
-        """Return (N, 4): the changes of x, y, z and the angle."""
+        """Return the changes of x, y, z and the angle, (N, 4)."""
         angle = (left * off_along).sum(axis=1) / lengths
         return np.column_stack([off_place, angle])
 
@@ -65,7 +65,9 @@ def robot_sigmas(
         place = (transform(ends[0]) - transform(ends[1])) / (2 * step)
         turned = (directions(ends[0], angles) - directions(ends[1], angles)) / (2 * step)
         columns.append(pose_change(place, turned))
-    turned = (directions(points, angles + STEP) - directions(points, angles - STEP)) / (2 * STEP)
+    turned = (directions(points, angles + STEP_SHARE) - directions(points, angles - STEP_SHARE)) / (
+        2 * STEP_SHARE
+    )
     columns.append(pose_change(np.zeros_like(turned), turned))
     slopes = np.stack(columns, axis=2)
     own = np.array([_covariance(one.pose.sigma) for one in seen])
@@ -77,7 +79,7 @@ def robot_sigmas(
 
 
 def _covariance(sigma: PoseSigma | None) -> Array:
-    """Return the covariance (3, 3) of x, y and theta; of no sigma one that is not a number."""
+    """Return the covariance (3, 3) of x, y and theta; NaN without a sigma."""
     if sigma is None:
         return np.full((3, 3), np.nan)
     xy, xt, yt = sigma.correlation_xy, sigma.correlation_xt, sigma.correlation_yt
@@ -88,7 +90,7 @@ def _covariance(sigma: PoseSigma | None) -> Array:
 
 
 def _sigma(covariance: Array, sign: float) -> PoseSigma:
-    """Return the sigmas of a covariance (4, 4) of x, y, z and theta; ``sign``: of theta."""
+    """Return the sigmas of a covariance (4, 4) of x, y, z and theta; ``sign`` is that of theta."""
     x, y, z, theta = np.sqrt(np.diag(covariance).clip(0)).tolist()
 
     def correlation(first: int, second: int) -> float:

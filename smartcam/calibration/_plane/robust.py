@@ -1,17 +1,17 @@
-"""Find the touches that agree with one another, where some are wrong.
+"""Find the touches that agree with one another if some are wrong.
 
 A touch of the wrong mark, or of two marks swapped, lies many sigmas off, and least squares spread
-it over all the others. Here every small subset of the points proposes a map (MSAC): what it costs
-is the sum of the squares of the others, none of them counted with more than the threshold. The best
-maps are fitted to the points that agree with them until those no longer change. A point is left out
-where noise alone would lay one point of all so far from the others in one of 100 calibrations.
+it over all the others. Here every small subset of the points proposes a map (MSAC). The cost of a
+map is the sum of the other points' squares, each counted up to a threshold. The best maps are
+fitted again to the points that agree with them, until those no longer change. A point is left out
+if noise alone would move any point so far from the others in only one of 100 calibrations.
 
-The maps are similarities; where noise does not explain what that costs above a homography, they are
-homographies. So a tilted camera does not make outliers of the corners, whatever model is asked for
-in the end.
+The maps are similarities, or homographies if noise does not explain by how much a similarity costs
+more. So the corners do not become outliers under a tilted camera, whichever model is used in the
+end.
 
-The points are sorted first, and the subsets of many points drawn with a fixed seed: the same points
-give the same answer, in whatever order they come.
+The points are sorted first, and random subsets are drawn with a fixed seed, so the same points give
+the same answer in any order.
 """
 
 from __future__ import annotations
@@ -47,16 +47,17 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MIN_POINTS = 6
-"""Points below which those that agree are hardly more than a map has need of."""
+"""At least this many points are needed: with fewer, those that agree are hardly more than a map
+needs."""
 
 MAX_SUBSETS_TRIED = 500
-"""Subsets that propose a map; of up to 12 points that is each one.
+"""At most this many subsets propose a map; for up to 12 points these are all subsets.
 
-With half of the points wrong, all of 500 subsets of four hold a wrong one in 1 of 10^14 cases.
+If half of the points are wrong, each of 500 subsets of four has a wrong one in 1 of 10^14 cases.
 """
 
-FITTED_PROPOSALS = 5
-"""Proposals that are fitted to the points that agree with them."""
+MAX_FITTED_PROPOSALS = 5
+"""Number of the best proposals that are fitted to the points that agree with them."""
 
 MAX_ROUNDS = 10
 """Fitting and judging take turns at most this many times; they usually take 2 or 3."""
@@ -65,10 +66,10 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may leave out a point, or ask for a homography."""
 
 LEFT_OUT_COST_RATIO = 0.5
-"""Part of the threshold that a left-out point costs where similarity and homography are compared.
+"""A left-out point costs this part of the threshold when similarity and homography are compared.
 
-A homography that only goes through one wrong point more is not chosen then: with 1, two wrong ones
-of six gave one that did so in 7 of 400 cases (measured).
+So a homography that only goes through one more wrong point is not chosen: with 1 instead, that
+happened in 7 of 400 cases with two wrong points of six (measured).
 """
 
 SEED = 7
@@ -78,18 +79,21 @@ MEDIAN_SQUARE = 2.366
 """Median of the squared length of a residual in three dimensions with a variance of 1 (derived)."""
 
 MIN_TRIANGLE_RATIO = 0.02
-"""A subset's smallest triangle is larger than this part of its largest, or its map says nothing."""
+"""The smallest triangle of a subset must be larger than this part of its largest, or its map is
+useless."""
 
 MIN_VARIANCE_RATIO = 1e-8
-"""Part of a residual's variance below which a point cannot be judged: the map goes through it."""
+"""A point cannot be judged if less than this part of its residual's variance is left: the map goes
+through it."""
 
 
 class _Agreement(NamedTuple):
-    """Points that agree."""
+    """Points that agree with a map."""
 
     fitted: Fit
-    mask: Mask  # (N,), True for those points
-    cost: float  # sum of their squares, and the threshold for each other point
+    mask: Mask  # (N,), True for each point that agrees
+    # cost of the map: the squares of these points, plus the threshold for each other point
+    cost: float
 
     @property
     def least(self) -> int:
@@ -102,11 +106,11 @@ def agreeing(
 ) -> NDArray[np.bool_]:
     """Return the mask (N,) of points that agree with one another, more than half of them.
 
-    All, where no subset determines a map: what is wrong with such points is for ``check_samples``
-    to say. ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over
-    the relative variance of each. ``touch_sigma``: of one coordinate, metres; None: from the
-    residuals of those that agree. Without a sigma about (N - 3) / 2 wrong points are found, with
-    one any number below half of the points.
+    All points agree if no subset determines a map; ``check_samples`` then says what is wrong with
+    them. ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over the
+    relative variance of each. ``touch_sigma``: standard deviation of one coordinate, metres; None:
+    estimated from the points that agree. Without it up to about (N - 3) / 2 wrong points are found,
+    with it any number below half of the points.
 
     Raises TOO_FEW, or OUTLIER: no map agrees with more than half of the points;
     MissingExtraError: SciPy is not installed.
@@ -133,7 +137,7 @@ def agreeing(
 
 
 def _about_median(camera: Array, robot: Array, weights: Array) -> tuple[Pairs, float]:
-    """Return the points about their medians in units of their size, and the robot's unit."""
+    """Return the points relative to their medians, scaled by their size, and the robot's scale."""
     scaled, size = [], 0.0
     for points in (camera, robot):
         centred = points - np.median(points, axis=0)
@@ -144,7 +148,7 @@ def _about_median(camera: Array, robot: Array, weights: Array) -> tuple[Pairs, f
 
 
 def _best(pairs: Pairs, sigma: float | None) -> _Agreement | None:
-    """Return the points that agree, with a homography where a similarity does not do."""
+    """Return the points that agree with a similarity, or else with a homography."""
     simple, general = _search("similarity", pairs, sigma), _search("homography", pairs, sigma)
     if simple is None or general is None or general.mask.sum() < general.least:
         return simple or general
@@ -161,7 +165,7 @@ def _best(pairs: Pairs, sigma: float | None) -> _Agreement | None:
 
 
 def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | None:
-    """Return the points that agree with a map of one model; None where nothing determines one."""
+    """Return the points that agree with a map of one model; None if no subset determines a map."""
     matrices = _proposals(name, pairs)
     if not len(matrices):
         return None
@@ -174,7 +178,7 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
     # MSAC: sum min(r^2, threshold). Source: Torr and Zisserman, MLESAC (2000).
     costs = np.minimum(squared, threshold).sum(axis=1)
     found: dict[bytes, _Agreement] = {}
-    for index in np.argsort(costs, kind="stable")[:FITTED_PROPOSALS]:
+    for index in np.argsort(costs, kind="stable")[:MAX_FITTED_PROPOSALS]:
         one = _settle(name, pairs, squared[index] <= threshold, sigma, threshold)
         if one is not None:
             found.setdefault(one.mask.tobytes(), one)
@@ -184,14 +188,14 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
 def _settle(
     name: ModelName, pairs: Pairs, mask: Mask, sigma: float | None, threshold: float
 ) -> _Agreement | None:
-    """Fit and judge in turns, until the points that agree are those that were fitted."""
+    """Fit and judge in turn, until the points that agree are those that were fitted."""
     fitted = None
     for _ in range(MAX_ROUNDS):
         if int(mask.sum()) < MODELS[name].least:
             return None
         try:
             fitted = fit(name, Pairs(pairs.camera[mask], pairs.robot[mask], pairs.weights[mask]))
-        except CalibrationError:  # they do not determine it
+        except CalibrationError:  # the points do not determine the model
             return None
         judged = _judged(fitted, pairs, mask, sigma)
         if np.array_equal(judged, mask):
@@ -204,11 +208,11 @@ def _settle(
 
 
 def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
-    """Return the mask (N,) of points that noise explains, each against a fit of the others."""
+    """Return a mask (N,) of the points that noise explains, each beside a fit of the others."""
     rows = element_derivatives(fitted.matrix, pairs.camera)
     known = rows @ fitted.unit_covariance @ rows.swapaxes(1, 2)
-    # A point that was fitted has drawn the map to itself: its residual has the variance
-    # I / w - J C J^T. One that was not has the map's own on top: I / w + J C J^T.
+    # A fitted point has pulled the map towards itself: its residual has the variance I / w - J C
+    # J^T. For any other point the variance of the map is added: I / w + J C J^T.
     signs = np.where(mask, -1.0, 1.0)[:, None, None]
     variances = np.eye(3) / pairs.weights[:, None, None] + signs * known
     residuals = pairs.robot - apply_homography(fitted.matrix, pairs.camera)
@@ -218,8 +222,8 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
     if sigma is not None:
         return np.asarray(squared <= max(sigma, ROUNDING_RATIO) ** 2 * _limit(len(mask), None))
-    # The squares without the point itself, which an outlier would make large: their sum falls by
-    # r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
+    # An outlier would enlarge the sum of squares, so the point's own share is taken out: the sum
+    # falls by r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
     total, freedom = squares(fitted.residuals, pairs.weights[mask]), fitted.freedom
     limits = np.full(len(mask), math.inf)
@@ -231,7 +235,7 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
 
 
 def _noise(found: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
-    """Return the touches' noise: as given, or as the residuals of those that agree say."""
+    """Return the touches' noise as given, or estimated from the points that agree."""
     squared = squares(found.fitted.residuals, pairs.weights[found.mask])
     return touch_noise(sigma, squared, found.fitted.freedom) or Noise(ROUNDING_RATIO**2)
 
@@ -239,8 +243,8 @@ def _noise(found: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
 def _limit(count: int, freedom: int | None) -> float:
     """Return the squared length of a residual that noise with a variance of 1 seldom exceeds.
 
-    ``count``: of points among which one may be longer in 1 of 100 calibrations. ``freedom``: of the
-    estimate that the variance comes from; None where it is known.
+    ``count``: number of points, of which one may exceed it in 1 of 100 calibrations. ``freedom``:
+    degrees of freedom of the estimated variance; None if the variance is known.
     """
     # Each point with SIGNIFICANCE_LEVEL / N, so that in at most that part of the calibrations one
     # of all points is longer (Bonferroni): chi-square of three coordinates, or three times F of an
@@ -252,7 +256,7 @@ def _limit(count: int, freedom: int | None) -> float:
 
 
 def _scale(squared: Array, least: int) -> float:
-    """Return the sigma of the proposal that half of the points beside its own lie closest to.
+    """Return the sigma from the proposal that half of the points beside its own lie closest to.
 
     Source: Rousseeuw and Leroy, Robust Regression and Outlier Detection (1987), chapter 5: least
     median of squares, with their correction for few points.
@@ -265,7 +269,7 @@ def _scale(squared: Array, least: int) -> float:
 
 
 def _subsets(count: int, least: int) -> NDArray[np.intp]:
-    """Return all subsets of ``least`` points, or as many drawn ones as are allowed."""
+    """Return all subsets of ``least`` points, or if they are too many, a random choice."""
     if math.comb(count, least) <= MAX_SUBSETS_TRIED:
         return np.array(list(itertools.combinations(range(count), least)), dtype=np.intp)
     random = np.random.default_rng(SEED).random((MAX_SUBSETS_TRIED, count))
@@ -273,14 +277,14 @@ def _subsets(count: int, least: int) -> NDArray[np.intp]:
 
 
 def _proposals(name: ModelName, pairs: Pairs) -> Array:
-    """Return the maps that subsets of the points determine (S, 4, 3)."""
+    """Return the maps (S, 4, 3) that subsets of the points determine."""
     subsets = _subsets(len(pairs.camera), MODELS[name].least)
     subsets = subsets[_shapely(pairs.camera[subsets]) & _shapely(pairs.robot[subsets])]
     return PROPOSALS[name](pairs.camera[subsets], pairs.robot[subsets])
 
 
 def _shapely(points: Array) -> Mask:
-    """Return True for each subset (S,) without three points nearly in a line."""
+    """Return a mask (S,) of the subsets in which no three points lie nearly in a line."""
     areas = []
     for triple in itertools.combinations(range(points.shape[1]), 3):
         first, second = (points[:, one] - points[:, triple[0]] for one in triple[1:])
@@ -304,12 +308,12 @@ def _similarities(camera: Array, robot: Array) -> Array:
 def _homographies(camera: Array, robot: Array) -> Array:
     """Return the homography into the plane of each subset of four (S', 4, 3).
 
-    Three of the points and what the fourth is made of in terms of them are a basis in each plane;
-    a map whose horizon divides the four is left out.
+    Three of the points, scaled so that they add up to the fourth, are a basis in each plane. A map
+    whose horizon separates the four points is left out.
     """
     # With x_4 = a x_1 + b x_2 + c x_3 and u_4 = d u_1 + e u_2 + f u_3 of homogeneous points,
     # H u_i = (a/d, b/e, c/f)_i x_i maps all four: H = (x_1 x_2 x_3) diag(a/d, b/e, c/f)
-    # (u_1 u_2 u_3)^-1. The factors are the depths at the first three points, to a common one.
+    # (u_1 u_2 u_3)^-1. The factors are the depths at the first three points, up to a common factor.
     mean = robot.mean(axis=1, keepdims=True)
     axes = np.linalg.svd(robot - mean, full_matrices=False)[2][:, :2]
     inside = _with_one((robot - mean) @ axes.swapaxes(1, 2)).swapaxes(1, 2)
@@ -330,7 +334,7 @@ PROPOSALS: dict[ModelName, Callable[[Array, Array], Array]] = {
     "similarity": _similarities,
     "homography": _homographies,
 }
-"""Functions that give maps of subsets (S, least, 2) and (S, least, 3)."""
+"""Functions that compute the maps of subsets (S, least, 2) and (S, least, 3)."""
 
 
 def _squared(matrices: Array, pairs: Pairs) -> Array:

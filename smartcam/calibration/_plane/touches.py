@@ -1,11 +1,10 @@
-"""A plane from the origin mark that the camera localizes, and touches of the sheet's two rays.
+"""Fit a plane from the origin mark that the camera localizes, and touches of the sheet's rays.
 
 The sheet has an origin and two rays at right angles, A along its x and B along its y. The camera
-says where the origin lies and how it is turned; the robot touches the origin and each ray anywhere.
-How far along is not known, so the scale comes from the user, and of three touches one number is
-left to check them with: the angle between the rays. Where the camera sees more than one mark,
-:func:`~smartcam.calibration.fit_plane` gives a better calibration from as many
-touches.
+localizes the origin with its angle; the robot touches the origin, and each ray anywhere. The place
+along the ray is not known, so the scale comes from the user, and three touches leave only one
+number to check: the angle between the rays. If the camera sees more than one mark,
+:func:`~smartcam.calibration.fit_plane` gives a better calibration from as many touches.
 """
 
 from __future__ import annotations
@@ -17,10 +16,15 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, numbers, of_class, or_none, takes
 from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
-from smartcam.calibration._plane.diagnostics import TYPICAL_SIGMA, check_side, remark_side, sigma_of
+from smartcam.calibration._plane.diagnostics import (
+    TYPICAL_SIGMA_M,
+    check_side,
+    remark_side,
+    sigma_of,
+)
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
-from smartcam.calibration._plane.validation import check_lever, check_positive
+from smartcam.calibration._plane.validation import check_field, check_lever, check_positive
 from smartcam.calibration._statistics import Noise
 from smartcam.geometry import Code, Remark
 from smartcam.geometry._inside import as_points, frame_from_axes, rotate_ccw
@@ -39,13 +43,13 @@ SIGNIFICANCE_LEVEL = 0.01
 
 
 class _FittedRays(NamedTuple):
-    """A fitted sheet."""
+    """A sheet that was fitted to touches."""
 
-    origin: Array  # (3,), metres
+    origin: Array  # (3,), origin, metres
     frame: Array  # (3, 3): rays A and B and the normal as columns
-    along: Array  # (N,), where on its ray each touch lies, metres
-    residuals: Array  # (N, 3), metres
-    covariance: Array  # (6, 6), of shift and turn, for touches with a variance of 1 m^2
+    along: Array  # (N,), place of each touch along its ray, metres
+    residuals: Array  # (N, 3), residuals, metres
+    covariance: Array  # (6, 6), covariance of shift and turn, for touches with a variance of 1 m^2
 
 
 @takes(
@@ -73,32 +77,35 @@ def fit_touches(
 ) -> PlaneCalibration:
     """Return the map from the camera's plane to the robot, from touches of the sheet's rays.
 
-    All touches count alike: the most likely origin and frame, with rays at right angles.
+    All touches have the same weight; the result is the most likely origin and frame with rays at
+    right angles.
 
     Args:
         origin: the origin mark, as the camera localized it; its theta is the direction of ray A.
         o: (3,) or (K, 3), touches of the origin, metres.
         a: (3,) or (K, 3), touches anywhere on ray A.
         b: (3,) or (K, 3), touches anywhere on ray B.
-        nominal_scale: metres for each unit of the camera; a smart camera gives metres.
+        nominal_scale: metres per unit of the camera; a smart camera gives metres.
         touch_sigma: standard deviation of one coordinate of a touch, metres.
         theta_sigma: standard deviation of the origin's theta, radians; 0.1 degrees are 0.5 mm at
-            300 mm. It counts in the predicted error where ``touch_sigma`` is given.
+            300 mm. It is part of the predicted error if ``touch_sigma`` is given.
         tool_z: (3,), direction of the tool's axis, into the plane, when it touched.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
         y_down: whether the camera's y axis points down and was turned up before the origin came;
-            None: not known. Kept, and compared where the calibration is used; nothing is turned.
+            None: not known. The value is stored, and compared when the calibration is used; nothing
+            is turned here.
 
     Returns:
-        A calibration with the model ``touches``. Its camera points are where the touches are on
-        their rays; none can be held out.
+        A calibration with the model ``touches``. Its camera points are the places of the touches on
+        their rays; none can be left out.
 
     Raises:
         CalibrationError: SHAPE, NOT_FINITE, TOO_FEW, COINCIDENT: A or B lies on the origin;
-            COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED.
+            COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED; UNIT_UNKNOWN:
+            they are farther apart than 20 m.
 
-    Source: the thesis' procedure, sections 3.2.3 and 3.2.4; its mathematics is put right.
+    Source: the thesis' procedure, sections 3.2.3 and 3.2.4, with its mathematics corrected.
     """
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
@@ -112,6 +119,7 @@ def fit_touches(
         _touches(touches, name) for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
     ]
     touched = np.concatenate(groups)
+    check_field(touched)
     ray = np.repeat([0, 1, 2], [len(group) for group in groups])
     levers = [float(np.linalg.norm(one.mean(0) - groups[0].mean(0))) for one in groups[1:]]
     sheet = _fit(touched, ray)
@@ -120,7 +128,7 @@ def fit_touches(
     axis = None if tool_z is None else mean_axis(tool_z, len(touched))
     side = None if axis is None else check_side(sheet.frame[:, 2], axis)
     freedom = 3 * len(groups[0]) + 2 * len(groups[1]) + 2 * len(groups[2]) - 6
-    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA)
+    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))
@@ -167,7 +175,7 @@ def _touches(values: ArrayLike, name: str) -> Array:
 
 
 def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
-    """Return the most likely sheet; where on its ray a touch lies is free."""
+    """Return the most likely sheet; the place of each touch along its ray is free."""
     # Gauss and Newton's steps of shift and turn: 3 to 6 of them, in 2.5 ms; SciPy's least_squares
     # takes 6 ms (measured).
     origin = touched[ray == 0].mean(axis=0)
@@ -189,7 +197,7 @@ def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
 def _linear(
     touched: Array, ray: NDArray[np.intp], origin: Array, frame: Array
 ) -> tuple[Array, Array, Array]:
-    """Return places of touches along their rays, residuals across, and the Jacobian (3N, 6)."""
+    """Return the touches' places along their rays, residuals across, and the Jacobian (3N, 6)."""
     axes: Array = np.concatenate([np.zeros((1, 3)), frame[:, :2].T])
     directions = axes[ray]
     # Off its ray with direction d a touch q is (I - d d^T) (q - o). A shift s of the origin and a

@@ -1,4 +1,4 @@
-"""Check whether points can give a calibration at all, before a number is made of them."""
+"""Check whether points determine a calibration at all, before it is computed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from smartcam._arguments import plain, shown
 from smartcam.calibration._plane.fitting import Normalization, Pairs
+from smartcam.calibration._units import MAX_UNASKED_M
 from smartcam.geometry import Code
 from smartcam.geometry._inside import as_points
 
@@ -19,25 +20,28 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_EXTENT_IN_SIGMAS = 20.0
-"""Extent of the touched points across their longest direction, in sigmas of a touch."""
+"""Least extent of the touched points across their longest direction, in sigmas of a touch."""
 
 MIN_WIDTH_RATIO = 0.1
-"""Extent across over extent along the longest direction; both rms.
+"""Least ratio of the extent across the longest direction to the extent along it, both RMS.
 
 Three points whose legs are 10 degrees apart have 0.15.
 """
 
 MAX_THICKNESS_RATIO = 0.2
-"""Extent out of the plane over extent across the longest direction, both rms."""
+"""Largest ratio of the extent out of the plane to the extent across the longest direction, both
+RMS."""
 
 SAME_MARK_RATIO = 0.01
-"""Part of the points' extent: points of one touch that are closer together show one mark."""
+"""Points of one touch that are closer together than this part of the points' extent show one
+mark."""
 
 SAME_POINT_RATIO = 1e-9
 """Points that are closer together than this part of the extent of all points count as the same."""
 
 MIN_DIFFERENCE = 1e-100
-"""Difference of two coordinates below which they are the same: the square of it is a number."""
+"""Two coordinates that differ by less than this are the same; the square of it is still a
+number."""
 
 
 def read_pairs(
@@ -70,18 +74,19 @@ def read_pairs(
 class Distinct(NamedTuple):
     """Points of which each counts once, however often it was touched."""
 
-    camera: Array  # (M, 2)
-    robot: Array  # (M, 3)
-    weights: Array  # (M,): that of one touch, since what is wrong with a point is in all of them
-    number: NDArray[np.intp]  # (N,), which of these a given point is
-    first: NDArray[np.intp]  # (M,), index of the first of the given points
+    camera: Array  # (M, 2), camera's points
+    robot: Array  # (M, 3), robot's points
+    # (M,), weights of a single touch each, since an error of the point is in all of its touches
+    weights: Array
+    number: NDArray[np.intp]  # (N,), index of the distinct point that each given point belongs to
+    first: NDArray[np.intp]  # (M,), index of the first given point of each
 
 
 def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
-    """Return points with the means of those that are no points of their own.
+    """Merge repeated points into their means.
 
-    Such are touches of one and the same point of the camera, and one and the same touch of points
-    that are close together: pictures of one mark.
+    Repeated points are several touches of the same camera point, and several camera points close
+    together with the same touch, which are pictures of one mark.
     """
     number = np.unique(camera, axis=0, return_inverse=True)[1].ravel()
     touch = np.unique(robot, axis=0, return_inverse=True)[1].ravel()
@@ -94,7 +99,7 @@ def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
         if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < near:
             number[np.isin(number, number[same])] = number[same[0]]
     first, number = np.unique(number, return_index=True, return_inverse=True)[1:]
-    order = np.argsort(first)  # as they came
+    order = np.argsort(first)  # in the order in which the points came
     first, number = first[order], np.argsort(order)[number.ravel()]
     share = weights / np.bincount(number, weights)[number]
     means = [
@@ -107,7 +112,7 @@ def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
 
 
 def check_positive(value: float | None, name: str, unit: str) -> None:
-    """Raise (NOT_FINITE) where an option is neither None nor a positive number."""
+    """Raise NOT_FINITE if an option is neither None nor a positive number."""
     if value is None:
         return
     number: object = plain(value)
@@ -121,14 +126,15 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
 
 
 def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | None) -> None:
-    """Raise where points do not determine a plane and a map onto it.
+    """Raise if points do not determine a plane and a map onto it.
 
-    ``camera`` (N, 2); ``robot`` (N, 3), metres; ``least`` points are needed by the model;
-    ``touch_sigma``: of one coordinate, metres; None where it is not known. TOO_FEW, COINCIDENT,
-    COLLINEAR, NOT_PLANAR or SHORT_LEVER.
+    ``camera`` (N, 2); ``robot`` (N, 3), metres; the model needs ``least`` points; ``touch_sigma``
+    is that of one coordinate, metres, or None if it is not known. Raises TOO_FEW, UNIT_UNKNOWN,
+    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER.
     """
     if len(camera) < least:
         raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
+    check_field(robot)
     for points, what in ((camera, "camera points"), (robot, "robot points")):
         _check_distinct(points, what, least)
         _check_width(points, what)
@@ -144,6 +150,17 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
         check_lever(lever(robot), touch_sigma)
 
 
+def check_field(robot: Array) -> None:
+    """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than in any cell."""
+    if (found := extent(robot)) > MAX_UNASKED_M:
+        raise Code.UNIT_UNKNOWN.refusal(
+            f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
+            f"of {found:.4g} m: are they millimetres? Multiply them by 0.001",
+            MAX_UNASKED_M,
+            found,
+        )
+
+
 def lever(robot: Array) -> float:
     """Return the extent of touched points (N, 3) across their longest direction, metres."""
     return float(np.ptp(_turned(robot)[:, 1]))
@@ -155,9 +172,9 @@ def extent(points: Array) -> float:
 
 
 def check_lever(found: float, touch_sigma: float) -> None:
-    """Raise (SHORT_LEVER) where points lie too close together for how well they are touched.
+    """Raise SHORT_LEVER if points lie too close together for the error of the touches.
 
-    ``found``: how far they reach, metres. ``touch_sigma``: of one coordinate, metres.
+    ``found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
     """
     if found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
         raise Code.SHORT_LEVER.refusal(
@@ -170,7 +187,7 @@ def check_lever(found: float, touch_sigma: float) -> None:
 
 
 def normalize(camera: Array, robot: Array, weights: Array) -> tuple[Normalization, Pairs]:
-    """Return the points as the fit wants them, and where they were."""
+    """Return the points centred and scaled for the fit, and their centres and sizes."""
     camera_centre, robot_centre = camera.mean(axis=0), robot.mean(axis=0)
     near, far = camera - camera_centre, robot - robot_centre
     camera_size = math.sqrt(float((near**2).sum(axis=1).mean()))
@@ -180,14 +197,14 @@ def normalize(camera: Array, robot: Array, weights: Array) -> tuple[Normalizatio
 
 
 def _turned(points: Array) -> Array:
-    """Return points along their own axes, the longest first."""
+    """Return the points in their principal axes, the longest first."""
     centred = points - points.mean(axis=0)
     turned: Array = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
     return turned
 
 
 def _extents(points: Array) -> Array:
-    """Return the rms extents along the points' own axes, the longest first."""
+    """Return the RMS extents along the points' principal axes, the longest first."""
     centred = points - points.mean(axis=0)
     singular = np.asarray(np.linalg.svd(centred, compute_uv=False), dtype=np.float64)
     return singular / math.sqrt(len(points))

@@ -1,1 +1,1 @@
-"""Sheets with targets, to print."""
+"""Lay out sheets with targets, to print them."""

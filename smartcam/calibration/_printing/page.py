@@ -1,7 +1,7 @@
-"""Black shapes on a page, written to scale as SVG and as PDF.
+"""Write black shapes on a page to scale, as SVG and as PDF.
 
-A page's coordinates are millimetres from its lower left corner, y up. Shapes are filled, none has a
-stroke: the outline of what is printed is where its numbers say. The same shapes always give the
+A page's coordinates are millimetres from its lower left corner, y up. Shapes are filled and have no
+stroke, so the printed outline is exactly that of the coordinates. The same shapes always give the
 same bytes.
 """
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 Point: TypeAlias = tuple[float, float]
 """x and y, mm."""
 
-POINTS: Final = 72 / 25.4
-"""PDF's unit, of a millimetre."""
+POINTS_PER_MM: Final = 72 / 25.4
+"""PDF's units (points) per millimetre."""
 
-ARC: Final = 4 / 3 * (math.sqrt(2) - 1)
-"""Distance from the ends of a quarter of a circle to its Bezier curve's control points, of the
-radius; the curve is at most 0.03 % of the radius off."""
+ARC_CONTROL_RATIO: Final = 4 / 3 * (math.sqrt(2) - 1)
+"""Distance between an end of a quarter circle and the next control point of its Bezier curve, as a
+part of the radius; the curve is off by at most 0.03 % of the radius."""
 
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A filled polygon; one that runs clockwise is a hole in what is around it."""
+    """A filled polygon; one that runs clockwise is a hole in the polygon around it."""
 
     points: tuple[Point, ...]
 
@@ -43,7 +43,7 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A line of text from its lower left corner, as high as ``size``; ``turned``: upwards."""
+    """A line of text from its lower left corner, as high as ``size``, upwards if ``turned``."""
 
     place: Point
     text: str
@@ -59,11 +59,11 @@ Shape: TypeAlias = Polygon | Disc | Label
 class PrintedPage:
     """The content of one sheet of paper."""
 
-    width: float  # mm
-    height: float  # mm
-    title: str  # of the document
-    description: str  # ASCII text that the document carries and does not show
-    shapes: tuple[Shape, ...]  # what it shows
+    width: float  # width, mm
+    height: float  # height, mm
+    title: str  # title of the document
+    description: str  # hidden ASCII text that the document carries
+    shapes: tuple[Shape, ...]  # visible shapes
 
 
 def rectangle(left: float, low: float, width: float, height: float) -> Polygon:
@@ -73,7 +73,7 @@ def rectangle(left: float, low: float, width: float, height: float) -> Polygon:
 
 
 def svg(page: PrintedPage) -> str:
-    """Return an SVG document; a unit of its coordinates is a millimetre."""
+    """Return an SVG document whose coordinates are in millimetres."""
     width, height = _number(page.width), _number(page.height)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -121,11 +121,11 @@ def _svg_texts(shapes: Iterable[Shape], height: float) -> Iterator[str]:
 
 
 def pdf(page: PrintedPage) -> bytes:
-    """Return a PDF document of one page, which asks its viewer to print it as large as it is."""
-    scale = f"{POINTS:.9f} 0 0 {POINTS:.9f} 0 0 cm"
+    """Return a PDF document of one page, which asks its viewer to print it at its true size."""
+    scale = f"{POINTS_PER_MM:.9f} 0 0 {POINTS_PER_MM:.9f} 0 0 cm"
     lines = [scale, *_pdf_paths(page.shapes), "f", *_pdf_texts(page.shapes)]
     content = "\n".join(lines).encode("latin-1", "replace")
-    size = " ".join(_number(POINTS * side) for side in (page.width, page.height))
+    size = " ".join(_number(POINTS_PER_MM * side) for side in (page.width, page.height))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -169,7 +169,7 @@ def _pdf_circle(x: float, y: float, radius: float) -> str:
     for along, up in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         before, behind, end = (
             _pair(x + radius * (along * a - up * b), y + radius * (up * a + along * b))
-            for a, b in ((1, ARC), (ARC, 1), (0, 1))
+            for a, b in ((1, ARC_CONTROL_RATIO), (ARC_CONTROL_RATIO, 1), (0, 1))
         )
         parts.append(f"{before} {behind} {end} c")
     return " ".join([*parts, "h"])

@@ -1,4 +1,4 @@
-"""Black shapes of a target, in millimetres from its origin, x right and y up."""
+"""Draw the black shapes of a target, in millimetres from its origin, x right and y up."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from smartcam.calibration._printing.page import Point
     from smartcam.calibration._targets import Target
 
-MM = 1e3
-"""Millimetres of a metre."""
+MM_PER_METRE = 1e3
+"""Millimetres per metre."""
 
 
 class Box(NamedTuple):
-    """Bounds of a target's own pattern, its origin mark aside, mm from its origin."""
+    """Bounds of a target's pattern without its origin mark, mm from its origin."""
 
     left: float
     low: float
@@ -35,10 +35,10 @@ class Box(NamedTuple):
 
 
 def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return the shapes of a target and what they take; those of an origin mark are the last.
+    """Return the shapes of a target, those of an origin mark last, and their bounds.
 
-    Raises SHAPE: its dictionary is none of OpenCV's, or has too few markers; MissingExtraError:
-    a marker's pattern needs OpenCV.
+    Raises SHAPE if OpenCV has no such dictionary or it has too few markers; MissingExtraError: a
+    marker's pattern needs OpenCV.
     """
     match target:
         case Checkerboard():
@@ -53,23 +53,23 @@ def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
 
 
 def _board(columns: int, rows: int, square: float) -> Box:
-    side = MM * square
+    side = MM_PER_METRE * square
     return Box(-side, -side, columns * side, rows * side)
 
 
 def _checkerboard(target: Checkerboard) -> Iterator[Polygon | Disc]:
-    side = MM * target.square
+    side = MM_PER_METRE * target.square
     for row in range(target.rows + 1):
         for column in range(row % 2, target.columns + 1, 2):
             yield rectangle((column - 1) * side, (row - 1) * side, side, side)
     if target.origin_mark:
-        x, y = (MM * target.corner_areas[0]).tolist()
-        yield Disc((x, y), MM * target.corner_area_diameter / 2)
+        x, y = (MM_PER_METRE * target.corner_areas[0]).tolist()
+        yield Disc((x, y), MM_PER_METRE * target.corner_area_diameter / 2)
 
 
 def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
     """Yield squares and markers; OpenCV counts both from the upper left."""
-    side, marker = MM * target.square, MM * target.marker
+    side, marker = MM_PER_METRE * target.square, MM_PER_METRE * target.marker
     first_black = 1 if target.legacy_pattern and target.rows % 2 == 0 else 0
     cells = [
         (column, row, box.left + column * side, box.high - (row + 1) * side)
@@ -91,18 +91,18 @@ def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
 
 
 def _marker_box(target: MarkerGrid) -> Box:
-    around = MM * target.gap if target.kalibr else 0.0
-    right, high = (MM * target.points[-1, :2]).tolist()
+    around = MM_PER_METRE * target.gap if target.kalibr else 0.0
+    right, high = (MM_PER_METRE * target.points[-1, :2]).tolist()
     return Box(-around, -around, right + around, high + around)
 
 
 def _markers(target: MarkerGrid) -> Iterator[Polygon]:
-    """Yield markers, and of Kalibr's the squares between their corners."""
-    side, gap = MM * target.marker, MM * target.gap
+    """Yield markers, and for Kalibr's grids the squares between their corners."""
+    side, gap = MM_PER_METRE * target.marker, MM_PER_METRE * target.gap
     patterns = marker_patterns(target)
     module = side / len(patterns[0])
     for numbers, pattern in zip(target.corners, patterns, strict=True):
-        left, low = (MM * target.points[numbers, :2].min(axis=0)).tolist()
+        left, low = (MM_PER_METRE * target.points[numbers, :2].min(axis=0)).tolist()
         for loop in outlines(pattern):
             yield Polygon(tuple((left + x * module, low + y * module) for x, y in loop))
     if target.kalibr:
@@ -113,7 +113,7 @@ def _markers(target: MarkerGrid) -> Iterator[Polygon]:
 
 
 def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
-    """Yield each marker's black modules, its border with them, by id."""
+    """Yield each marker's black modules, its border included, by id."""
     cv2 = load("cv2")
     dictionary: Any = charuco_board(target).getDictionary()
     modules = dictionary.markerSize + 2
@@ -122,7 +122,7 @@ def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
 
 
 def outlines(cells: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
-    """Return the outlines of what is black among cells (rows, columns), the upper row first.
+    """Return the outlines of the black areas among cells (rows, columns), the upper row first.
 
     Corners are x to the right and y up, counted in cells from the lower left one's; outer outlines
     counter-clockwise, those of holes clockwise.
@@ -161,10 +161,10 @@ def _corners(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
-    centres = MM * target.points[:, :2]
-    radii = np.full(len(centres), MM * target.diameter / 2)
+    centres = MM_PER_METRE * target.points[:, :2]
+    radii = np.full(len(centres), MM_PER_METRE * target.diameter / 2)
     if target.origin_diameter is not None:
-        radii[0] = MM * target.origin_diameter / 2
+        radii[0] = MM_PER_METRE * target.origin_diameter / 2
     dots = tuple(
         Disc((x, y), radius)
         for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True)
@@ -174,9 +174,9 @@ def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
 
 
 def quartered(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return a disc about the origin with two black quarters, the first one with a white dot.
+    """Return a disc around the origin with two black quarters, the first with a white dot.
 
-    The quarters meet in the point to touch; the dot tells the sheet from one that is turned.
+    The quarters meet in the point to touch; the dot distinguishes the sheet from a turned one.
     """
     hole = 0.18 * radius
     at = 0.6 * radius * math.sqrt(0.5)

@@ -1,14 +1,12 @@
-"""Sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
+"""Make sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
 
 ::
 
     sheet = make_sheet(Checkerboard(columns=9, rows=6, square=0.025), page="A4")
-    Path("sheet.svg").write_text(sheet.svg())
-    Path("sheet.pdf").write_bytes(sheet.pdf())
-    ...
-    target = scaled(sheet.target, (99.2, 99.3))  # how long the printed rulers are, mm
+    Path("sheet.svg").write_text(sheet.svg()) Path("sheet.pdf").write_bytes(sheet.pdf()) ... target
+    = scaled(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
 
-A sheet says on itself what it is; both files carry the target's description, as
+A description is printed on each sheet; both files carry the target's description, as
 :func:`~smartcam.calibration.target_from_data` reads it.
 """
 
@@ -31,8 +29,13 @@ from smartcam.calibration._printing.page import (
     pdf,
     svg,
 )
-from smartcam.calibration._printing.page_layout import AREA_REACH, BORDER, RULER, PageLayout
-from smartcam.calibration._printing.shapes import MM, Box, ink, quartered
+from smartcam.calibration._printing.page_layout import (
+    AREA_REACH_SQUARES,
+    BORDER_MM,
+    RULER_MM,
+    PageLayout,
+)
+from smartcam.calibration._printing.shapes import MM_PER_METRE, Box, ink, quartered
 from smartcam.calibration._targets import (
     Charuco,
     Checkerboard,
@@ -51,7 +54,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
     from smartcam.exceptions import CalibrationError
 
-PAGES: Final[Mapping[str, tuple[float, float]]] = {
+PAGES_MM: Final[Mapping[str, tuple[float, float]]] = {
     "A5": (148.0, 210.0),
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),
@@ -62,16 +65,17 @@ PAGES: Final[Mapping[str, tuple[float, float]]] = {
     "Legal": (215.9, 355.6),
     "Tabloid": (279.4, 431.8),
 }
-"""Width and height of pages, mm; a sheet takes them upright or lying, as it fits."""
+"""Width and height of pages, mm; a sheet uses them in portrait or landscape format, as it fits."""
 
-MAX_PAGE: Final = 3000.0
+MAX_PAGE_MM: Final = 3000.0
 """Longest side of a page, mm."""
 
 MAX_SCALE_CHANGE: Final = 0.05
-"""Largest deviation of a printer's scale."""
+"""Largest deviation of a printer's scale, as a part of it."""
 
 MAX_UNEQUAL_SCALES: Final = 0.005
-"""Largest difference of the scales along x and y: about that of a ruler that is read twice."""
+"""Largest difference between the scales along x and y, as a part: about that of reading a ruler
+twice."""
 
 DIGITS: Final = 9
 """Digits of a length in metres: nanometres."""
@@ -79,11 +83,11 @@ DIGITS: Final = 9
 
 @dataclass(frozen=True, kw_only=True)
 class Rays:
-    """Rays and an origin mark alone: for a camera that localizes the mark by itself.
+    """A sheet of only rays and an origin mark, for a camera that localizes the mark by itself.
 
     Attributes:
         diameter: diameter of the origin mark, metres; the mark has two black quarters, which meet
-            in the origin, and a white dot in the one between the rays.
+            in the origin, and a white dot in the quarter between the rays.
     """
 
     kind: ClassVar[str] = "rays"
@@ -108,12 +112,12 @@ class Sheet:
     """A target on a page.
 
     Attributes:
-        target: what is on it.
+        target: target, or rays, on the sheet.
         width: width of the page, mm.
         height: height of the page, mm.
         origin: the target's origin from the page's lower left corner, mm; x and y are those of the
             page.
-        shapes: what is printed.
+        shapes: printed shapes.
     """
 
     target: Target | Rays
@@ -124,7 +128,7 @@ class Sheet:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The target's description, JSON-able."""
+        """Description of the target, as JSON takes it."""
         return _data(self.target)
 
     @property
@@ -134,7 +138,7 @@ class Sheet:
 
     @property
     def title(self) -> str:
-        """Id, kind, counts and lengths in a line, as it is printed."""
+        """One line with id, kind, counts and lengths, as it is printed."""
         return _title(self.target)
 
     def svg(self) -> str:
@@ -156,26 +160,26 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     """Lay out a sheet.
 
     Args:
-        target: what is on it; lengths are printed as they are.
-        page: one of ``PAGES``, upright or lying as the target fits, or width and height in mm,
-            such as ``300x200``, which is not turned.
+        target: target, or rays, on the sheet; lengths are printed as they are.
+        page: one of ``PAGES_MM``, in portrait or landscape format as the target fits, or width and
+            height in mm, such as ``300x200``, which is not turned.
 
     Raises:
-        CalibrationError: PAGE_TOO_SMALL; SHAPE: no such page, no such dictionary of markers, or one
-            with too few.
+        CalibrationError: PAGE_TOO_SMALL; SHAPE: the page is unknown, or the dictionary of markers
+            is, or it has too few.
         MissingExtraError: a ChArUco target needs OpenCV.
     """
     pattern, box = _pattern(target)
     width, height = page_size(page)
-    turns = [(width, height), (height, width)] if page in PAGES else [(width, height)]
+    turns = [(width, height), (height, width)] if page in PAGES_MM else [(width, height)]
     marked = isinstance(target, Checkerboard) and target.origin_mark
     pitch = _pitch(target)
     layouts = [
         PageLayout(
             box,
             pitch=pitch,
-            areas=AREA_REACH * pitch if marked else 0.0,
-            texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER)),
+            areas=AREA_REACH_SQUARES * pitch if marked else 0.0,
+            texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER_MM)),
             width=wide,
             height=high,
         )
@@ -203,10 +207,10 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
         if need > there
     ]
     text = f"{size[0]:g} x {size[1]:g} mm"
-    named = f"{page} ({text})" if page in PAGES else text
+    named = f"{page} ({text})" if page in PAGES_MM else text
     return Code.PAGE_TOO_SMALL.refusal(
         f"{_title(target).partition(': ')[2]}: does not fit on {named}: with rays, rulers and a "
-        f"border of {BORDER:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
+        f"border of {BORDER_MM:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
         f"{' and '.join(over)}",
         needed,
         size,
@@ -214,23 +218,23 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
 
 
 def on_paper(data: Mapping[str, Any]) -> Target | Rays:
-    """Return the target, or the rays, that a sheet's ``data`` describes (SHAPE: it does not)."""
+    """Return the target, or the rays, that a sheet's ``data`` describes; raise SHAPE otherwise."""
     if data.get("kind") != Rays.kind or set(data) != {"kind", "diameter"}:
         return target_from_data(data)
     return Rays(diameter=data["diameter"])
 
 
 def page_size(page: str) -> tuple[float, float]:
-    """Return a page's width and height, mm; SHAPE where it has none."""
-    if page in PAGES:
-        return PAGES[page]
+    """Return a page's width and height, mm; raise SHAPE if it has none."""
+    if page in PAGES_MM:
+        return PAGES_MM[page]
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
     size = (float(sides[1]), float(sides[2])) if sides else (0.0, 0.0)
-    if not 0 < min(size) <= max(size) <= MAX_PAGE:
+    if not 0 < min(size) <= max(size) <= MAX_PAGE_MM:
         raise Code.SHAPE.refusal(
-            f"page: expected one of {', '.join(PAGES)}, or width and height in mm up to "
-            f"{MAX_PAGE:g}, such as 300x200, got {page[:64]!r}",
-            list(PAGES),
+            f"page: expected one of {', '.join(PAGES_MM)}, or width and height in mm up to "
+            f"{MAX_PAGE_MM:g}, such as 300x200, got {page[:64]!r}",
+            list(PAGES_MM),
             page[:64],
         )
     return size
@@ -238,26 +242,26 @@ def page_size(page: str) -> tuple[float, float]:
 
 @takes(measured_ruler=each(a_number, 2))
 def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
-    """Return a target with the lengths that it has on paper.
+    """Return a target with its lengths as they are on paper.
 
     Args:
         target: the target as it was to be printed.
-        measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
-            scale, the mean of both. Rulers that differ by more than half a percent show no
-            scale, but a printer that pulls the paper unevenly.
+        measured_ruler: measured lengths of the printed rulers along x and along y, mm. A target has
+            one scale, the mean of both. If the rulers differ by more than half a percent, that is
+            not a scale but a printer that pulls the paper unevenly.
 
     Raises:
         CalibrationError: SCALE_MISMATCH: a ruler is more than 5 % off 100 mm, or the rulers differ
             by more than 0.5 %.
     """
-    factors = [length / RULER for length in measured_ruler]
+    factors = [length / RULER_MM for length in measured_ruler]
     for axis, factor in zip("xy", factors, strict=True):
         if not abs(factor - 1) <= MAX_SCALE_CHANGE:
             raise Code.SCALE_MISMATCH.refusal(
-                f"ruler along {axis}: expected {RULER:g} mm within {MAX_SCALE_CHANGE:.0%}, "
-                f"got {RULER * factor:g} mm; print at 100 %, not fitted to the page",
-                RULER,
-                RULER * factor,
+                f"ruler along {axis}: expected {RULER_MM:g} mm within {MAX_SCALE_CHANGE:.0%}, "
+                f"got {RULER_MM * factor:g} mm; print at 100 %, not fitted to the page",
+                RULER_MM,
+                RULER_MM * factor,
             )
     if abs(factors[0] - factors[1]) > MAX_UNEQUAL_SCALES:
         raise Code.SCALE_MISMATCH.refusal(
@@ -270,7 +274,7 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     return resized(target, sum(factors) / 2, DIGITS)
 
 
-# ---------------------------------------------------------------------- what is said
+# ---------------------------------------------------------------------- texts
 
 
 def _data(target: Target | Rays) -> dict[str, Any]:
@@ -329,30 +333,30 @@ ADVICE: Final = (
 
 
 def _mm(metres: float) -> str:
-    return f"{MM * metres:.6g} mm"
+    return f"{MM_PER_METRE * metres:.6g} mm"
 
 
-# ---------------------------------------------------------------------- what is drawn
+# ---------------------------------------------------------------------- shapes
 
 
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
     checked(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
-        return quartered(MM * target.diameter / 2)
+        return quartered(MM_PER_METRE * target.diameter / 2)
     return ink(target)
 
 
 def _pitch(target: Target | Rays) -> float:
-    """Return the distance of two neighbouring points, mm."""
+    """Return the distance between two neighbouring points, mm."""
     match target:
         case Checkerboard() | Charuco():
-            return MM * target.square
+            return MM_PER_METRE * target.square
         case CircleGrid():
-            return MM * target.spacing
+            return MM_PER_METRE * target.spacing
         case MarkerGrid():
-            return MM * (target.marker + target.gap)
+            return MM_PER_METRE * (target.marker + target.gap)
         case Rays():
-            return MM * target.diameter
+            return MM_PER_METRE * target.diameter
 
 
 def _moved(shape: Polygon | Disc, x: float, y: float) -> Shape:

@@ -1,1 +1,1 @@
-"""A camera above a printed sheet, one picture of which brings its pixels to the robot."""
+"""Calibrate a camera above a printed sheet: one picture maps its pixels to the robot."""

@@ -1,4 +1,4 @@
-"""From what a camera finds in its pixels to the robot, by one picture of a printed sheet.
+"""Map a camera's pixels to the robot's space, by one picture of a printed sheet.
 
 ::
 
@@ -9,7 +9,7 @@
     )
     calibration.transform([[412.5, 300.0]])         # pixels, v down: metres of the robot
 
-The robot touches corners of the sheet, or its rays; the camera need not find what is touched.
+The robot touches corners of the sheet, or its rays; the camera need not detect the touched points.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from smartcam.calibration._least_squares import independent_parts
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
 from smartcam.calibration._verdict import CalibrationVerdict, Judgement
@@ -42,16 +43,17 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from smartcam.calibration._targets import Target
+    from smartcam.models import PoseSigma
 
 KIND = "sheet"
 """Name of these calibrations' files in the store."""
 
-UNEXPLAINED = {True: 0.3, False: 0.1}
-"""Residual in pixels, beyond the points' noise, from which on a remark says so: with a lens, the
-errors of print, edges and lens; without, a tenth of what usual distortion adds."""
+MAX_UNEXPLAINED_PX = {True: 0.3, False: 0.1}
+"""Largest residual, pixels, beyond the points' noise without a remark. With a lens (True) it allows
+for errors of print, edges and lens; without a lens it is a tenth of usual distortion."""
 
-ONE_SCALE = frozenset({"rigid", "similarity", "touches"})
-"""Models of a plane that keep the shape of a sheet."""
+ONE_SCALE_MODELS = frozenset({"rigid", "similarity", "touches"})
+"""Models of a plane that do not change the shape of a sheet."""
 
 
 PLANE = storage.Form(
@@ -65,19 +67,19 @@ PLANE = storage.Form(
 class SheetCalibration(storage.SavedCalibration):
     """The result of :func:`calibrate_sheet`; immutable.
 
-    It takes localizations in pixels whose y axis was turned up (y is -v), as
-    :func:`smartcam.connect` gives them with ``y_down=True``, and refuses to be used otherwise:
-    ``y_down`` says so. Pixels as such, in :meth:`transform` and the like, count v down.
+    Localizations must be in pixels with the y axis turned up (y is -v), as :func:`smartcam.connect`
+    gives them with ``y_down=True``; others are refused. Plain pixels, as in :meth:`transform`, have
+    v down.
 
     Attributes:
-        view: the target as the camera saw it.
+        view: view of the target by the camera.
         sheet: map from pixels to the sheet.
         plane: map from the sheet's metres to the robot.
-        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as
-            :attr:`IntrinsicCalibration.covariance` has it; None: not known, or there is no lens.
+        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as in
+            :attr:`IntrinsicCalibration.covariance`; None: not known, or there is no lens.
         rms: standard deviation of a coordinate of the view's points from the fit, pixels.
         camera_frame: name of the frame that localizations must come in; None for any.
-        remarks: what one should know of the view.
+        remarks: warnings about the view.
     """
 
     y_down: ClassVar[bool] = True
@@ -129,12 +131,12 @@ class SheetCalibration(storage.SavedCalibration):
 
     @property
     def model(self) -> str:
-        """Model of the way from the sheet to the robot."""
+        """Model of the map from the sheet to the robot."""
         return self.plane.model
 
     @property
     def warnings(self) -> tuple[Remark, ...]:
-        """Remarks to know before the calibration is used: on the view, then on the touches."""
+        """Warnings to read before using the calibration: of the view, then of the touches."""
         return (*self.remarks, *self.plane.warnings)
 
     @property
@@ -143,7 +145,7 @@ class SheetCalibration(storage.SavedCalibration):
         return self.judged().verdict
 
     def judged(self) -> Judgement:
-        """Return the verdict, of what the target covers in the image, and what is advisable."""
+        """Return the verdict for the area that the target covers in the image, and the advice."""
         if any(one.code == Code.POOR_FIT for one in self.remarks):
             lens = "another lens" if self.camera else "a lens: --lens"
             text = f"Not good enough: the picture wants {lens}, or a flat sheet"
@@ -167,10 +169,10 @@ class SheetCalibration(storage.SavedCalibration):
 
     @cached_property
     def lens_planes(self) -> tuple[SheetPlane, ...]:
-        """The maps from pixels to the sheet by lenses that are one standard deviation off.
+        """Maps from pixels to the sheet, by lenses that are one standard deviation off.
 
-        The lenses are off in independent ways, whose squares add up to ``lens_covariance``; where
-        the sheet lies is found anew by each, from the same view.
+        The errors of these lenses are independent, and their squares add up to ``lens_covariance``.
+        Each map has the sheet located anew by its lens, from the same view.
         """
         if self.camera is None or self.lens_covariance is None:
             return ()
@@ -180,7 +182,7 @@ class SheetCalibration(storage.SavedCalibration):
         )
 
     def transform(self, pixels: ArrayLike) -> Array:
-        """Map pixels to the points of the plane that they show, in the robot's space.
+        """Map pixels to points of the plane in the robot's space.
 
         Args:
             pixels: (N, 2), u to the right and v down from the middle of the upper left pixel.
@@ -201,7 +203,7 @@ class SheetCalibration(storage.SavedCalibration):
             points: (N, 3), metres; a point beside the plane is projected onto it.
 
         Returns:
-            (N, 2), pixels, v down; NaN for what lies behind the camera.
+            (N, 2), pixels, v down; NaN for points behind the camera.
 
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.
@@ -221,7 +223,10 @@ class SheetCalibration(storage.SavedCalibration):
 
         Args:
             localizations: localizations of the camera, one or many: pixels, with y turned up.
-            tool_flip: flip of the tool, as of :meth:`PlaneCalibration.to_robot`.
+            tool_flip: as in :meth:`PlaneCalibration.to_robot`.
+
+        Where a pose has a ``sigma``, and the touches' sigma is known, the robot's has one, too,
+        with the errors of view, touches and lens in it.
 
         Raises:
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
@@ -232,7 +237,34 @@ class SheetCalibration(storage.SavedCalibration):
 
     def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
-        return self.plane.to_robot(self.sheet.solve(Poses.of(parts)).put(parts), tool_flip=flip)
+        flat = self.sheet.solve(Poses.of(parts)).put(parts)
+        told = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
+        if told and self.plane.touch_sigma is not None:
+            for n, sigma in zip(told, self._sigmas([parts[n] for n in told]), strict=True):
+                flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
+        return self.plane.to_robot(flat, tool_flip=flip)
+
+    def _sigmas(self, parts: list[Localization]) -> list[PoseSigma]:
+        """Return the errors of poses on the sheet: the camera's, the view's and the lens'."""
+        lenses = self.lens_planes
+        y_up = np.array([1.0, -1.0])
+
+        def on_sheet(points: Array) -> Array:
+            flat = self.sheet.near_sheet(points * y_up)
+            return np.column_stack([flat, np.zeros(len(flat))])
+
+        def by_values(points: Array) -> Array:
+            flat = self.sheet.near_sheet(points * y_up)
+            rows = np.zeros((len(flat), 3, 9 + len(lenses)))
+            rows[:, :2, :9] = self.sheet.by_elements(flat)
+            for number, one in enumerate(lenses, start=9):
+                rows[:, :2, number] = one.near_sheet(points * y_up) - flat
+            return rows
+
+        covariance = np.eye(9 + len(lenses))
+        covariance[:9, :9] = self.sheet.covariance
+        normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
+        return robot_sigmas(parts, on_sheet, normal, by_values, covariance, size, flip=False)
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
@@ -241,12 +273,12 @@ class SheetCalibration(storage.SavedCalibration):
             pixels: (K, 2), v down.
 
         Returns:
-            (K, 3, 3), m^2, along the robot's axes. Errors of the lens are in it where
-            ``lens_covariance`` tells them; the noise of the camera when it sees the point comes on
+            (K, 3, 3), m^2, along the robot's axes. It includes errors of the lens if
+            ``lens_covariance`` is given; the noise of the camera when it sees the point comes on
             top.
 
         Raises:
-            CalibrationError: as :meth:`transform`; UNVERIFIED: nothing tells the touches' sigma.
+            CalibrationError: as :meth:`transform`; UNVERIFIED: the touches' sigma is not known.
         """
         flat = self.sheet.on_sheet(pixels)
         # to first order: D C D^T with the map's derivative D
@@ -270,7 +302,7 @@ class SheetCalibration(storage.SavedCalibration):
 
 
 def _check_lens(covariance: Array, camera: CameraModel | None, called: str) -> None:
-    """Raise (SHAPE, NOT_FINITE) where a covariance is none of a lens' values."""
+    """Raise SHAPE or NOT_FINITE if a covariance cannot be that of the lens' values."""
     count = 0 if camera is None else 4 + len(camera.distortion)
     storage.check_shape(covariance, (count, count), called, "lens_covariance")
     check_finite(covariance, f"{called}: lens_covariance")
@@ -291,22 +323,21 @@ def calibrate_sheet(
     lens_covariance: ArrayLike | None = None,
     camera_frame: str | None = None,
 ) -> SheetCalibration:
-    """Return the way from pixels to the robot.
+    """Calibrate the map from pixels to the robot.
 
     Args:
-        view: the target, as the camera sees it while the sheet lies where it is touched.
+        view: view of the target while the sheet lies where it is touched.
         plane: map from the sheet's metres to the robot: of :func:`fit_corners`, or of
             :func:`~smartcam.calibration.fit_touches` with the origin at (0, 0).
         camera: the lens, for images of the same size; None: a homography of the view's points.
-        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as
-            :attr:`IntrinsicCalibration.covariance` has it; None: not known. Predicted errors have
-            it in them.
+        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as in
+            :attr:`IntrinsicCalibration.covariance`; None: not known. Predicted errors include it.
         camera_frame: name of the frame that localizations must come in; None for any.
 
     Raises:
         CalibrationError: TOO_FEW, COLLINEAR, WRONG_SIZE, NOT_FINITE, POOR_FIT, MIRRORED: see
-            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`. SHAPE or NOT_FINITE: no such
-            covariance.
+            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`. SHAPE or NOT_FINITE: the
+            covariance is not valid.
     """
     if lens_covariance is not None:
         lens_covariance = storage.as_array(lens_covariance)
@@ -320,7 +351,7 @@ def calibrate_sheet(
                 "lens is not, and grows outside of the target's points"
             )
         )
-    if found.unexplained > UNEXPLAINED[camera is not None]:
+    if found.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
         whose = "the lens distorts" if camera is None else "the lens is another one"
         remarks.append(
             Code.POOR_FIT.remark(
@@ -355,14 +386,14 @@ def fit_corners(
     robust: bool = False,
     robot_frame: str = "robot",
 ) -> PlaneCalibration:
-    """Return the way from a sheet's metres to the robot, by touches of points of its target.
+    """Fit the map from a sheet's metres to the robot to touches of points of its target.
 
-    A sheet that lies flat keeps its shape. Touches that ask for more than a scale give a warning
-    (NOT_SIMILAR), and the shape stays. A scale that is not the target's gives a warning, too
-    (SCALE_MISMATCH), and is taken: the rulers were measured wrong, or not at all.
+    A sheet that lies flat keeps its shape. If touches do not fit that shape, a warning says so
+    (NOT_SIMILAR), and the shape is kept. If the scale is not the target's, a warning says so, too
+    (SCALE_MISMATCH), and the scale is used: the rulers were measured wrong, or not at all.
 
     Args:
-        target: target with the lengths that it has on paper.
+        target: target with its lengths as they are on paper.
         ids: (N,), numbers of the target's points that were touched, three at least.
         touches: (N, 3), where the robot's tip was, metres.
         touch_sigma: standard deviation of one coordinate of a touch, metres, as in
@@ -373,8 +404,8 @@ def fit_corners(
         robot_frame: name of the robot's frame, in which poses will be given.
 
     Raises:
-        CalibrationError: SHAPE: a number that the target does not have; SCALE_MISMATCH: more than
-            a tenth off; and as :func:`~smartcam.calibration.fit_plane`.
+        CalibrationError: SHAPE: the target has no point of that number; SCALE_MISMATCH: the scale
+            is off by more than a tenth; and those of :func:`~smartcam.calibration.fit_plane`.
     """
     points = target.points[:, :2]
     wrong = [one for one in ids if not 0 <= one < len(points)]
@@ -399,4 +430,4 @@ def fit_corners(
         )
 
     found = fitted("auto")
-    return found if found.model in ONE_SCALE else fitted("similarity")
+    return found if found.model in ONE_SCALE_MODELS else fitted("similarity")

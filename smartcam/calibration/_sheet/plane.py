@@ -1,8 +1,9 @@
-"""From pixels to the metres of a sheet that lies before a camera.
+"""Map pixels to the metres of a sheet in front of a camera.
 
-With a lens, pixels lose its distortion and their rays meet the plane where the target was located.
-Without one a homography of all of the target's points leads there: right for any tilt, but what the
-lens bends stays bent, least between the points and more outside of them.
+With a lens, pixels are corrected for its distortion, and their rays are cut with the plane where
+the target was located. Without a lens, a homography is fitted to all points of the target: it is
+right for any tilt, but does not correct distortion, whose error is least between the points and
+larger outside of them.
 """
 
 from __future__ import annotations
@@ -43,18 +44,18 @@ MAX_STEPS = 20
 """The fit of the homography takes at most this many steps; it usually takes 2 or 3."""
 
 SETTLED_SIGMAS = 1e-6
-"""Standard deviations by which an element of the homography still changes in the last step, with
-the others held; the next step changes it a million times less."""
+"""The fit ends when a step changes each element of the homography by less than this part of its
+standard deviation, the others held; the next step would change it a million times less."""
 
 DIRECTION_STEP_PX = 0.5
-"""Pixels to both sides of a point, from which its direction on the sheet is taken."""
+"""The direction of a point on the sheet is computed from points this many pixels to both sides."""
 
 
 class SheetPlane:
     """A solver from a camera's pixels to a sheet's metres.
 
-    Poses come as localizations do whose y axis was turned up: x is u, y is -v, and angles count
-    counter-clockwise. They leave in the target's frame, on its plane.
+    Poses must be those of localizations with the y axis turned up: x is u, y is -v, and angles
+    count counter-clockwise. The results are in the target's frame, on its plane.
 
     Args:
         size: width and height of the camera's images, pixels.
@@ -93,7 +94,7 @@ class SheetPlane:
     def in_image(self, points: ArrayLike) -> Array:
         """Map points (N, 2) of the sheet, metres, to pixels (N, 2), v down.
 
-        NaN for what lies behind the camera.
+        NaN for points behind the camera.
         """
         flat = as_points(points, 2, "points of the sheet")
         mapped = flat @ self.matrix[:, :2].T + self.matrix[:, 2]
@@ -109,19 +110,31 @@ class SheetPlane:
         Raises:
             CalibrationError: as :meth:`on_sheet`.
         """
-        flat = self.on_sheet(pixels)
-        # A pixel stays: 0 = D dx + E dm, with the derivatives by the point and by the elements, so
-        # dx = -D^-1 E dm.
-        by_elements = element_derivatives(self.matrix, flat)
-        moves = np.linalg.solve(derivatives(self.matrix, flat), by_elements)
+        moves = self.by_elements(self.on_sheet(pixels))
         covariance: Array = moves @ self.covariance @ moves.swapaxes(1, 2)
         return covariance
+
+    def by_elements(self, flat: Array) -> Array:
+        """Return the derivatives (N, 2, 9) of points (N, 2) of the sheet by the matrix' elements.
+
+        Each point is the one that its pixel shows.
+        """
+        # The pixel does not change: 0 = D dx + E dm, with the derivatives D by the point and E by
+        # the elements, so dx = -D^-1 E dm.
+        by_elements = element_derivatives(self.matrix, flat)
+        moves = np.linalg.solve(derivatives(self.matrix, flat), by_elements)
+        return np.asarray(-moves, dtype=np.float64)
+
+    def near_sheet(self, pixels: Array) -> Array:
+        """Map pixels (N, 2), v down, as :meth:`on_sheet`, some beside the image, too."""
+        return self._mapped(self._straight(pixels), pixels)
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses on the sheet.
 
         Raises:
-            CalibrationError: OUT_OF_PLANE: one has a height or a tilt; and as :meth:`on_sheet`.
+            CalibrationError: OUT_OF_PLANE: a pose has a height or a tilt; and those of
+                :meth:`on_sheet`.
         """
         x, y, z, w = poses.quaternions.T
         if poses.points[:, 2].any() or x.any() or y.any():
@@ -188,17 +201,17 @@ class PlaneView(NamedTuple):
     """The result of :func:`look_at_sheet`."""
 
     plane: SheetPlane
-    # standard deviation of a coordinate of the target's points about where the plane has them,
-    # pixels
+    # standard deviation of a coordinate of the target's points from their predicted places, pixels
     rms: float
-    unexplained: float  # what that has beside the view's own noise, pixels; 0 where noise does
+    # the part of it that the view's own noise does not explain, pixels; 0 if noise explains all
+    unexplained: float
 
 
 def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneView:
-    """Return the way from pixels to the sheet that a view shows.
+    """Fit the map from pixels to the sheet that a view shows.
 
     ``view`` has at least 4 points of the target that are not on a line; without a lens (``camera``,
-    for images of the same size) 5 at least, so that something tells how well a homography fits.
+    for images of the same size) at least 5, so that the fit of the homography can be checked.
     Raises as :func:`~smartcam.calibration.locate`.
     """
     check_view(view, view.size if camera is None else camera.size)
@@ -227,7 +240,7 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
 
 
 def _by_homography(view: TargetView, start: Array) -> PlaneView:
-    """Return the way by the most likely homography of a view."""
+    """Return the map by the most likely homography of a view."""
     flat, pixels = view.object_points[:, :2], view.points
     freedom = 2 * len(flat) - 8
     if freedom <= 0:
@@ -252,9 +265,9 @@ def _by_homography(view: TargetView, start: Array) -> PlaneView:
 
 
 def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[Array, Array]:
-    """Return the homography and the covariance of its elements (9, 9); the last is 1."""
-    # Gauss and Newton's steps. From the linear solution the second or third is the last; of 54
-    # points they take 1.8 ms, with SciPy's least_squares 2.2 ms (measured), in no fewer lines.
+    """Return the homography and the covariance of its elements (9, 9); the last element is 1."""
+    # Gauss and Newton's steps. From the linear solution, the second or third is the last; with 54
+    # points they take 1.8 ms, SciPy's least_squares 2.2 ms (measured), in no fewer lines.
     weights, normal = whitening(noise, 0.0), np.eye(8)
     for _ in range(MAX_STEPS):
         off = weights @ (pixels - apply_homography(matrix, source))[..., None]
@@ -270,10 +283,10 @@ def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[
 
 
 def _scaling(points: Array) -> Array:
-    """Return the matrix (3, 3) that brings points around the origin, at a distance of about 1."""
-    # With its middle at the origin the sheet's last element is the depth there, which is not 0, so
-    # it can be 1; and the equations are well conditioned.
-    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 4.4.4.
+    """Return the matrix (3, 3) that centres points, and scales them to distances of about 1."""
+    # With the sheet's centre at the origin, the last element is the depth there, which is not 0, so
+    # it can be set to 1; and the equations are well conditioned. Source: Hartley and Zisserman,
+    # Multiple View Geometry, 2nd edition, section 4.4.4.
     middle = points.mean(axis=0)
     factor = 1.0 / math.sqrt(float(((points - middle) ** 2).sum(axis=1).mean()))
     return np.array([[factor, 0, -factor * middle[0]], [0, factor, -factor * middle[1]], [0, 0, 1]])

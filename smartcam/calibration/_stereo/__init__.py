@@ -1,1 +1,1 @@
-"""Two cameras that look at the same place."""
+"""Calibrate two cameras that look at the same place."""

@@ -1,4 +1,4 @@
-"""Two cameras that look at the same place: where the one is in the other's frame."""
+"""Calibrate two cameras that look at the same place: the pose of one in the other's frame."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PoseInLeft = Annotated[Transform, storage.motion(lambda _: (LEFT, TARGET))]
 LeftInRight = Annotated[Transform, storage.motion(lambda _: (RIGHT, LEFT))]
 
 MIN_PAIRS: Final = 2
-"""Pairs needed for known lenses: one tells the transform, another that it is right."""
+"""Known lenses need this many pairs: one determines the transform, another confirms it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,15 +64,17 @@ class PairFit(storage.Stored):
 
     Attributes:
         left: view of the left camera, as it was given.
-        right: view of the right camera, as it was given; numbered from the other end where the
-            target looks the same when turned.
-        used: True, for each side, if the cameras are fitted to it; False for a bad or missing view.
-        transform: ``T_left_target``; None where neither view is used.
-        rms: rms of each side's residuals, a coordinate, pixels; NaN where it is not used.
-        held_out: rms, for cameras that were fitted without this pair, of the distances between
-            neighbouring points as both see them, less the true ones, metres; NaN where one view is
-            missing or bad, or where there are too few pairs.
-        epipolar: rms distance from the epipolar lines of the same cameras, pixels; NaN likewise.
+        right: view of the right camera, as it was given, but perhaps numbered from the other end of
+            a target that looks the same when turned.
+        used: whether the cameras are fitted to the view of each side; False for a bad or missing
+            view.
+        transform: ``T_left_target``; None if neither view is used.
+        rms: RMS of a coordinate of each side's residuals, pixels; NaN for a side that is not used.
+        held_out: RMS error of the distances between neighbouring points, as triangulated by cameras
+            that were fitted without this pair, metres; NaN if a view is missing or bad, or if there
+            are too few pairs.
+        epipolar: RMS distance from the epipolar lines of the same cameras, pixels; NaN as for
+            ``held_out``.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -95,21 +97,22 @@ class StereoCalibration(storage.SavedCalibration):
         right: lens of the right camera.
         transform: ``T_right_left``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the left camera in the right
-            one's frame, from how much each pair changes it (a jackknife): what a pair has wrong
-            as a whole is in it.
-        pairs: one for each given pair, in their order.
-        rms: rms of the residuals of all used views, their freedom taken off: the standard deviation
-            of a coordinate, pixels. It is no accuracy: see ``held_out``.
-        sigma: what the residuals show beside the points' covariance, pixels.
+            one's frame, from how much each pair changes it (a jackknife), so it includes errors
+            that all points of a pair share.
+        pairs: fit of each given pair, in their order.
+        rms: RMS of a coordinate of the residuals of all used views, pixels, corrected for their
+            degrees of freedom. It is not the accuracy: see ``held_out``.
+        sigma: standard deviation of a coordinate, pixels, that the points' covariance does not
+            explain.
         epipolar: rms distance of the used points from their epipolar lines, pixels.
-        held_out: held-out error by leaving one pair out: rms over all pairs of the distances
-            between neighbouring points of the target, as triangulated, less those that were meant,
-            metres. NaN where there were too few pairs.
-        held_out_epipolar: rms distance from epipolar lines of cameras fitted without the pair,
+        held_out: held-out error: RMS error, metres, of the distances between neighbouring points of
+            the target, as triangulated by cameras that were fitted without the pair, over all
+            pairs. NaN if there were too few pairs.
+        held_out_epipolar: RMS distance from the epipolar lines of cameras fitted without the pair,
             pixels.
-        sheet: (T, 3), how far the target's points are from where they were meant to be, metres;
-            None where they are taken as meant.
-        warnings: what one should know.
+        sheet: (T, 3), offsets of the target's points from where they were meant to be, metres; None
+            if they are taken as exact.
+        warnings: remarks to read before using the calibration.
     """
 
     kind: ClassVar[str] = "stereo"
@@ -147,16 +150,19 @@ class StereoCalibration(storage.SavedCalibration):
         left_covariance: ArrayLike | None = None,
         right_covariance: ArrayLike | None = None,
     ) -> Array:
-        """Return the points that both cameras see, where their projections fit best.
+        """Triangulate points that both cameras see, to the least reprojection error.
 
         Args:
-            left_pixels: (N, 2), as the left image has them: the lens is corrected for.
+            left_pixels: (N, 2), pixels of the points in the left image, with distortion.
             right_pixels: (N, 2), pixels of the same points in the right image.
-            left_covariance: (N, 2, 2), covariance of ``left_pixels``, pixels^2; None: all alike.
-            right_covariance: (N, 2, 2), covariance of ``right_pixels``, pixels^2; None: all alike.
+            left_covariance: (N, 2, 2), covariance of ``left_pixels``, pixels^2; None: the same for
+                all.
+            right_covariance: (N, 2, 2), covariance of ``right_pixels``, pixels^2; None: the same
+                for all.
 
         Returns:
-            (N, 3), left camera's frame, metres; NaN where the rays do not meet before both cameras.
+            (N, 3), left camera's frame, metres; NaN where the rays do not meet in front of both
+            cameras.
 
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
@@ -174,11 +180,11 @@ class StereoCalibration(storage.SavedCalibration):
 
         Args:
             points: (N, 3), left camera's frame, metres.
-            pixel_sigma: standard deviation of a coordinate in an image, pixels; None: as the
-                residuals of the calibration have it.
+            pixel_sigma: standard deviation of a coordinate in an image, pixels; None: that of the
+                calibration's residuals.
 
         Returns:
-            (N, 3, 3), m^2; NaN for what is not before both cameras.
+            (N, 3, 3), m^2; NaN for points that are not in front of both cameras.
 
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
@@ -214,22 +220,22 @@ class StereoCalibration(storage.SavedCalibration):
         left_views: Sequence[TargetView | None],
         right_views: Sequence[TargetView | None],
     ) -> tuple[PairErrors, ...]:
-        """Return by how much the cameras are off at any pairs of views.
+        """Return the errors of the cameras at any pairs of views.
 
-        Pairs that they were not fitted to tell how good they are. The target does not have to be
-        the same.
+        Pairs that the cameras were not fitted to show how good they are. The target does not have
+        to be the same.
 
         Args:
-            left_views: one for each moment; None where the left camera does not see the target.
-            right_views: views of the right camera at the same moments. Of a target that looks the
-                same when turned they are numbered as they fit the left ones.
+            left_views: a view for each moment; None if the left camera does not see the target.
+            right_views: views of the right camera at the same moments. Those of a target that looks
+                the same when turned are numbered to match the left ones.
 
         Returns:
-            One for each moment, without any errors where a view is missing.
+            The errors of each moment; empty if a view is missing.
 
         Raises:
             CalibrationError: ``SHAPE``: lists of different lengths; ``WRONG_SIZE``; ``TOO_FEW``,
-                ``COLLINEAR``, ``NOT_FINITE``: a view that is of no use; ``DIFFERENT_TARGETS``.
+                ``COLLINEAR``, ``NOT_FINITE``: a view is unusable; ``DIFFERENT_TARGETS``.
         """
         moments = as_moments(left_views, right_views)
         for side, camera in enumerate((self.left, self.right)):
@@ -248,15 +254,15 @@ class StereoCalibration(storage.SavedCalibration):
         return min(found, key=lambda one: _rms([one.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
-        """Return the maps after which the rows of both images show the same points.
+        """Return the maps that make the rows of both images show the same points.
 
         Args:
             alpha: 0 to 1, from no invalid pixels in the output to no lost ones of the source.
             size: size of the output, width and height in pixels; None: the source's.
 
         Raises:
-            CalibrationError: ``SHAPE``, ``WRONG_SIZE``: as
-                :func:`~smartcam.calibration._stereo.rectification.rectify` says.
+            CalibrationError: ``SHAPE``, ``WRONG_SIZE``: as in
+                :func:`~smartcam.calibration._stereo.rectification.rectify`.
         """
         return rectify(self.left, self.right, self.transform, alpha=alpha, size=size)
 
@@ -305,33 +311,36 @@ def calibrate_stereo(
     sheet: Sheet = "auto",
     drop_bad: bool = True,
 ) -> StereoCalibration:
-    """Return both lenses and where the left camera is in the right one's frame.
+    """Calibrate both lenses and the pose of the left camera in the right one's frame.
 
     Lenses, transform and poses are adjusted together to the least reprojection error in both
-    images, each point weighted by its covariance and by what the residuals show beside it. The
-    order of the pairs does not matter.
+    images; each point is weighted by its covariance, and by the additional variance that the
+    residuals show. The order of the pairs does not matter.
 
     Args:
-        left_views: views of one target, one for each moment; None where the left camera sees none.
+        left_views: views of one target, one for each moment; None if the left camera does not see
+            it.
         right_views: views of the right camera at the same moments.
-        left: lens of the left camera where it is known and is to stay; None: found with the rest.
-        right: lens of the right camera where it is known and is to stay; None: found likewise.
-        distortion_model: model of lenses that are to be found.
-        fixed: coefficients of those that stay 0, such as ``k3``; ``aspect``: fx and fy are one.
-        sheet: ``auto``, ``exact`` or ``free``: whether the target's points are adjusted, too, as
-            :func:`~smartcam.calibration.calibrate_intrinsics` has it.
-        drop_bad: whether views that fit far worse than the others are left out (and named), at
-            most a third of them; else they are only named. Of a pair whose views do not belong
-            together it is the right one.
+        left: lens of the left camera, if it is known and must not change; None: it is fitted.
+        right: lens of the right camera, if it is known and must not change; None: it is fitted.
+        distortion_model: model of the lenses that are fitted.
+        fixed: coefficients of fitted lenses that stay 0, such as ``k3``; ``aspect`` makes fx and fy
+            the same.
+        sheet: ``auto``, ``exact`` or ``free``: whether the target's points are adjusted, too, as in
+            :func:`~smartcam.calibration.calibrate_intrinsics`.
+        drop_bad: whether views that fit far worse than the others are left out (and named), at most
+            a third of them; else they are only named. In a pair whose views do not belong together
+            the right view is left out.
 
     Raises:
-        CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
-            ``SHAPE``: lists of different lengths, a coefficient that is not valid, or too many
-            points to be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
-            ``POOR_FIT``: no lens or no transform shows the views, as where those of many pairs are
-            of different moments; ``INSUFFICIENT_ROTATION``: the target was not tilted;
-            ``MIRRORED`` pictures; ``COINCIDENT``: both sides are of one camera;
-            ``SWAPPED_LENSES``: ``left`` is the right camera's, and ``right`` the left one's.
+        CalibrationError: ``TOO_FEW``: fewer than 3 pairs, or than 2 if both lenses are known;
+            ``SHAPE``: lists of different lengths, a coefficient that is not valid, or more points
+            than can be adjusted; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``,
+            ``NOT_FINITE``; ``POOR_FIT``: no lens or no transform fits the views, as when the views
+            of many pairs are from different moments; ``INSUFFICIENT_ROTATION``: the target was not
+            tilted; ``MIRRORED``: pictures were flipped; ``COINCIDENT``: both sides are of one
+            camera; ``SWAPPED_LENSES``: ``left`` is the right camera's, and ``right`` the left
+            one's.
     """
     moments = as_moments(left_views, right_views)
     check_pairs(moments, (left, right))
@@ -386,20 +395,20 @@ def calibrate_stereo(
 
 
 def _pairs(sights: Sequence[Sight]) -> list[int]:
-    """Return the moments that both cameras see."""
+    """Return the indices of the moments at which both cameras see the target."""
     sides = [{one.pose for one in sights if one.camera == side} for side in range(2)]
     return sorted(sides[0] & sides[1])
 
 
 class _Found(NamedTuple):
-    """The findings from which a summary is made."""
+    """Results that the summary is made from."""
 
     moments: list[Moment]  # all views, the right ones numbered as the left ones
-    sights: list[Sight]  # the used ones
-    bad: list[Sight]  # those that fit badly, whether used or not
-    adjusted: AdjustedBundle  # the cameras
-    least: int  # pairs that are needed
-    apart: Mapping[int, float]  # as :class:`~smartcam.calibration._stereo.start.FirstGuess` has it
+    sights: list[Sight]  # used views
+    bad: list[Sight]  # views that fit badly, whether used or not
+    adjusted: AdjustedBundle  # fitted cameras
+    least: int  # number of pairs that are needed
+    apart: Mapping[int, float]  # as in :class:`~smartcam.calibration._stereo.start.FirstGuess`
 
     def pair(self, number: int) -> tuple[TargetView, TargetView]:
         """Return the views of a moment that both cameras see."""
@@ -410,7 +419,7 @@ class _Found(NamedTuple):
 
 
 def _held_out(found: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
-    """Return the errors of each pair under cameras that never saw it."""
+    """Return the errors of each pair with cameras that were fitted without it."""
     pairs = _pairs(found.sights)
     if len(pairs) <= found.least:
         return {}

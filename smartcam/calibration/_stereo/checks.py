@@ -1,4 +1,4 @@
-"""Check whether the views of two cameras, and what was found of them, are possible."""
+"""Check whether the views of two cameras, and the calibration found from them, are plausible."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_RMS_PX: Final = 5.0
-"""Pixels rms, beyond which the pairs do not belong together."""
+"""Residual RMS, pixels, above which the views of pairs do not belong together."""
 
-WORST_PART: Final = 0.005
-"""Residuals, rms, beyond which the pairs do not belong together, as a part of the longer side of
-the image: it counts where it is more pixels than MAX_RMS_PX."""
+MAX_RMS_SHARE: Final = 0.005
+"""The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
 
 EXCHANGED_RESIDUAL_RATIO: Final = 1.05
-"""Residuals over those with the lenses exchanged, from which on they are: two lenses of one make
-differ by 1.7 and more where they are not (measured on recorded pairs)."""
+"""The lenses are exchanged if exchanging them makes the residuals this many times smaller: if they
+are not, the wrong order of two lenses of one model makes them 1.7 times larger or more (measured on
+recorded pairs)."""
 
 MIN_SWAPPED_SHARE: Final = 0.75
 """At least this part of the pairs must fit better with the lenses exchanged."""
 
 MIN_APART_CHI2: Final = 30.0
-"""Squared standard deviations by which the right camera's place is no chance from the left one's:
-of three axes one in a million is more."""
+"""The cameras stand apart if their distance, squared and in standard deviations, is more than this:
+chance alone exceeds it, over three axes, once in a million."""
 
-UPRIGHT: Final = 1.0
-"""Trace of the rotation between cameras that are turned by a right angle."""
+RIGHT_ANGLE_TRACE: Final = 1.0
+"""Trace of the rotation between two cameras, one of which is turned by a right angle."""
 
 
 def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]) -> None:
-    """Refuse pairs that one camera took, and known lenses that are those of the other sides.
+    """Refuse pairs that one camera took, and known lenses that were given for the wrong sides.
 
-    Raises ``COINCIDENT``: an image stands on both sides; ``SWAPPED_LENSES``.
+    Raises ``COINCIDENT`` if an image is given for both sides, and ``SWAPPED_LENSES``.
     """
     for side, lens in zip(SIDES, known, strict=True):
         checked(lens, (CameraModel, type(None)), f"stereo: {side}")
@@ -96,11 +96,12 @@ def _squares(view: TargetView, camera: CameraModel) -> float:
 
 
 def check_apart(transform: Transform, covariance: Array) -> None:
-    """Raise (``COINCIDENT``) where the right camera is where the left one is.
+    """Raise ``COINCIDENT`` if the right camera is at the place of the left one.
 
-    ``covariance`` (6, 6): of ``T_right_left``.
+    ``covariance`` (6, 6) is that of ``T_right_left``.
     """
-    # by the variance along it, which few views tell where they do not tell all of the covariance
+    # by the variance along the distance, which few views determine even if they do not determine
+    # the whole covariance
     shift, spread = transform.translation, covariance[3:, 3:]
     if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ spread @ shift):
         raise Code.COINCIDENT.refusal(
@@ -119,11 +120,10 @@ def examined(
     known: tuple[CameraModel | None, CameraModel | None],
     drop: bool,
 ) -> StereoCalibration:
-    """Return a calibration without points that are far off in their views, and remarks on them.
+    """Return the calibration without stray points, with remarks on them.
 
-    ``again`` calibrates from other views of both sides. ``known``: lenses. ``drop``: whether the
-    points are left out.
-    Raises ``COINCIDENT``: the cameras do not stand apart.
+    ``again`` calibrates from other views of both sides. ``known`` are the known lenses. ``drop``
+    says whether stray points are left out. Raises ``COINCIDENT`` if the cameras do not stand apart.
     """
     check_apart(found.transform, found.covariance)
     sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
@@ -139,7 +139,7 @@ def examined(
     if off and drop:
         for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
             sides[one.side][one.pair] = view
-        found, said = again(*sides), []  # which says it of them
+        found, said = again(*sides), []  # check_fit says it of these views
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
@@ -169,12 +169,12 @@ def _seen(found: StereoCalibration) -> Iterator[_SeenFrom]:
 
 
 def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:
-    """Raise (``POOR_FIT``) where the pairs do not belong together.
+    """Raise ``POOR_FIT`` if the views of pairs do not belong together.
 
-    ``rms``: of the residuals, a coordinate, pixels. ``sights``: the used views; ``bad``: those that
-    fit worst.
+    ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
+    views that fit worst.
     """
-    most = most_rms([one.view for one in sights], MAX_RMS_PX, WORST_PART)
+    most = most_rms([one.view for one in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
     named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)
@@ -189,10 +189,10 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
 
 
 def remark_sides(transform: Transform) -> list[Remark]:
-    """Return a remark where the right camera stands left of the left one, by ``T_right_left``."""
+    """Return a remark if the right camera is left of the left one, by ``T_right_left``."""
     along = transform.translation
     beside = along[0] > 0 and along[0] == np.abs(along).max()
-    if not beside or float(np.trace(transform.rotation)) <= UPRIGHT:
+    if not beside or float(np.trace(transform.rotation)) <= RIGHT_ANGLE_TRACE:
         return []
     return [
         Code.SWAPPED_SIDES.remark(

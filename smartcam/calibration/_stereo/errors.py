@@ -1,4 +1,4 @@
-"""By how much two cameras are off at a pair of views."""
+"""Compute the errors of two cameras at a pair of views."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 NEIGHBOUR_DISTANCE_RATIO: Final = 1.01
-"""Points that are no farther apart than this many times the least distance are neighbours."""
+"""Points are neighbours if they are at most this many times the least distance apart."""
 
 
 class PairErrors(NamedTuple):
-    """By how much two cameras are off at one pair of views.
+    """Errors of two cameras at one pair of views.
 
     Attributes:
-        spacing: (M,), distances between neighbouring points of the target, as triangulated, less
-            those that were meant, metres.
+        spacing: (M,), triangulated minus true distances between neighbouring points of the target,
+            metres.
         epipolar: (N, 2), distances of the points from the epipolar lines of their partners, in the
             left image and in the right one, pixels without distortion.
     """
@@ -35,9 +35,9 @@ class PairErrors(NamedTuple):
 
 
 def pair_errors(cameras: CameraPair, left: TargetView, right: TargetView) -> PairErrors:
-    """Return by how much two cameras are off at one pair of views of a target.
+    """Return the errors of two cameras at one pair of views of a target.
 
-    The points of both are numbered alike.
+    The points of both views must be numbered alike.
     """
     ids, first, second = np.intersect1d(left.ids, right.ids, return_indices=True)
     pixels = left.points[first], right.points[second]
@@ -50,10 +50,10 @@ def pair_errors(cameras: CameraPair, left: TargetView, right: TargetView) -> Pai
 
 
 def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
-    """Return the distances between neighbours on a target less the true ones (M,), metres.
+    """Return the errors of triangulated distances between neighbours on a target, (M,), metres.
 
-    ``ids`` (N,): numbers of points on it. ``points`` (N, 3): where they are in space, metres; those
-    that are NaN have no neighbours.
+    ``ids`` (N,): numbers of points on the target. ``points`` (N, 3): their places in space, metres;
+    those that are NaN have no neighbours.
     """
     seen = np.isfinite(points).all(axis=1)
     flat, points = target.points[ids[seen]], points[seen]

@@ -1,4 +1,4 @@
-"""Both images of a pair as two parallel cameras would see them: rows show the same points."""
+"""Rectify both images of a pair, as two parallel cameras would see them."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
 Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
 
 MIN_ACROSS_COSINE: Final = 0.1
-"""Cosine of the angle by which a camera's viewing direction is turned, at least.
+"""Least cosine of the angle by which a camera's viewing direction may be turned.
 
-With less, a camera looks along the line to the other one: rows would meet inside of its image.
+Below it, a camera looks along the line to the other one, and rows would meet inside of its image.
 """
 
 MAX_PIXELS: Final = 100_000_000
 """A rectified image has at most this many pixels; its two maps have 8 bytes for each pixel."""
 
 MAX_SAMPLES: Final = 50_000
-"""Source pixels at most, evenly spread, of which it is counted how many are kept."""
+"""At most this many source pixels, evenly spread, are sampled to count how many are kept."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rectification:
     """The result of :meth:`StereoCalibration.rectify`.
 
-    Where an image's half stands in a pair, the left one comes first.
+    In each pair of values, that of the left image comes first.
 
     Attributes:
         size: width and height of the rectified images, pixels.
         alpha: 0: all pixels of the output are valid; 1: all source pixels are kept.
         rotations: (3, 3) each, from each camera's frame into its rectified one.
         projections: (3, 4) each, from the left rectified frame, metres, into each rectified image.
-        depth: (4, 4), Q: (u, v, disparity, 1) becomes the point in the left rectified frame,
-            homogeneous, metres.
+        depth: (4, 4), the matrix Q, which maps (u, v, disparity, 1) to the homogeneous point in the
+            left rectified frame, metres.
         maps: (H, W, 2) each, float32: source of each output pixel, for ``cv2.remap``.
-        masks: (H, W) each: which pixels of the output have a source.
-        kept: part of the source pixels that are in the output, of each.
-        invalid: part of the output pixels that have no source, of each.
+        masks: (H, W) each, True for output pixels that have a source.
+        kept: part of the source pixels of each image that are in the output.
+        invalid: part of the output pixels of each image that have no source.
     """
 
     size: tuple[int, int]
@@ -64,11 +64,11 @@ class Rectification:
 
     @property
     def lost(self) -> tuple[float, float]:
-        """Part of the source pixels that are not in the output, of each."""
+        """Part of the source pixels of each image that are not in the output."""
         return 1.0 - self.kept[0], 1.0 - self.kept[1]
 
     def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Return both images (H, W) or (H, W, C) rectified; 0 where there is no source."""
+        """Rectify both images, (H, W) or (H, W, C); pixels without a source are 0."""
         cv2 = load("cv2")
         first, second = (
             np.asarray(cv2.remap(image, chart, None, cv2.INTER_LINEAR), dtype=np.uint8)
@@ -85,7 +85,7 @@ def rectify(
     alpha: float = 0.0,
     size: tuple[int, int] | None = None,
 ) -> Rectification:
-    """Return the maps after which the rows of two images show the same points.
+    """Return the maps that make the rows of two images show the same points.
 
     Args:
         left: lens of the left camera.
@@ -97,8 +97,8 @@ def rectify(
     Raises:
         CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is not valid or too
             large, lenses of different models; ``WRONG_SIZE``: images of different sizes;
-            ``OUT_OF_FIELD``: the images would have nothing in them, as of cameras behind each
-            other, or of which one stands on its head.
+            ``OUT_OF_FIELD``: the images would be empty, as for cameras one behind the other, or if
+            one is upside down.
     """
     output = _checked(left, right, alpha, size)
     turns, projections, depth = _parallel(left, right, transform, alpha, output)
@@ -169,10 +169,10 @@ def _parallel(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
     """Return rotations, projections and Q."""
     # Each camera is turned by half of the rotation between them, in opposite senses, so that both
-    # look the same way and neither image changes more than it must; then both are turned until the
-    # baseline is along x. A point at depth Z has the disparity d = f B / Z then, and Q takes
-    # (u, v, d, 1) to (u - cx, v - cy, f, -d / Tx), which is (X, Y, Z, 1) times d / B.
-    # Source: Bouguet's algorithm, as in Bradski and Kaehler, Learning OpenCV (2008), chapter 12.
+    # look in the same direction and neither image changes more than necessary; then both are turned
+    # until the baseline is along x. A point at depth Z has the disparity d = f B / Z then, and Q
+    # takes (u, v, d, 1) to (u - cx, v - cy, f, -d / Tx), which is (X, Y, Z, 1) times d / B. Source:
+    # Bouguet's algorithm, as in Bradski and Kaehler, Learning OpenCV (2008), chapter 12.
     cv2 = load("cv2")
     given = (
         left.matrix,

@@ -32,25 +32,24 @@ SIDES: Final = (LEFT, RIGHT)
 """Names of the sides by number."""
 
 MAX_GUESSES: Final = 20
-"""Pairs at most that are tried for a first guess of the transform."""
+"""At most this many pairs are tried for a first guess of the transform."""
 
-GROSS_RATIO: Final = 10.0
-"""Multiple of the median error beyond which a pair's views do not belong together, if it is
-MIN_FAR_SHARE, too."""
+MIN_GROSS_ERROR_RATIO: Final = 10.0
+"""The views of a pair do not belong together if its error is more than this many times the median,
+and above MIN_FAR_SHARE as well."""
 
 MIN_FAR_SHARE: Final = 0.01
-"""A pair is far off where its points are off by more than this part of the longer side of the
-image: neither noise nor a lens that is not yet adjusted does that."""
+"""A pair is far off only if its points are off by more than this part of the longer side of the
+image: neither noise nor a lens that is not yet adjusted causes that."""
 
 
 class Lenses(NamedTuple):
-    """The lenses that are known, and what is to be fitted of the others."""
+    """The known lenses, and the model of those to be fitted."""
 
-    # left and right; None for one that is to be found
+    # left and right lens; None for one that is to be fitted
     known: tuple[CameraModel | None, CameraModel | None]
-    model: DistortionModel  # of those that are to be found
-    # of these, coefficients that stay 0, as :func:`~smartcam.calibration._lens.start.lens_basis`
-    # takes them
+    model: DistortionModel  # model of the lenses that are to be fitted
+    # their coefficients that stay 0, as in :func:`~smartcam.calibration._lens.start.lens_basis`
     fixed: tuple[str, ...]
 
     def basis(self, side: int) -> Array:
@@ -60,7 +59,7 @@ class Lenses(NamedTuple):
 
 
 Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]
-"""Views that both cameras have of the target at one time."""
+"""Views of the target by both cameras at one time."""
 
 
 def as_moments(
@@ -68,9 +67,9 @@ def as_moments(
 ) -> list[Moment]:
     """Return the views as pairs.
 
-    Raises ``SHAPE``: lists of different lengths; ``DIFFERENT_TARGETS``, ``WRONG_SIZE``,
-    ``TOO_FEW``, ``COLLINEAR``, ``NOT_FINITE``: views that do not belong together, or one that is of
-    no use.
+    Raises ``SHAPE`` if the lists have different lengths; ``DIFFERENT_TARGETS``, ``WRONG_SIZE``,
+    ``TOO_FEW``, ``COLLINEAR`` or ``NOT_FINITE`` if views do not belong together, or if one is
+    unusable.
     """
     left_views, right_views = (
         as_list(views, (TargetView, type(None)), f"{side} view")
@@ -98,20 +97,20 @@ def as_moments(
 
 
 class FirstGuess(NamedTuple):
-    """A first guess of everything."""
+    """A first guess of all that is calibrated."""
 
     moments: list[Moment]  # the right views numbered as the left ones are
     bundle: Bundle  # lenses, transform and poses
-    # moments whose views do not belong together, and how far the right one is off where the left
-    # one and the other pairs have it, pixels; infinite where that is behind it
+    # moments whose views do not belong together, with the distance, pixels, of the right view from
+    # where the left view and the other pairs predict it; infinite if that is behind the camera
     apart: dict[int, float]
 
 
 def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
-    """Return a first guess of everything.
+    """Return a first guess of all that is calibrated.
 
-    Raises ``POOR_FIT``: no lens or no transform shows the views; ``INSUFFICIENT_ROTATION``;
-    ``WRONG_SIZE``: views of another camera than the known one.
+    Raises ``POOR_FIT`` if no lens or no transform fits the views; ``INSUFFICIENT_ROTATION``;
+    ``WRONG_SIZE`` if views are from another camera than the known one.
     """
     (left, ones), (right, twos) = (_side(moments, side, lenses) for side in range(2))
     poses: list[Poses] = list(zip(ones, twos, strict=True))
@@ -135,7 +134,7 @@ Poses: TypeAlias = tuple["Rigid | None", "Rigid | None"]
 def _side(
     moments: list[Moment], side: int, lenses: Lenses
 ) -> tuple[CameraModel, list[Rigid | None]]:
-    """Return one side's lens, and of each moment the pose that it sees."""
+    """Return one side's lens, and the target's pose at each moment."""
     seen = [number for number, moment in enumerate(moments) if moment[side] is not None]
     views = [view for moment in moments if (view := moment[side]) is not None]
     known, what = lenses.known[side], f"{SIDES[side]} camera"
@@ -155,12 +154,11 @@ def _side(
 def _rig(
     moments: list[Moment], poses: list[Poses], right: CameraModel, turns: Sequence[Rigid]
 ) -> tuple[Rigid, dict[int, float], list[int]]:
-    """Return the pair's transform that fits most of the pairs best, and the pairs that do not fit.
+    """Return the transform that fits most of the pairs best, and the pairs that do not fit.
 
-    Last come the pairs whose right view is numbered from the other end: ``turns`` of the target
-        leave it as
-    it was. Which numbering fits is told by all pairs together, as the cameras may stand on their
-    heads. Raises ``POOR_FIT``.
+    The last result are the pairs whose right view is numbered from the other end: after ``turns``
+    the target looks the same. All pairs together decide which numbering fits, since a camera may be
+    upside down. Raises ``POOR_FIT``.
     """
     pairs = [
         (number, one, two, moment[1])
@@ -170,8 +168,9 @@ def _rig(
     best, least, off = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
     some = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
     for turn, (_, one, two, _) in itertools.product(turns, some):
-        # T_right_left = T_right_target T_target_left; that with the least median counts, which half
-        # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).
+        # T_right_left = T_right_target T_target_left; the one with the least median error is taken,
+        # which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares Regression
+        # (1984).
         guess = two @ turn @ one.inverse()
         tried = np.array([_off(guess @ pose, view, right, turns) for _, pose, _, view in pairs])
         middle = float(np.median(tried.min(axis=1)))
@@ -182,7 +181,7 @@ def _rig(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
-    far = max(GROSS_RATIO * least, MIN_FAR_SHARE * max(right.size))
+    far = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
     numbers, nearest = [number for number, *_ in pairs], off.min(axis=1).tolist()
     apart = {number: one for number, one in zip(numbers, nearest, strict=True) if one > far}
     turned = [number for number, one in zip(numbers, off, strict=True) if one[0] > one[-1]]
@@ -190,7 +189,7 @@ def _rig(
 
 
 def _off(pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]) -> list[float]:
-    """Return the mean distance of a view's points from a pose's, with each turn, pixels."""
+    """Return the mean distance, pixels, of a view's points from a pose's, for each turn."""
     seen = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
     off = [np.linalg.norm(one - view.points, axis=1) for one in seen]
     return [float(np.nan_to_num(one, nan=math.inf).mean()) for one in off]

@@ -1,4 +1,4 @@
-"""Points that two cameras see, in space."""
+"""Triangulate points that two cameras see."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_STEPS = 10
-"""Steps from the linear solution to the least reprojection error; two or three are enough."""
+"""At most this many steps lead from the linear solution to the least reprojection error; two or
+three are enough."""
 
 SETTLED_DEPTH_RATIO = 1e-9
-"""Part of its depth that a point still moves in the last step."""
+"""The iteration ends when a step moves a point by less than this part of its depth."""
 
 
 class CameraPair(NamedTuple):
     """Two cameras."""
 
-    left: CameraModel  # its lens
-    right: CameraModel  # its lens
+    left: CameraModel  # lens of the left camera
+    right: CameraModel  # lens of the right camera
     transform: Transform  # ``T_right_left``
 
 
 class Triangulated(NamedTuple):
-    """Points and how sure they are."""
+    """Triangulated points with their covariance."""
 
-    # (N, 3), left camera's frame, metres; NaN where the rays do not meet before both cameras
+    # (N, 3), left camera's frame, metres; NaN where the rays do not meet in front of both cameras
     points: Array
     covariance: Array  # (N, 3, 3), m^2
 
@@ -40,12 +41,12 @@ class Triangulated(NamedTuple):
 def triangulate(
     pair: CameraPair, pixels: tuple[Array, Array], covariance: tuple[Array, Array]
 ) -> Triangulated:
-    """Return the points whose projections are nearest to what both cameras see.
+    """Return the points whose projections are nearest to the given pixels.
 
     Nearest is the least sum of squares in both images, weighted by the covariance of the pixels:
     for normal noise no unbiased estimate has a smaller variance.
 
-    ``pixels`` (N, 2) and ``covariance`` (N, 2, 2) are left and right.
+    ``pixels`` (N, 2) and ``covariance`` (N, 2, 2) are given for the left and the right image.
     """
     points = _linear(pair, pixels)
     points[~(points[:, 2] > 0)] = np.nan
@@ -60,7 +61,7 @@ def triangulate(
             break
     behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
     points[behind] = np.nan
-    points[~np.isfinite(points).all(axis=1)] = np.nan  # none of them is infinite
+    points[~np.isfinite(points).all(axis=1)] = np.nan  # all weights are finite
     # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
     inverse = np.full_like(normal, np.nan)
@@ -69,7 +70,7 @@ def triangulate(
 
 
 def _linear(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
-    """Return the points by the direct linear transform of the rays (N, 3)."""
+    """Return the points (N, 3) by the direct linear transform of the rays."""
     if not len(pixels[0]):
         return np.zeros((0, 3))
     # A ray (x, y) of the plane z = 1 gives two linear equations of the homogeneous point X with the
@@ -90,7 +91,8 @@ def _step(
 ) -> tuple[Array, Array]:
     """Return the normal matrices (N, 3, 3) and Gauss and Newton's step (N, 3)."""
     # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
-    # points at once, which no solver of single problems does; a thousand take a few milliseconds.
+    # points are solved at once, which no solver of single problems does; a thousand take a few
+    # milliseconds.
     one = linearize(points, pair.left)
     two = linearize(pair.transform.apply(points), pair.right)
     rows = [white[0] @ one.by_point, white[1] @ two.by_point @ pair.transform.rotation]
@@ -109,9 +111,10 @@ def _step(
 
 
 def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
-    """Return the distances of undistorted pixels from the other camera's rays of their partners.
+    """Return the distances of undistorted pixels from the epipolar lines of their partners.
 
-    ``pixels`` (N, 2) are left and right; (N, 2): in the left image and in the right one, pixels.
+    ``pixels`` (N, 2) are given for the left and the right image; the result (N, 2) has the
+    distances in the left and in the right image, pixels.
     """
     # A point's two rays and the baseline lie in one plane: x2^T E x1 = 0 with E = [t]x R. In pixels
     # without distortion it is F = K2^-T E K1^-1; F x1 is the line of x1's partner in the right

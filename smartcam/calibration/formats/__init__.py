@@ -1,4 +1,4 @@
-"""Formats of other programs: transforms, samples of a hand-eye calibration, poses over time.
+"""Read and write other programs' transforms, samples of hand-eye calibrations, and poses over time.
 
 Our own files are in ``calibration/_files``.
 
@@ -8,9 +8,9 @@ Our own files are in ``calibration/_files``.
     camera = read_transform("handeye.calib", "easy_handeye2")
     pose = pose_from("kuka", [400, 120, 35.5, 90, 0, 180])
 
-:data:`TRANSFORMS`, :data:`SAMPLES` and :data:`TRAJECTORIES` are the tables of them; cameras have
-theirs in ``_cameras.py`` (:func:`read_cameras`). One that is added is a row, with a function that
-parses and one that composes. Everything that is read is bad input until it has been checked: size,
+:data:`TRANSFORMS`, :data:`SAMPLES` and :data:`TRAJECTORIES` are the tables of formats; those of
+cameras are in ``_cameras.py`` (:func:`read_cameras`). To add a format, add a row with a function
+that parses and one that composes. Nothing that is read is trusted until it has been checked: size,
 depth, every number and every rotation.
 """
 
@@ -32,7 +32,7 @@ from smartcam.calibration.formats._cameras import (
     write_camera_info,
     write_cameras,
 )
-from smartcam.calibration.formats._file_format import MAX_FILE, MAX_YAML, Format, named
+from smartcam.calibration.formats._file_format import MAX_FILE_BYTES, MAX_YAML_BYTES, Format, named
 from smartcam.calibration.formats._opencv import PlaneMatrix
 from smartcam.calibration.formats._plain import frame_name, known
 from smartcam.calibration.formats._planes import plane_frame
@@ -74,14 +74,14 @@ __all__ = [
 
 
 def _arguments(title: str, compose: Callable[..., str], **options: bool) -> Format[Transform]:
-    """Return a format of arguments; all of them read the same."""
+    """Return a format of command-line arguments; all of these are read alike."""
     return Format(title, ".txt", named(ros.parse_arguments), partial(compose, **options))
 
 
 def _easy(
     name: str, of: str, suffix: str, parse: Callable[[str], Transform], compose: Callable[..., str]
 ) -> dict[str, Format[Transform]]:
-    """Return a program's two formats: of a camera that stands, and of one that is carried."""
+    """Return a program's two formats: one for a fixed camera, one for a camera on the robot."""
     carried = partial(compose, in_hand=True)
     return {
         name: Format(f"{name}, {of}: a camera that stands", suffix, named(parse), compose),
@@ -132,7 +132,7 @@ TRANSFORMS: Mapping[str, Format[Transform]] = {
     ),
     "urdf": Format("origin of a joint in a robot's description", ".urdf", ros.parse_urdf),
 }
-"""Formats of one transform. Those that differ in what they write alone read all the same."""
+"""Formats of one transform. Those that differ only in what they write are read alike."""
 
 SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
     "moveit": Format(
@@ -140,17 +140,17 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
         ".json",
         named(samples.parse_json),
         samples.compose_json,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
     "moveit_yaml": Format(
         "samples of MoveIt's hand-eye panel, YAML",
         ".yaml",
         named(samples.parse_yaml),
         samples.compose_yaml,
-        most=MAX_YAML,
+        most=MAX_YAML_BYTES,
     ),
 }
-"""Formats of samples of a hand-eye calibration; none has names of frames."""
+"""Formats of samples of a hand-eye calibration; they have no names of frames."""
 
 TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
     "asl": Format(
@@ -158,17 +158,17 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_asl,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
     "euroc": Format(
         "EuRoC: nanoseconds, the quaternion's real part first",
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_euroc,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
 }
-"""Formats of poses over time; either reads both, and the file's header decides."""
+"""Formats of poses over time; both are read alike, since the file's header decides."""
 
 _MATRIX: Format[PlaneMatrix] = Format(
     "matrix of a plane calibration",
@@ -178,7 +178,8 @@ _MATRIX: Format[PlaneMatrix] = Format(
 )
 
 
-# ---------------------------------------------------------------------- one for each kind of value
+# ---------------------------------------------------------------------- a reader and a writer for
+# each kind of value
 
 
 def read_transform(
@@ -195,15 +196,15 @@ def read_transform(
         path: the file.
         form: format of the file, a key of :data:`TRANSFORMS`.
         target: the frame that the transform leads to, for a format that does not name it.
-        source: the frame that the transform comes from, likewise.
-        unit: unit of the file's lengths; None for the one that the file, or its format, says. A
-            bare matrix and OpenCV's files do not say it.
+        source: the frame that the transform comes from, for a format that does not name it.
+        unit: unit of the file's lengths; None for the unit that the file or its format says. A bare
+            matrix and OpenCV's files say none.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``; ``MALFORMED``: the file is not what the format says,
-            or too large; ``UNIT_UNKNOWN``: nothing says the unit, or a distance of more than 20 m
-            or an angle of more than a turn asks whether it is another one; ``NOT_FINITE``,
-            ``NOT_RIGID``, ``BAD_NAME``: what it says is no pose.
+        CalibrationError: ``UNKNOWN_FORMAT``; ``MALFORMED``: the file does not have the format, or
+            is too large; ``UNIT_UNKNOWN``: nothing says the unit, or a distance of more than 20 m
+            or an angle of more than a turn suggests another one; ``NOT_FINITE``, ``NOT_RIGID``,
+            ``BAD_NAME``: its values are no pose.
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
@@ -211,7 +212,7 @@ def read_transform(
 
 
 def write_transform(path: str | os.PathLike[str], form: str, transform: Transform) -> None:
-    """Write a transform; the file is whole, or what was there before.
+    """Write a transform; the file is written whole, or left as it was.
 
     Args:
         path: the file.
@@ -220,8 +221,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``BAD_NAME``: a frame's name that the format cannot
-            hold;
-            ``NOT_WRITTEN``: it cannot be written.
+            hold; ``NOT_WRITTEN``: the file cannot be written.
     """
     known(TRANSFORMS, form).write(path, transform)
 
@@ -229,7 +229,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 def read_samples(
     path: str | os.PathLike[str], form: str, *, unit: LengthUnit | None = None
 ) -> Sequence[HandEyeSample]:
-    """Read the samples of a hand-eye calibration, a key of :data:`SAMPLES`.
+    """Read the samples of a hand-eye calibration; ``form`` is a key of :data:`SAMPLES`.
 
     Their frames are called base, effector, camera and object. Errors are those of
     :func:`read_transform`.
@@ -238,12 +238,11 @@ def read_samples(
 
 
 def write_samples(path: str | os.PathLike[str], form: str, values: Sequence[HandEyeSample]) -> None:
-    """Write samples; the file is whole, or what was there before.
+    """Write samples; the file is written whole, or left as it was.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``; ``WRONG_FRAME``: they are not all between the same
-            frames, whose names the file cannot tell;
-            ``NOT_WRITTEN``: it cannot be written.
+        CalibrationError: ``UNKNOWN_FORMAT``; ``WRONG_FRAME``: samples are between different frames,
+            whose names the file cannot hold; ``NOT_WRITTEN``: the file cannot be written.
     """
     known(SAMPLES, form).write(path, values)
 
@@ -256,20 +255,20 @@ def read_trajectory(
     source: str = "body",
     unit: LengthUnit | None = None,
 ) -> Sequence[Transform]:
-    """Read poses over time, a key of :data:`TRAJECTORIES`, in the order of the file.
+    """Read poses over time, in the order of the file; ``form`` is a key of :data:`TRAJECTORIES`.
 
-    Times come to the nearest microsecond. Arguments and errors are those of
+    Times are rounded to the nearest microsecond. Arguments and errors are those of
     :func:`read_transform`, and ``BAD_TIME``.
     """
     return known(TRAJECTORIES, form).read(path, target, source, unit=unit)
 
 
 def write_trajectory(path: str | os.PathLike[str], form: str, values: Sequence[Transform]) -> None:
-    """Write poses over time; the file is whole, or what was there before.
+    """Write poses over time; the file is written whole, or left as it was.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``, ``WRONG_FRAME``; ``BAD_TIME``: one has none;
-            ``NOT_WRITTEN``: it cannot be written.
+        CalibrationError: ``UNKNOWN_FORMAT``, ``WRONG_FRAME``; ``BAD_TIME``: a pose has no time;
+            ``NOT_WRITTEN``: the file cannot be written.
     """
     known(TRAJECTORIES, form).write(path, values)
 
@@ -278,7 +277,8 @@ def read_matrix(path: str | os.PathLike[str]) -> PlaneMatrix:
     """Read the matrix of a plane calibration that was exported as ``.yaml``.
 
     Raises:
-        CalibrationError: ``MALFORMED``, ``NOT_FINITE``; ``COLLINEAR``: it maps to a line.
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE``; ``COLLINEAR``: the matrix maps the plane to
+            a line.
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
@@ -286,16 +286,16 @@ def read_matrix(path: str | os.PathLike[str]) -> PlaneMatrix:
 
 
 def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = None) -> str:
-    """Return the file of a plane calibration's frame, its scale in a comment.
+    """Return the text of a file with a plane calibration's frame, its scale in a comment.
 
     Args:
         form: format of the file, a key of :data:`TRANSFORMS`.
-        calibration: one that has a frame: see :func:`plane_frame`.
-        suffix: what the file's name ends in; None for whatever.
+        calibration: calibration that has a frame, see :func:`plane_frame`.
+        suffix: required suffix of the file's name; None for any.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``, ``NOT_SIMILAR``; ``BAD_NAME``: a frame's name that
-            the format cannot hold, or another suffix than the format's.
+        CalibrationError: ``UNKNOWN_FORMAT``, ``NOT_SIMILAR``; ``BAD_NAME``: a frame's name that the
+            format cannot hold, or ``suffix`` is not the format's.
     """
     wanted = known(TRANSFORMS, form)
     if suffix not in {None, wanted.suffix}:
@@ -304,7 +304,7 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         )
     transform, scale = plane_frame(calibration)
     for name in (transform.target, transform.source):
-        frame_name(name, "frame")  # it stands in the comment whatever the format holds
+        frame_name(name, "frame")  # in the comment, whatever the format can hold
     said = (
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"

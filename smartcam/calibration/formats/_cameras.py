@@ -1,14 +1,14 @@
-"""Lenses and pairs in files of other programs: ROS' ``camera_info``, Kalibr's camchain, OpenCV's.
+"""Read and write lenses and pairs: ROS' ``camera_info``, Kalibr's camchain, OpenCV's files.
 
-Those of other programs that are only read are in ``_foreign.py``.
+Formats that can only be read are in ``_foreign.py``.
 
 ::
 
     write_cameras("camchain.yaml", "kalibr", CameraChain.of(calibration))
     camera = read_cameras("left.yaml", "camera_info").cameras[0]
 
-Pixels count from the middle of the upper left one, and lengths become metres. The number of
-coefficients that is written follows from the model, and so does what is read.
+Pixels count from the centre of the upper left pixel, and lengths are converted to metres. The model
+of the lens decides how many coefficients are written and read.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ CameraForm: TypeAlias = Literal[
 ]
 """Names of the formats."""
 
-MAX_FILE: Final = 1 << 20
-"""Bytes of a file at most; a chain of eight cameras has four thousand."""
+MAX_FILE_BYTES: Final = 1 << 20
+"""A file has at most this many bytes; a chain of eight cameras has four thousand."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
 _RADTAN: Final = 4
-"""k1, k2, p1, p2: Kalibr has no k3."""
+"""Number of Kalibr's coefficients: k1, k2, p1, p2; there is no k3."""
 
 _MATRICES: Final = (("M1", "D1"), ("M2", "D2"))
 """Names of both cameras' matrices in OpenCV's sample ``stereo_calib``."""
@@ -70,7 +70,7 @@ _MATRICES: Final = (("M1", "D1"), ("M2", "D2"))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraChain:
-    """Cameras, each where the one before it sees it.
+    """Cameras, each with its pose relative to the one before.
 
     Attributes:
         cameras: the lenses, one or more.
@@ -108,8 +108,8 @@ class CameraInfo(NamedTuple):
     Attributes:
         camera: the lens.
         name: name of the camera.
-        rectification: (3, 3), from the camera's frame into the rectified one.
-        projection: (3, 4), of the rectified image, pixels.
+        rectification: (3, 3), rotation from the camera's frame into the rectified one.
+        projection: (3, 4), projection of the rectified image, pixels.
     """
 
     camera: CameraModel
@@ -133,16 +133,16 @@ def read_cameras(
         form: ``camera_info`` and ``ros_ini`` (ROS), ``kalibr``, ``opencv`` (YAML or XML),
             ``euroc`` (``sensor.yaml``), ``mrcal`` (``.cameramodel``), ``colmap``
             (``cameras.txt``), ``basalt`` or ``multical`` (``calibration.json``).
-        size: width and height of the cameras' images, pixels, for a file that does not say it, as
-            OpenCV's ``intrinsics.yml``; else what the file says has to be the same.
-        unit: unit of the lengths between cameras; None for what the file or its format says.
-            OpenCV's and multical's do not.
+        size: width and height of the cameras' images, pixels, for a file that does not say it, such
+            as OpenCV's ``intrinsics.yml``; if a file says it, it must be the same.
+        unit: unit of the lengths between cameras; None for the unit that the file or its format
+            says. Those of OpenCV and multical say none.
         extrinsics: the second file of OpenCV's sample ``stereo_calib``, with R and T.
 
     Raises:
-        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID`` or ``SHAPE``: the file is not
-            what its format says, or has a lens of another model; ``WRONG_SIZE``: it has no size of
-            the images, or another one; ``UNIT_UNKNOWN``; ``UNKNOWN_FORMAT``.
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID`` or ``SHAPE``: the file does
+            not have its format, or has a lens of another model; ``WRONG_SIZE``: the file has no
+            size of the images, or another one; ``UNIT_UNKNOWN``; ``UNKNOWN_FORMAT``.
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
@@ -154,7 +154,7 @@ def read_cameras(
     if form != "opencv":
         raise _cannot(form, "one file", "extrinsics as well")
     with Path(extrinsics).open("rb") as stream:
-        more = stream.read(MAX_FILE + 1).decode("utf-8", "replace")
+        more = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
     return wanted.read(path, size, more, unit=unit)
 
 
@@ -167,9 +167,8 @@ def write_cameras(path: str | os.PathLike[str], form: CameraForm, chain: CameraC
         chain: the cameras.
 
     Raises:
-        CalibrationError: ``SHAPE``: the format cannot hold so many cameras, or such a lens;
-            ``UNKNOWN_FORMAT``;
-            ``NOT_WRITTEN``: it cannot be written.
+        CalibrationError: ``SHAPE``: the format cannot hold this number of cameras, or such a lens;
+            ``UNKNOWN_FORMAT``; ``NOT_WRITTEN``: the file cannot be written.
     """
     known(FORMS, form, "format of cameras").write(path, chain)
 
@@ -188,12 +187,12 @@ def write_camera_info(
         path: the file.
         camera: the lens.
         name: name of the camera.
-        rectification: (3, 3), as :meth:`StereoCalibration.rectify` has it; None: none.
-        projection: (3, 4), pixels and, for the right camera, pixels times metres; None: the lens
-            without its distortion.
+        rectification: (3, 3), as from :meth:`StereoCalibration.rectify`; None for no rectification.
+        projection: (3, 4), pixels and, for the right camera, pixels times metres; None for that of
+            the lens without its distortion.
 
     Raises:
-        CalibrationError: ``NOT_WRITTEN``: it cannot be written.
+        CalibrationError: ``NOT_WRITTEN``: the file cannot be written.
     """
     text = compose_camera_info(camera, name, rectification, projection)
     replace_file(Path(path), text.encode())
@@ -273,10 +272,11 @@ def _parse_one(text: str, size: tuple[int, int] | None = None) -> CameraChain:
 def compose_camchain(chain: CameraChain) -> str:
     """Return the YAML of Kalibr's camchain; the cameras are ``cam0``, ``cam1``, ...
 
-    Source: Kalibr's wiki, "YAML formats" (published): ``T_cn_cnm1`` leads from the camera before.
+    Source: Kalibr's wiki, "YAML formats" (published): ``T_cn_cnm1`` leads from the previous camera
+    into this one.
 
     Raises:
-        CalibrationError: ``SHAPE``: a lens with k3, or of a model that Kalibr does not have.
+        CalibrationError: ``SHAPE``: a lens has k3, or a model that Kalibr does not have.
     """
     text = ""
     for number_, (camera, name) in enumerate(zip(chain.cameras, chain.names, strict=True)):
@@ -309,13 +309,14 @@ def _of_kalibr(camera: CameraModel) -> Array:
 
 
 def compose_opencv(chain: CameraChain) -> str:
-    """Return YAML for ``cv2.FileStorage``: ``camera_matrix`` of one camera, M1, D1, ... of two.
+    """Return YAML for ``cv2.FileStorage``: ``camera_matrix`` for one camera, M1, D1, ... for two.
 
     Source: OpenCV's samples ``calibration`` and ``stereo_calib`` (published): R and T lead from the
     first camera to the second.
 
     Raises:
-        CalibrationError: ``SHAPE``: more than two cameras, of different sizes or models.
+        CalibrationError: ``SHAPE``: there are more than two cameras, or they have different sizes
+            or models.
     """
     first = chain.cameras[0]
     head = (
@@ -353,10 +354,10 @@ def parse_opencv(
 ) -> Measured[CameraChain]:
     """Return the cameras of a file of OpenCV's calibration samples and tutorials, YAML or XML.
 
-    Names are the same in whatever case, with or without ``_``. Where the file does not name the
-    model, coefficients beyond the fifth that are not 0 make it ``rational_polynomial``, and eight
-    of them; else it is ``plumb_bob``, and ``equidistant`` with ``fisheye_model: 1``.
-    ``extrinsics``: the text of the file with R and T.
+    Names are read in any case, with or without ``_``. If the file does not name the model, it is
+    ``equidistant`` with ``fisheye_model: 1``, ``rational_polynomial`` of eight coefficients if one
+    beyond the fifth is not 0, and else ``plumb_bob``. ``extrinsics``: the text of the file with R
+    and T.
 
     Raises:
         CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``, ``SHAPE``, ``WRONG_SIZE``.
@@ -392,7 +393,7 @@ def parse_opencv(
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "k", "m")
 _BENT: Final = ("distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distortion", "d")
 _ENDS: Final = (("1", "2"), ("left", "right"), ("l", "r"))
-"""Names of a camera's matrix and coefficients in files of OpenCV, and what tells two cameras."""
+"""Endings of the names of matrices and coefficients that distinguish two cameras."""
 
 
 def _normal(data: Plain) -> dict[str, Plain]:
@@ -439,7 +440,7 @@ def _form(
     parse: Callable[..., CameraChain | Measured[CameraChain]],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE)
+    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE_BYTES)
 
 
 def _foreign(
@@ -447,7 +448,7 @@ def _foreign(
     parse: Callable[[str], foreign.Found],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    """Return a format whose parser knows no cameras of ours."""
+    """Return a format for a parser that returns lenses as the file has them."""
 
     def read(
         text: str, given: tuple[int, int] | None = None
@@ -479,7 +480,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
     "basalt": _foreign("basalt", foreign.parse_basalt),
     "multical": _foreign("multical", foreign.parse_multical),
 }
-"""The formats by their names."""
+"""Formats of cameras by their names."""
 
 
 def _cannot(form: str, expected: str, got: str) -> CalibrationError:
@@ -489,7 +490,7 @@ def _cannot(form: str, expected: str, got: str) -> CalibrationError:
 
 
 def _size(said: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, int]:
-    """Return width and height, pixels, of what a file says and what the user gives."""
+    """Return width and height, pixels, from those in the file and those that the user gives."""
     if not said:
         if given is None:
             raise Code.WRONG_SIZE.refusal(
@@ -520,7 +521,7 @@ def _model(said: Plain, coefficients: Array) -> DistortionModel:
 def _camera(
     size: tuple[int, int], matrix: Array, coefficients: Array, model: DistortionModel
 ) -> CameraModel:
-    """Return a lens; missing coefficients at the end are 0, and so must be those too many."""
+    """Return a lens; missing coefficients at the end are taken as 0, surplus ones must be 0."""
     count = COEFFICIENTS[model]
     short = {"plumb_bob": {0, 4}}.get(model, {0})
     if len(coefficients) in short:

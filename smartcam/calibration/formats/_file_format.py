@@ -1,4 +1,4 @@
-"""Files of a format of another program: read within a bound, written whole or not at all."""
+"""Read files of other programs within a bound, and write them whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,41 +19,43 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable
 
-MAX_TEXT = 1 << 16
-"""Bytes at most of a file with one pose, which has some hundred."""
+MAX_TEXT_BYTES = 1 << 16
+"""A file with one pose has at most this many bytes; usual ones have some hundred."""
 
-MAX_YAML = 1 << 18
-"""Bytes at most of a YAML file with samples: some 400 of them. PyYAML may take seconds for it."""
+MAX_YAML_BYTES = 1 << 18
+"""A YAML file with samples has at most this many bytes, which hold some 400 samples. PyYAML may
+take seconds for it."""
 
-MAX_FILE = 1 << 24
-"""Bytes at most of a JSON or CSV file: a ground truth of EuRoC has 6 MB."""
+MAX_FILE_BYTES = 1 << 24
+"""A JSON or CSV file has at most this many bytes: a ground truth of EuRoC has 6 MB."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Measured(Generic[T]):
-    """A value of a file whose format leaves the unit of lengths open."""
+    """A value read from a file whose format does not fix the unit of lengths."""
 
     value: T
-    unit: str | None = None  # what the file itself says
+    unit: str | None = None  # unit that the file itself says, or None
 
 
 @dataclass(frozen=True, slots=True)
 class Format(Generic[T]):
-    """One format."""
+    """One format of files."""
 
-    title: str  # what it is
-    suffix: str  # what its files' names end in
-    # makes a value of a text and of what else is given: of cameras their size, else the names of
-    # target and source where the format has none; Measured where lengths may be in any unit, else
-    # metres; errors are those of :func:`~smartcam.calibration.formats.read_transform`
+    title: str  # description for people
+    suffix: str  # suffix of the files' names
+    # function that makes a value of a text and of further arguments: the size for cameras, else the
+    # names of target and source if the format has none. It returns Measured if lengths may be in
+    # any unit, else metres; errors are those of
+    # :func:`~smartcam.calibration.formats.read_transform`
     parse: Callable[..., T | Measured[T]]
-    # makes a text of a value, without ``head``; errors are those of
-    # :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
+    # function that makes a text, without ``head``, of a value; None for a format that is only read.
+    # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
     compose: Callable[[T], str] | None = None  # None: it is only read
-    head: str = ""  # what the file begins with
-    most: int = MAX_TEXT  # bytes of a file at most
+    head: str = ""  # text at the beginning of each file
+    most: int = MAX_TEXT_BYTES  # largest number of bytes of a file
 
     def read(
         self,
@@ -63,7 +65,7 @@ class Format(Generic[T]):
     ) -> T:
         """Read a file; errors are those of ``parse``, and UNIT_UNKNOWN.
 
-        ``unit``: of its lengths; None for what the file or its format says.
+        ``unit``: unit of its lengths; None for the unit that the file or its format says.
         """
         with Path(path).open("rb") as stream:
             body = stream.read(self.most + 1)
@@ -101,7 +103,7 @@ class Format(Generic[T]):
         replace_file(Path(path), (self.head + self.text(value)).encode())
 
     def text(self, value: T) -> str:
-        """Return a value as the format has it, without ``head``; UNKNOWN_FORMAT: only read."""
+        """Return a value as text, without ``head``; raise UNKNOWN_FORMAT if it can only be read."""
         if self.compose is None:
             raise Code.UNKNOWN_FORMAT.refusal(
                 f"{self.title}: expected a format that can be written, got one that is only read",
@@ -111,7 +113,7 @@ class Format(Generic[T]):
 
 
 def _motions(value: Any) -> list[Transform]:
-    """Return the motions of what a file holds: one, lists of them to any depth, or a chain's."""
+    """Return the motions in the value of a file: one, lists of them to any depth, or a chain's."""
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
@@ -131,5 +133,5 @@ def _scaled(value: Any, factor: float) -> Any:
 
 
 def named(parse: Callable[[str], T | Measured[T]]) -> Callable[..., T | Measured[T]]:
-    """Return a parser for a format that names its frames, or has none to name."""
+    """Return a parser for a format that names its frames itself, or has none."""
     return lambda text, *_names: parse(text)

@@ -1,8 +1,8 @@
-"""Lenses of other programs' files that are only read.
+"""Read lenses from other programs' files that smartcam does not write.
 
-Each function gives what a file says as :class:`ForeignLens`, ... and the table of
-``_cameras.py`` makes cameras of it. Pixels count from the middle of the upper left one; COLMAP
-counts from its corner, which is half a pixel more.
+Each function returns the contents of a file as :class:`ForeignLens`, ..., from which the table of
+``_cameras.py`` makes cameras. Pixels count from the centre of the upper left pixel; COLMAP counts
+from its corner, which is half a pixel more.
 
 Source: dkogan/mrcal, ``doc/cameramodels.org``; colmap/colmap, ``sensor/models.h`` and
 ``doc/format.rst``; ros-perception/image_common, ``camera_calibration_parsers``, ``parse_ini.cpp``;
@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 
 
 class ForeignLens(NamedTuple):
-    """A lens as a file has it."""
+    """A lens as it is in a file."""
 
     name: str
-    size: Sequence[Plain] | None  # width and height; None: the file does not say it
+    size: Sequence[Plain] | None  # width and height, pixels; None if the file does not say it
     focal: Sequence[float]  # fx, fy, cx, cy, pixels
     model: DistortionModel
     coefficients: Sequence[float]
@@ -105,7 +105,7 @@ MODELS: Final[Mapping[str, Mapping[str, _LensParameters]]] = {
         "rational": _LensParameters(_FXFY, "rational_polynomial", _EIGHT),
     },
 }
-"""ForeignLens models of each program that can be told here by their names."""
+"""Lens models of each program, by their names in its files."""
 
 
 def _lens(
@@ -115,7 +115,7 @@ def _lens(
     where: str,
     size: Sequence[Plain] | None,
 ) -> ForeignLens:
-    """Return a lens of its parameters, in the order that the program's model has."""
+    """Return a lens from its parameters, which are in the order of the program's model."""
     models = MODELS[program]
     if not (isinstance(said, str) and said in models):
         raise malformed(f"{where}: lens model", f"one of {', '.join(models)}", said)
@@ -140,17 +140,17 @@ def _lens(
 # ---------------------------------------------------------------------- one camera, or several
 
 Found = tuple["list[ForeignLens]", "list[Transform]", "str | None"]
-"""Lenses, the transforms from each into the next one, and their unit where the file gives it."""
+"""Lenses, the transforms from each into the next one, and the transforms' unit if it is known."""
 
 BY_FORMAT: Final = ""
-"""Unit of lengths that are metres because the format says so, not the file."""
+"""Unit of lengths that are metres by the definition of the format."""
 
 MAX_CAMERAS: Final = 64
-"""Cameras of a chain at most."""
+"""A chain has at most this many cameras."""
 
 
 def parse_camchain(text: str) -> Found:
-    """Return the cameras of Kalibr's camchain, each with its motion from the one before."""
+    """Return the cameras of Kalibr's camchain, with the motion from each to the next."""
     data = mapping(load_yaml(text), "file", ["cam0"])
     names = [f"cam{place}" for place in range(sum(key.startswith("cam") for key in data))]
     if len(names) > MAX_CAMERAS:
@@ -170,7 +170,7 @@ _PINHOLE_OF_KALIBR: Final = ("camera_model", "intrinsics", "distortion_model", "
 
 
 def _pinhole(program: str, part: dict[str, Plain], where: str, coefficients: str) -> ForeignLens:
-    """Return a lens of Kalibr's keys, which EuRoC has as well but for one."""
+    """Return a lens from Kalibr's keys; EuRoC's are the same except for one."""
     if part["camera_model"] != "pinhole":
         raise malformed(f"{where}.camera_model", "pinhole", part["camera_model"])
     values = reals(part["intrinsics"], f"{where}.intrinsics", 4)
@@ -180,7 +180,7 @@ def _pinhole(program: str, part: dict[str, Plain], where: str, coefficients: str
 
 
 def parse_colmap(text: str) -> Found:
-    """Return the cameras of ``cameras.txt``; it has no poses, so there may be one only."""
+    """Return the cameras of ``cameras.txt``; it has no poses, so there may be only one camera."""
     found = []
     for line in text.splitlines():
         words = line.split()
@@ -196,7 +196,7 @@ def parse_colmap(text: str) -> Found:
 
 
 def parse_mrcal(text: str) -> Found:
-    """Return the lens of a ``.cameramodel``: a dictionary of Python, which is YAML as well."""
+    """Return the lens of a ``.cameramodel``: a Python dictionary, which is also YAML."""
     data = mapping(load_yaml(text), "file", ["lensmodel", "intrinsics", "imagersize"])
     values = reals(data["intrinsics"], "intrinsics")
     size = sequence(data["imagersize"], "imagersize", 2)
@@ -204,7 +204,7 @@ def parse_mrcal(text: str) -> Found:
 
 
 def parse_ros_ini(text: str) -> Found:
-    """Return the camera of ROS' ``.ini``: titles in lines of their own, numbers below them."""
+    """Return the camera of ROS' ``.ini``: lines with titles, and lines with numbers below them."""
     section, title = "camera", ""
     found: dict[str, list[Plain]] = {}
     for line in map(str.strip, text.splitlines()):
@@ -229,7 +229,7 @@ def parse_ros_ini(text: str) -> Found:
 
 
 def _focal(matrix: np.ndarray[Any, Any]) -> list[float]:
-    """Return fx, fy, cx and cy of a (3, 3) matrix; else MALFORMED: it is no lens'."""
+    """Return fx, fy, cx and cy of a (3, 3) matrix; raise MALFORMED if it is no lens' matrix."""
     focal = [float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
     if (matrix != lens_matrix(*focal)).any():
         raise malformed("camera matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist())
@@ -237,14 +237,14 @@ def _focal(matrix: np.ndarray[Any, Any]) -> list[float]:
 
 
 def parse_euroc(text: str) -> Found:
-    """Return the camera of a ``sensor.yaml``; where it sits on the body is a transform's format."""
+    """Return the camera of a ``sensor.yaml``; its pose on the body is read as a transform."""
     keys = [*_PINHOLE_OF_KALIBR[:3], "distortion_coefficients"]
     lens = _pinhole("euroc", mapping(load_yaml(text), "file", keys), "camera", keys[3])
     return [lens], [], None
 
 
 def parse_basalt(text: str) -> Found:
-    """Return the cameras of basalt's ``calibration.json``, metres; each lies in the IMU's frame."""
+    """Return the cameras of basalt's ``calibration.json``, metres, posed in the IMU's frame."""
     data = mapping(mapping(load_json(text), "file", ["value0"])["value0"], "value0", ["intrinsics"])
     cameras = sequence(data["intrinsics"], "intrinsics")
     sizes = sequence(data["resolution"], "resolution", len(cameras)) if "resolution" in data else []
@@ -284,7 +284,8 @@ def parse_multical(text: str) -> Found:
         lenses.append(_lens("multical", part["model"], [*_focal(matrix), *bent], name, size))
     if len(lenses) < 2:
         return lenses, [], None
-    # "b_to_a" is where b sees what a sees; one name alone is the master, or where the rig is
+    # "b_to_a" is the motion from a's frame into b's; a single name is the master, or the pose of
+    # the rig
     seen: dict[str, Transform] = {}
     for name, pose in mapping(
         mapping(data, "file", ["camera_poses"])["camera_poses"], "poses"
@@ -308,7 +309,7 @@ def _flat(value: Plain) -> list[Plain]:
 
 
 def parse_bare(text: str, target: str, source: str) -> Measured[Transform]:
-    """Return a (4, 4) matrix: JSON, or four lines of four numbers with spaces or commas between."""
+    """Read a (4, 4) matrix: JSON, or four lines of four numbers between spaces or commas."""
     if text.lstrip().startswith("["):
         rows = sequence(load_json(text), "matrix", 4)
     else:

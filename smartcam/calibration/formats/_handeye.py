@@ -1,7 +1,7 @@
-"""Files of easy_handeye (ROS 1) and easy_handeye2 (ROS 2): where a camera sits, on hand or on base.
+"""Read and write files of easy_handeye (ROS 1) and easy_handeye2 (ROS 2): a camera's pose.
 
-The pose is that of the camera (``tracking_base_frame``), in the effector's frame where the robot
-carries it, in the base's where it stands; a word elsewhere in the file says which.
+The pose is that of the camera (``tracking_base_frame``), in the effector's frame if the robot
+carries it, in the base's if it is fixed; another entry of the file says which.
 
 Source: github.com/IFL-CAMP/easy_handeye, ``handeye_calibration.py`` (published);
 github.com/marcoesposito1988/easy_handeye2, ``handeye_calibration.py`` and ``easy_handeye2_msgs``
@@ -72,8 +72,8 @@ def _camera(parameters: Mapping[str, Plain], pose: list[float], *, in_hand: bool
 def compose_easy_handeye(transform: Transform, *, in_hand: bool = False) -> str:
     """Return an easy_handeye file.
 
-    ``transform``: the camera's pose, ``T_base_camera``, or ``T_effector_camera`` where it is
-    carried.
+    ``transform``: the camera's pose, ``T_base_camera``, or ``T_effector_camera`` if the robot
+    carries it.
     """
     pose = dict(zip(POSE, row(transform), strict=True))
     return (
@@ -88,7 +88,7 @@ def compose_easy_handeye(transform: Transform, *, in_hand: bool = False) -> str:
 
 
 def compose_easy_handeye2(transform: Transform, *, in_hand: bool = False) -> str:
-    """Return an easy_handeye2 file; arguments as of :func:`compose_easy_handeye`."""
+    """Return an easy_handeye2 file; the arguments are those of :func:`compose_easy_handeye`."""
     translation = dict(zip("xyz", row(transform)[:3], strict=True))
     rotation = dict(zip("xyzw", row(transform)[3:], strict=True))
     return (

@@ -1,4 +1,4 @@
-"""Lenses in a file of whatever format: ours, or one of those of other programs."""
+"""Read lenses from a file of any format: smartcam's own, or those of other programs."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats._cameras import CameraForm
     from smartcam.geometry import Transform
 
-HEAD: Final = 1 << 16
-"""Bytes of a file by which its format is told."""
+HEAD_BYTES: Final = 1 << 16
+"""The beginning of a file, this many bytes, decides which format it has."""
 
-MARKS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
+FORMAT_PATTERNS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
     "euroc": re.compile(rb"^sensor_type\s*:\s*camera", re.MULTILINE),
     "kalibr": re.compile(rb"^cam0\s*:", re.MULTILINE),
     "mrcal": re.compile(rb"LENSMODEL_"),
@@ -38,7 +38,7 @@ MARKS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
     "opencv": re.compile(rb"\A\s*(?:%YAML|<\?xml|<opencv_storage)"),
     "camera_info": re.compile(rb"^camera_matrix\s*:", re.MULTILINE),
 }
-"""Signs that tell the formats of other programs apart."""
+"""Patterns by which the formats of other programs are recognized."""
 
 
 class StoredLenses(NamedTuple):
@@ -46,8 +46,8 @@ class StoredLenses(NamedTuple):
 
     Attributes:
         names: names of the cameras.
-        lenses: lens of each camera, as much of it as the file has.
-        transforms: ``T_1_0``, ... between neighbours; none of a single camera.
+        lenses: lens of each camera, with everything that the file has about it.
+        transforms: ``T_1_0``, ... between neighbours; empty for a single camera.
     """
 
     names: tuple[str, ...]
@@ -61,20 +61,21 @@ def read_lenses(
     size: tuple[int, int] | None = None,
     unit: LengthUnit | None = None,
 ) -> StoredLenses:
-    """Return the lenses of a file; its content tells the format.
+    """Return the lenses of a file; its contents show the format.
 
-    It may be a calibration of a lens, of a pair or of a camera on a robot, or of a format of
-    :func:`read_cameras`, which says what ``size`` and ``unit`` are.
+    It may be a calibration of a lens, of a pair or of a camera on a robot, or have a format of
+    :func:`read_cameras`, which explains ``size`` and ``unit``.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``: none of these; ``WRONG_KIND``: a calibration without a
-            lens; and what :func:`read_cameras` and ``load`` of the calibrations say.
+        CalibrationError: ``UNKNOWN_FORMAT``: the file is none of these; ``WRONG_KIND``: the
+            calibration has no lens; and those of :func:`read_cameras` and of the calibrations'
+            ``load``.
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
-        head = stream.read(HEAD)
-    for form, mark in MARKS.items():
+        head = stream.read(HEAD_BYTES)
+    for form, mark in FORMAT_PATTERNS.items():
         if mark.search(head):
             found = read_cameras(path, form, size=size, unit=unit)
             lenses = tuple(Lens(one) for one in found.cameras)
@@ -82,14 +83,14 @@ def read_lenses(
     if head.lstrip().startswith(b"{"):
         return _ours(path)
     raise Code.UNKNOWN_FORMAT.refusal(
-        f"{path}: expected a calibration of smartcam, or one of {', '.join(MARKS)}; got none of "
-        "them",
-        list(MARKS),
+        f"{path}: expected a calibration of smartcam, or one of {', '.join(FORMAT_PATTERNS)}; got "
+        "none of them",
+        list(FORMAT_PATTERNS),
     )
 
 
 def _of_pair(pair: StereoCalibration) -> StoredLenses:
-    """Return a pair's lenses, each with where it saw the target."""
+    """Return a pair's lenses, each with the places at which it saw the target."""
     sides = []
     for number, camera in enumerate((pair.left, pair.right)):
         seen = [
@@ -108,7 +109,7 @@ def _of_pair(pair: StereoCalibration) -> StoredLenses:
 
 
 def _of_robot(hand: HandEyeCalibration) -> StoredLenses | None:
-    """Return the lens of a camera on a robot; None where it has none."""
+    """Return the lens of a camera on a robot; None if it has none."""
     if hand.camera is None:
         return None
     seen = [

@@ -1,7 +1,7 @@
-"""YAML that ``cv2.FileStorage`` and PyYAML read: a plane's matrix, or a transform.
+"""Write YAML that ``cv2.FileStorage`` and PyYAML read: a plane's matrix, or a transform.
 
 Source: OpenCV, ``modules/core/src/persistence_yml.cpp`` (published): the first line begins with
-``%YAML``, a number with a point is a real, ``!!opencv-matrix`` has rows, cols, dt and data.
+``%YAML``; a number with a point is a real one; ``!!opencv-matrix`` has rows, cols, dt and data.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 HEAD = "%YAML:1.0\n---\n"
-"""Beginning of OpenCV's files; its readers want ``%YAML`` there."""
+"""Beginning of OpenCV's files; its readers need ``%YAML`` there."""
 
 
 def load_storage(text: str) -> Plain:
@@ -51,10 +51,10 @@ class PlaneMatrix(NamedTuple):
 
     Attributes:
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres. A
-            :class:`~smartcam.calibration.PlaneProjection` of it maps poses.
+            :class:`~smartcam.calibration.PlaneProjection` with this matrix maps poses.
         model: name of the model that was fitted.
-        robot_frame: where x, y and z are.
-        camera_frame: frame of u and v; empty where none was given.
+        robot_frame: frame of x, y and z.
+        camera_frame: frame of u and v; empty if none was given.
     """
 
     matrix: Array
@@ -74,9 +74,9 @@ class PlaneMatrix(NamedTuple):
 
 
 def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
-    """Return the matrix of any plane calibration, as little YAML as both readers have in common.
+    """Return the matrix of a plane calibration, in YAML that both readers understand.
 
-    ``unit``: of the camera's coordinates, in words.
+    ``unit``: unit of the camera's coordinates, in words.
     """
     rows = plane.matrix.tolist()
     values = ",\n    ".join(", ".join(real(value) for value in row) for row in rows)
@@ -93,7 +93,7 @@ def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
 
 
 def parse_matrix(text: str) -> PlaneMatrix:
-    """Return the matrix of a calibration that :func:`compose_matrix` wrote, bit by bit."""
+    """Return the matrix of a calibration that :func:`compose_matrix` wrote, bit for bit."""
     names = ["model", "robot_frame", "camera_frame"]
     data = mapping(load_yaml(text), "file", [*names, "rows", "cols", "data"])
     for name in names:
@@ -106,7 +106,7 @@ def parse_matrix(text: str) -> PlaneMatrix:
 
 
 def storage_matrix(name: str, matrix: Array) -> str:
-    """Return a matrix as ``cv2.FileStorage`` has it under a name."""
+    """Return a matrix with its name, in the form of ``cv2.FileStorage``."""
     return (
         f"{name}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}\n"
         f"   dt: d\n   data: {flow(matrix.ravel())}\n"
@@ -123,9 +123,9 @@ def compose_transform(transform: Transform) -> str:
 
 
 def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
-    """Return the one (4, 4) matrix of a file of OpenCV, of any name.
+    """Return the only (4, 4) matrix of a file of OpenCV, whatever its name.
 
-    ``target`` and ``source`` are the frames where the file does not say them.
+    ``target`` and ``source`` are the frames, if the file does not name them.
     """
     data = mapping(load_storage(text), "file")
     names = [

@@ -1,9 +1,9 @@
-"""Text of other programs as plain data: bounded, and no scalar taken for what it may not be.
+"""Parse texts of other programs into plain data, within bounds and without guessing types.
 
-Scalars stay the texts that stand in the file. YAML has many ideas of what a text may mean (a time,
-a number to the base 60, ``1e-05`` as a string), and programs differ in which of them they have;
-:func:`number` and :func:`flag` read what all have in common. What is not as it should be raises a
-CalibrationError, ``MALFORMED`` where no other code is named.
+Scalars stay texts, as they are in the file. YAML gives texts many meanings (a time, a number to the
+base 60, ``1e-05`` as a string), and programs differ in which of them they support; :func:`number`
+and :func:`flag` read the forms that all of them share. Anything else raises a CalibrationError,
+``MALFORMED`` if no other code is named.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ POSE: tuple[str, ...] = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Names of the numbers of :func:`row` in most formats."""
 
 MAX_DEPTH = 16
-"""Lists in lists of a file at most; poses have five."""
+"""Lists in a file are nested at most this deep; those of poses five deep."""
 
 MAX_NUMBER = 1e9
-"""Largest number of a pose, metres or what it is in: farther off is no robot, and its square is
-still a number."""
+"""Largest number of a pose, in metres or any other unit: no robot is farther away, and its square
+is still finite."""
 
 MAX_SIDE = 1_000_000
-"""Pixels of an image's side at most, and rows or columns of a matrix."""
+"""Largest side of an image, pixels, and largest number of rows or columns of a matrix."""
 
 _MAX_NAME = 255
 _MAX_SHOWN = 64
@@ -51,25 +51,26 @@ _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "o
 _MAX_PRINTED_DEVIATION = 1e-4
 """Largest deviation from a rotation of a matrix that was printed with few digits."""
 _MAX_EXACT_DEVIATION = 1e-6
-"""Largest deviation of a matrix that is taken as it is; :class:`Transform` has the same bound."""
+"""Largest deviation from a rotation of a matrix that is not corrected; :class:`Transform` has the
+same bound."""
 
 
 def malformed(what: str, expected: str, got: object = None) -> CalibrationError:
-    """Return the error for a text that is not what its format says; ``got`` is shown cut."""
+    """Return the error for a text that does not have its format; ``got`` is shortened."""
     shown = None if got is None else _cut(got)
     text = f"{what}: expected {expected}" + ("" if shown is None else f", got {shown}")
     return Code.MALFORMED.refusal(text, expected, shown)
 
 
 def within(where: str, error: CalibrationError) -> CalibrationError:
-    """Return an error that says where in a file it was."""
+    """Return the error with its place in the file added."""
     return CalibrationError(
         f"{where}: {error}", code=error.code, expected=error.expected, got=error.got
     )
 
 
 def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
-    """Return a table's value for a name (``UNKNOWN_FORMAT``)."""
+    """Return a table's value for a name; raise ``UNKNOWN_FORMAT`` if there is none."""
     if not isinstance(name, str) or name not in table:
         raise Code.UNKNOWN_FORMAT.refusal(
             f"no {what} is called {name!r}; expected one of {', '.join(table)}", list(table), name
@@ -78,7 +79,7 @@ def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
 
 
 def _cut(value: object) -> str:
-    """Return a short text of a file's value, however large it is."""
+    """Return a short text for a value from a file, however large it is."""
     if isinstance(value, (dict, list)):
         kind = "mapping" if isinstance(value, dict) else "list"
         return f"a {kind} of {len(cast('Sequence[object]', value))}"
@@ -90,7 +91,7 @@ def _cut(value: object) -> str:
 
 
 def load_json(text: str) -> Plain:
-    """Return a JSON document, its numbers as texts; MALFORMED: it is no JSON, or too deep."""
+    """Parse JSON, with numbers as texts; raise MALFORMED if it is not valid or too deep."""
     try:
         return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as exc:
@@ -98,9 +99,9 @@ def load_json(text: str) -> Plain:
 
 
 def load_yaml(text: str) -> Plain:
-    """Return a YAML document, that of OpenCV too; its scalars are texts, its tags are dropped.
+    """Parse YAML, also OpenCV's; scalars become texts, and tags are dropped.
 
-    Raises ``MALFORMED``: it is no YAML, it has aliases or a key twice, or is too deep;
+    Raises ``MALFORMED`` if it is no valid YAML, has aliases or a repeated key, or is too deep;
     MissingExtraError: PyYAML is not installed.
     """
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
@@ -131,7 +132,7 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
 
 
 def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
-    """Return a value that must be a mapping with these keys; others may be there."""
+    """Return a value that must be a mapping with these keys; it may have others."""
     if not isinstance(value, dict):
         raise malformed(where, "a mapping", value)
     found = cast("dict[str, Plain]", value)
@@ -152,7 +153,7 @@ def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
 def number(value: Plain, where: str) -> float:
     """Return a number of at most :data:`MAX_NUMBER`.
 
-    Raises ``MALFORMED``, or ``NOT_FINITE`` for NaN, infinity and larger ones.
+    Raises ``MALFORMED``, or ``NOT_FINITE`` for NaN, infinity and larger numbers.
     """
     text = value if isinstance(value, str) else ""
     read = math.nan if _NOT_FINITE.fullmatch(text) else None
@@ -175,13 +176,13 @@ def reals(value: Plain, where: str, count: int | None = None) -> list[float]:
 
 
 def matrix_of(value: Plain, where: str, shape: tuple[int, int]) -> Array:
-    """Return a matrix that stands as a list of rows."""
+    """Return a matrix that is stored as a list of rows."""
     rows = sequence(value, where, shape[0])
     return np.array([reals(one, where, shape[1]) for one in rows]).reshape(shape)
 
 
 def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
-    """Return a matrix that stands as ``rows``, ``cols`` and ``data``; without ``shape`` any."""
+    """Return a matrix stored as ``rows``, ``cols`` and ``data``, of a given shape if any."""
     data = mapping(value, where, ["rows", "cols", "data"])
     rows, cols = (whole(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
     if shape is not None and shape != (rows, cols):
@@ -204,9 +205,9 @@ def lens_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
 
 
 def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
-    """Return the numbers under ``keys``, in that order, of a mapping that has no others.
+    """Return the numbers of a mapping in the order of ``keys``; it must have no other keys.
 
-    ``where``: what the mapping is, for the error.
+    ``where``: name of the mapping, for the error.
     """
     found = mapping(value, where, keys)
     if len(found) != len(keys):
@@ -225,8 +226,8 @@ def flag(value: Plain, where: str) -> bool:
 def frame_name(value: Plain, where: str) -> str:
     """Return a frame's name that every format can hold.
 
-    Raises ``BAD_NAME``: it is not valid, too long, or has letters that mean something in a file or
-    on a command line.
+    Raises ``BAD_NAME`` if the name is not valid or too long, or has letters with a meaning in files
+    or on a command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
         raise Code.BAD_NAME.unexpected(
@@ -242,7 +243,7 @@ def rigid(
 ) -> Transform:
     """Return the transform of a (4, 4) matrix; its rotation may be printed with few decimals.
 
-    Raises ``MALFORMED``: its last row; ``NOT_RIGID``: it is no rotation.
+    Raises ``MALFORMED`` for a wrong last row; ``NOT_RIGID`` if the rest is no rotation.
     """
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
@@ -256,16 +257,17 @@ def rigid(
 
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right, dtype=np.float64)  # a reflection stays one, and is refused
+    # a reflection is not corrected, and so it is refused
+    return np.asarray(left @ right, dtype=np.float64)
 
 
 def placed(target: str, source: str, pose: Sequence[float]) -> Transform:
-    """Return the transform of the numbers of :data:`POSE`."""
+    """Return the transform from the numbers of :data:`POSE`."""
     return Transform.from_quaternion(target, source, pose[:3], pose[3:])
 
 
 def row(transform: Transform) -> list[float]:
-    """Return the numbers of :data:`POSE`, metres."""
+    """Return a transform as the numbers of :data:`POSE`, metres."""
     return [*transform.translation.tolist(), *transform.quaternion.tolist()]
 
 
@@ -279,12 +281,12 @@ def matrix_rows(transform: Transform) -> list[list[float]]:
 
 
 def quoted(text: str) -> str:
-    """Return a text as YAML and JSON write it."""
+    """Return a text in the quotes of YAML and JSON."""
     return '"{}"'.format(text.replace("\\", "\\\\").replace('"', '\\"'))
 
 
 def real(value: float) -> str:
-    """Return a number as YAML 1.1 knows a real: with a point, also before an exponent."""
+    """Return a number in YAML 1.1's form of a real one: with a point, also before an exponent."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     if not e:
         return mantissa
@@ -298,5 +300,5 @@ def flow(values: Sequence[float] | Array) -> str:
 
 
 def block(values: Mapping[str, float], indent: str = "") -> str:
-    """Return a YAML mapping of numbers, one in a line."""
+    """Return a YAML mapping of numbers, one per line."""
     return "".join(f"{indent}{name}: {real(value)}\n" for name, value in values.items())

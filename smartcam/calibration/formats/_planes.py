@@ -1,4 +1,4 @@
-"""A plane calibration as a rigid frame and a scale, for programs that know frames alone."""
+"""Convert a plane calibration to a rigid frame and a scale, for programs that know only frames."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class PlaneFrame(NamedTuple):
     Attributes:
         transform: ``T_robot_plane``: the plane's origin is the camera's (0, 0), its x and y are the
             camera's, its z is the plane's normal.
-        scale: metres for each unit of the camera's coordinates. They are multiplied by it before
-            the transform is applied: ``transform.apply(scale * (u, v, 0))``.
+        scale: metres per unit of the camera's coordinates, which are multiplied by it before the
+            transform is applied: ``transform.apply(scale * (u, v, 0))``.
     """
 
     transform: Transform
@@ -33,12 +33,12 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     """Return the frame of a calibration's plane, and its scale.
 
     Args:
-        calibration: a rigid one, a similarity, or one of touches.
-        name: name of the frame, where the calibration has no ``camera_frame``.
+        calibration: a calibration of the model ``rigid``, ``similarity`` or ``touches``.
+        name: name of the frame if the calibration has no ``camera_frame``.
 
     Raises:
-        CalibrationError: ``NOT_SIMILAR``: an affine map or a homography, which is no frame: its
-            axes differ in scale, or it has another scale at each point.
+        CalibrationError: ``NOT_SIMILAR``: the model is ``affine`` or ``homography``, which is no
+            frame: its axes differ in scale, or its scale differs from point to point.
     """
     matrix = calibration.matrix / calibration.matrix[3, 2]
     axes = matrix[:3, :2]

@@ -1,4 +1,4 @@
-"""Poses as robots' controllers write them.
+"""Convert poses to and from the forms of robots' controllers.
 
 ::
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 _MAX_UNIT_DEVIATION: Final = 0.01
-"""Largest deviation of a quaternion's length from one; it is made one."""
+"""A quaternion's length may deviate from 1 by this much, and is then corrected."""
 
 
 def rotation_zyx(z: float, y: float, x: float) -> Array:
@@ -53,8 +53,9 @@ def rotation_zyx(z: float, y: float, x: float) -> Array:
 def angles_zyx(rotation: Array) -> tuple[float, float, float]:
     """Return z, y, x of :func:`rotation_zyx`, radians; y is within a quarter turn.
 
-    At a quarter turn about y only one of the other two is determined; then z is 0. Close to it z
-    is what rounding leaves, and x goes with it: the three together are the rotation all the same.
+    At a quarter turn about y only the sum or difference of the other two is determined; then z is
+    0. Close to it, z is affected by rounding, and x compensates it, so the three angles together
+    still give the rotation.
     """
     r = rotation.tolist()
     z = math.atan2(r[1][0], r[0][0]) if math.hypot(r[1][0], r[0][0]) > 1e-15 else 0.0
@@ -88,7 +89,7 @@ def _from_xyzw(quaternion: Array) -> Array:
 
 
 def _shifted(places: int) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
-    """Return the two ways of a quaternion whose real part is moved to the front by a place."""
+    """Return the two functions for quaternions whose real part is moved to the front by a place."""
     return (
         lambda given: _from_xyzw(np.roll(given, -places)),
         lambda pose: list(map(float, np.roll(pose.quaternion, places))),
@@ -98,10 +99,10 @@ def _shifted(places: int) -> tuple[Callable[[Array], Array], Callable[[Transform
 def _angles(
     signs: int, order: slice
 ) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
-    """Return the two ways of angles in degrees about z, y and x, in an order.
+    """Return the two functions for angles in degrees about z, y and x, in a given order.
 
-    With ``signs`` of -1 they are about the axes that turn along, x first: Rx(a) Ry(b) Rz(c) undoes
-    Rz(-c) Ry(-b) Rx(-a).
+    With ``signs`` of -1 the turns are about the moving axes, x first: Rx(a) Ry(b) Rz(c) is the
+    inverse of Rz(-c) Ry(-b) Rx(-a).
     """
     return (
         lambda given: _turned(
@@ -119,13 +120,14 @@ def _turned(rotation: Array, signs: int) -> Array:
 
 
 class PoseConvention(NamedTuple):
-    """The way in which a robot's poses are written."""
+    """The convention by which a robot's poses are written."""
 
     numbers: tuple[str, ...]  # names of the numbers, in order
-    metre: float  # how many of its units of length a metre has
-    rotation: Callable[[Array], Array]  # makes a rotation (3, 3) of the numbers behind the position
-    orientation: Callable[[Transform], list[float]]  # makes those numbers of a pose
-    title: str  # what the orientation is, in words
+    metre: float  # number of its units of length in a metre
+    # function that makes a rotation (3, 3) of the numbers after the position
+    rotation: Callable[[Array], Array]
+    orientation: Callable[[Transform], list[float]]  # function that makes those numbers of a pose
+    title: str  # form of the orientation, in words
 
 
 ROBOTS: Mapping[str, PoseConvention] = {
@@ -158,8 +160,8 @@ ROBOTS: Mapping[str, PoseConvention] = {
         "quaternion, its real part first",
     ),
 }  # fmt: skip
-"""The conventions by their names. A metre is 1 of the unit of ``ur``, ``xyzw`` and ``wxyz``, and
-1000 millimetres for the others."""
+"""The conventions by their names. Lengths are in metres for ``ur``, ``xyzw`` and ``wxyz``, and in
+millimetres for the others."""
 
 
 def pose_from(
@@ -176,17 +178,17 @@ def pose_from(
         robot: the convention, a key of :data:`ROBOTS`.
         values: numbers of the pose in the convention's order and units.
         target: name of the frame in which the pose is given.
-        source: name of the frame whose pose it is.
+        source: name of the frame whose pose is given.
         unit: unit of the position; None for the controller's.
 
     Returns:
         ``T_target_source``, metres.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``: no such convention; ``SHAPE``: not as many numbers;
-            ``NOT_FINITE``: NaN, infinity or beyond 1e9; ``NOT_RIGID``: a quaternion whose length is
-            more than 1 % off; ``UNIT_UNKNOWN``: farther than 20 m without a ``unit``, or a rotation
-            vector of more than a turn.
+        CalibrationError: ``UNKNOWN_FORMAT``: the convention is unknown; ``SHAPE``: the number of
+            values is wrong; ``NOT_FINITE``: a value is NaN, infinite or beyond 1e9; ``NOT_RIGID``:
+            the length of the quaternion is more than 1 % off; ``UNIT_UNKNOWN``: the position is
+            farther than 20 m without a ``unit``, or a rotation vector has more than a turn.
     """
     convention = known(ROBOTS, robot, "robot's convention")
     what = f"pose of {robot} ({', '.join(convention.numbers)})"
@@ -206,7 +208,7 @@ def pose_from(
 
 
 def pose_to(robot: str, pose: Transform) -> list[float]:
-    """Return a pose as a robot's controller takes it.
+    """Return a pose in the form of a robot's controller.
 
     Args:
         robot: the convention, a key of :data:`ROBOTS`.

@@ -1,8 +1,8 @@
-"""Arguments of ROS' ``static_transform_publisher``, and poses as ROS-Industrial keeps them.
+"""Read and write arguments of ROS' ``static_transform_publisher`` and poses of ROS-Industrial.
 
-Three programs have that name. That of ROS 1's ``tf`` ends with a period in milliseconds, that of
-``tf2_ros`` does not, that of ROS 2 takes options. Each knows quaternions, and yaw, pitch and roll:
-``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
+Three programs have that name. The arguments of the one in ROS 1's ``tf`` end with a period in
+milliseconds, those of ``tf2_ros`` do not, and ROS 2's takes options. Each knows quaternions, and
+yaw, pitch and roll: ``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
 
 Source: wiki.ros.org/tf, section 6.3; github.com/ros2/geometry2,
 ``static_transform_broadcaster_program.cpp``; github.com/moveit/moveit_calibration,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PERIOD_MS = 100
-"""Period of the messages of ``tf``; its documents call 100 a good value."""
+"""Period of the messages of ``tf``, milliseconds; its documents call 100 a good value."""
 
 _COMMAND = "static_transform_publisher"
 _PYTHON = re.compile(r"^(?:from|import) [a-z]", re.MULTILINE)
@@ -56,10 +56,9 @@ def parse_arguments(text: str) -> Transform:
     """Return the transform that ``static_transform_publisher`` would send.
 
     ``text``: its arguments, with the command in front of them or without; ``#`` begins a comment.
-    Or a launch file with one such node: XML of ROS 1 or 2, or ROS 2's Python, which is read as text
-    and not run. Raises
-    ``MALFORMED``: another number of arguments, options that are none of its own, or arguments that
-    can be meant in two ways.
+    It may also be a launch file with one such node: XML of ROS 1 or 2, or ROS 2's Python, which is
+    read as text and not run. Raises ``MALFORMED`` if the number of arguments is wrong, an option is
+    unknown, or the arguments have two possible meanings.
     """
     if text.lstrip().startswith("<"):
         text = _from_launch(text)
@@ -123,7 +122,7 @@ def _from_python(text: str) -> list[str]:
 def parse_urdf(text: str, target: str, source: str) -> Transform:
     """Return the origin of a joint of a robot's description: its child's pose in its parent.
 
-    Of several joints it is the one from ``target`` to ``source``.
+    If there are several joints, the one from ``target`` to ``source`` is taken.
     """
     joints = {}
     for joint in load_xml(text.strip()).all("joint"):
@@ -183,7 +182,8 @@ def _from_positions(words: Sequence[str]) -> Transform:
             f"{count} words",
         )
     angles = count == 8
-    if count == 9:  # a quaternion, or angles with a period: what is a number tells
+    # a quaternion, or angles with a period: the arguments that are numbers show which
+    if count == 9:
         angles = not _is_number(words[6])
         if angles != _is_number(words[8]):
             raise malformed(
@@ -219,8 +219,8 @@ def _transform(
 def compose_positions(transform: Transform, *, angles: bool = False, period: bool = False) -> str:
     """Return the arguments of ``tf`` (with a period) and ``tf2_ros`` (without), one line.
 
-    ``angles``: yaw, pitch and roll instead of a quaternion. ``period``: with :data:`PERIOD_MS` at
-    the end.
+    ``angles``: yaw, pitch and roll instead of a quaternion. ``period``: whether :data:`PERIOD_MS`
+    follows at the end.
     """
     frames = frame_name(transform.target, "target"), frame_name(transform.source, "source")
     values = row(transform)
@@ -261,5 +261,5 @@ def parse_pose(text: str, target: str, source: str) -> Transform:
 
 
 def compose_pose(transform: Transform) -> str:
-    """Return a pose as ROS-Industrial keeps it; it has no place for the frames' names."""
+    """Return a pose in ROS-Industrial's form, which has no place for the frames' names."""
     return block(dict(zip(POSE, row(transform), strict=True)))

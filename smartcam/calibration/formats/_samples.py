@@ -1,7 +1,7 @@
-"""Samples of a hand-eye calibration as MoveIt keeps them: where the hand was, what the camera saw.
+"""Read and write MoveIt's samples of a hand-eye calibration: poses of hand and object.
 
-Its solver's tests have JSON, a list of pairs of (4, 4) matrices; its panel saves YAML, a list of
-mappings to 16 numbers, row by row.
+The tests of MoveIt's solver have JSON, a list of pairs of (4, 4) matrices; its panel saves YAML, a
+list of mappings to 16 numbers, row by row.
 
 Source: github.com/moveit/moveit_calibration, ``pose_samples.json`` and
 ``handeye_control_widget.cpp`` (published).
@@ -37,11 +37,11 @@ _HAND, _SEEN = "effector_wrt_world", "object_wrt_sensor"
 
 
 class HandEyeSample(NamedTuple):
-    """One stop of the robot.
+    """One stop of the robot, with the poses there.
 
     Attributes:
         hand: ``T_base_effector``, the effector's pose in the robot's base.
-        seen: ``T_camera_object``, the object's pose in the camera.
+        seen: ``T_camera_object``, the object's pose in the camera's frame.
     """
 
     hand: Transform
@@ -76,14 +76,14 @@ def _sample(index: int, hand: Array, seen: Array) -> HandEyeSample:
 
 
 def compose_json(samples: Sequence[HandEyeSample]) -> str:
-    """Return samples as JSON; the frames' names have no place in it."""
+    """Return samples as JSON, which has no place for the frames' names."""
     _check(samples)
     pairs = [[matrix_rows(one.hand), matrix_rows(one.seen)] for one in samples]
     return f"[{','.join(chr(10) + json.dumps(pair) for pair in pairs)}\n]\n"
 
 
 def compose_yaml(samples: Sequence[HandEyeSample]) -> str:
-    """Return samples as YAML; the frames' names have no place in it."""
+    """Return samples as YAML, which has no place for the frames' names."""
     _check(samples)
     text = "".join(
         f"- {_HAND}: [{_listed(one.hand)}]\n  {_SEEN}: [{_listed(one.seen)}]\n" for one in samples
@@ -97,7 +97,7 @@ def _check(samples: Sequence[HandEyeSample]) -> None:
 
 
 def same_frames(transforms: Sequence[Transform]) -> None:
-    """Raise (``WRONG_FRAME``) where not all are between the same frames: the file cannot tell."""
+    """Raise ``WRONG_FRAME`` unless all are between the same frames, which the file cannot name."""
     for index, one in enumerate(transforms):
         if (one.target, one.source) != (transforms[0].target, transforms[0].source):
             raise Code.WRONG_FRAME.unexpected(

@@ -1,8 +1,8 @@
-"""Poses over time as CSV: the plain columns of ASL's tools, and those of the EuRoC data sets.
+"""Read and write poses over time as CSV, with the columns of ASL's tools or of EuRoC's data sets.
 
-The header decides: it names the columns, and with them the quaternion's order and the unit of time.
-EuRoC has nanoseconds and the real part first, others seconds and the real part last. A file without
-a header is refused: both are eight numbers in a row.
+The header decides which: it names the columns, and with them the order of the quaternion and the
+unit of time. EuRoC has nanoseconds and the real part first, the others seconds and the real part
+last. A file without a header is refused: the rows of both are eight numbers.
 
 Source: github.com/ethz-asl/hand_eye_calibration (published) for ``t, x, y, z, qx, qy, qz, qw``; the
 files ``state_groundtruth_estimate0/data.csv`` and ``vicon0/data.csv`` of EuRoC MAV (published).
@@ -24,11 +24,11 @@ from smartcam.geometry import Code, Transform
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-MAX_LINE = 4096
-"""Characters of a line at most; EuRoC's have some 200."""
+MAX_LINE_LENGTH = 4096
+"""A line has at most this many characters; EuRoC's have some 200."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_LAST = Decimal(253_402_300_799)  # the year 9999
+_LAST = Decimal(253_402_300_799)  # end of the year 9999
 _COLUMN = re.compile(r"\s*([A-Za-z_]+)\s*(?:\[([^\]]*)\])?\s*")
 _TIME = re.compile(r"[0-9]{1,21}(?:\.[0-9]{0,20})?(?:[eE][-+]?[0-9]{1,2})?")
 
@@ -36,10 +36,10 @@ _TIME = re.compile(r"[0-9]{1,21}(?:\.[0-9]{0,20})?(?:[eE][-+]?[0-9]{1,2})?")
 class _Columns(NamedTuple):
     """The columns that a header names."""
 
-    places: tuple[int, ...]  # of the columns of time, then of x, y, z, qx, qy, qz, qw
-    width: int  # how many columns there are
-    seconds: Decimal  # the unit of time
-    metres: str | None  # the unit of lengths, where the header says one
+    places: tuple[int, ...]  # indices of the columns of time, then of x, y, z, qx, qy, qz, qw
+    width: int  # number of columns
+    seconds: Decimal  # unit of time
+    metres: str | None  # unit of lengths, if the header says one
 
 
 _COLUMNS = (
@@ -50,8 +50,8 @@ _COLUMNS = (
     (("timestamp", *POSE), ""),
     (("time", *POSE), ""),
 )
-"""Names of the columns of time and of the pose in lower case, and the unit of time where the header
-has none: EuRoC's ground truth leaves it out. Without one a time may be anything."""
+"""Names, in lower case, of the columns of time and of the pose, with the unit of time for headers
+that leave it out, as EuRoC's ground truth does. An empty unit means that the header must say it."""
 _SECONDS: Mapping[str, Decimal] = {
     "s": Decimal(1),
     "ms": Decimal("1e-3"),
@@ -68,18 +68,18 @@ _EUROC_HEAD = (
 def parse_csv(
     text: str, target: str, source: str
 ) -> Sequence[Transform] | Measured[Sequence[Transform]]:
-    """Return the poses of a file with a header, in its order; further columns are left out.
+    """Return the poses of a file with a header, in its order; other columns are ignored.
 
-    Lines that begin with ``#`` are remarks, one of them may be the header. The poses are
-    ``source``'s in ``target``, with their times to the nearest microsecond. Raises ``MALFORMED``:
-    no header that is known, or a row that is not as long; ``NOT_FINITE``, ``NOT_RIGID``;
-    ``BAD_TIME``: a time outside of 1970 to 9999.
+    Lines that begin with ``#`` are comments; one of them may be the header. The poses are those of
+    ``source`` in ``target``, with times rounded to the nearest microsecond. Raises ``MALFORMED`` if
+    there is no known header, or if a row has another length; ``NOT_FINITE``, ``NOT_RIGID``;
+    ``BAD_TIME`` for a time outside of 1970 to 9999.
     """
     header: _Columns | None = None
     found: list[Transform] = []
     for index, line in enumerate(map(str.strip, text.splitlines()), 1):
-        if len(line) > MAX_LINE:
-            raise malformed(f"line {index}", f"{MAX_LINE} characters at most", len(line))
+        if len(line) > MAX_LINE_LENGTH:
+            raise malformed(f"line {index}", f"{MAX_LINE_LENGTH} characters at most", len(line))
         if not line or (header is not None and line.startswith("#")):
             continue
         if header is not None:
@@ -143,8 +143,8 @@ def _microseconds(text: str, unit: Decimal, where: str) -> int:
 def compose_asl(transforms: Sequence[Transform]) -> str:
     """Return poses as ``t, x, y, z, qx, qy, qz, qw``, seconds since 1970 and metres.
 
-    Raises ``WRONG_FRAME``: not all between the same frames; ``BAD_TIME``: one without a time, or
-    before 1970.
+    Raises ``WRONG_FRAME`` unless all are between the same frames; ``BAD_TIME`` for a pose without a
+    time, or before 1970.
     """
     return _ASL_HEAD + "".join(
         f"{time // 1_000_000}.{time % 1_000_000:06d},{','.join(map(repr, row(one)))}\n"
@@ -153,7 +153,7 @@ def compose_asl(transforms: Sequence[Transform]) -> str:
 
 
 def compose_euroc(transforms: Sequence[Transform]) -> str:
-    """Return poses in EuRoC's columns: nanoseconds, the real part first; errors as above."""
+    """Return poses in EuRoC's columns: nanoseconds, the real part first."""
     rows = [(time, *row(one)) for time, one in _timed(transforms)]
     return _EUROC_HEAD + "".join(
         f"{time}000,{x!r},{y!r},{z!r},{qw!r},{qx!r},{qy!r},{qz!r}\n"

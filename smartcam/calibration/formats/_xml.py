@@ -1,4 +1,4 @@
-"""XML of other programs as elements, within bounds and without document types."""
+"""Parse XML of other programs into elements, within bounds and without document types."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MAX_ELEMENTS: Final = 20_000
-"""Elements of a file at most; a robot's description has some hundred."""
+MAX_XML_ELEMENTS: Final = 20_000
+"""A file has at most this many elements; a robot's description has some hundred."""
 
 
 @dataclass(slots=True)
 class XmlElement:
-    """An element.
+    """An element of XML.
 
     Attributes:
         kind: tag of the element.
@@ -43,7 +43,7 @@ class XmlElement:
 def load_xml(text: str) -> XmlElement:
     """Return the outermost element of a document.
 
-    Raises ``MALFORMED``: it is no XML, has a document type, or goes beyond a bound.
+    Raises ``MALFORMED`` if it is no XML, has a document type, or exceeds a bound.
     """
     root = XmlElement("", {})
     opened, texts = [root], [[""]]
@@ -52,8 +52,10 @@ def load_xml(text: str) -> XmlElement:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
-        if count > MAX_ELEMENTS or len(opened) > MAX_DEPTH:
-            raise malformed("file", f"{MAX_ELEMENTS} elements at most, {MAX_DEPTH} in each other")
+        if count > MAX_XML_ELEMENTS or len(opened) > MAX_DEPTH:
+            raise malformed(
+                "file", f"{MAX_XML_ELEMENTS} elements at most, {MAX_DEPTH} in each other"
+            )
         element = XmlElement(tag.rpartition(":")[2], attributes)
         opened[-1].children.append(element)
         opened.append(element)
@@ -73,7 +75,7 @@ def load_xml(text: str) -> XmlElement:
     parser.StartDoctypeDeclHandler = doctype
     try:
         parser.Parse(text.encode(), True)
-    except CalibrationError:  # a ValueError, too
+    except CalibrationError:  # also a ValueError
         raise
     except (expat.ExpatError, ValueError) as exc:
         raise malformed("file", f"XML ({exc})") from exc
@@ -81,7 +83,7 @@ def load_xml(text: str) -> XmlElement:
 
 
 def storage_data(element: XmlElement) -> Plain:
-    """Return an element of OpenCV's XML storage as its YAML storage is read."""
+    """Convert an element of OpenCV's XML storage to the form of its YAML storage."""
     if not element.children:
         listed = element.kind == "data" or " " in " ".join(element.text.split())
         return (

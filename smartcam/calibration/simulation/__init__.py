@@ -1,4 +1,4 @@
-"""Images and scenes whose truth is known, for tests."""
+"""Make images and scenes whose truth is known, for tests."""
 
 from __future__ import annotations
 

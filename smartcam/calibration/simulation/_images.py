@@ -1,9 +1,9 @@
-"""Images of targets as a camera would take them, for tests whose truth is known.
+"""Draw images of targets as a camera would take them, for tests with known truth.
 
-Each pixel is the mean over its own square of what a lens with a Gaussian blur shows there. Edges
-are drawn with the share of each sample that they cover, so that nothing snaps to a raster: a corner
-lies in the image where :meth:`~smartcam.calibration.CameraModel.project` says, to a
-few thousandths of a pixel.
+Each pixel is the mean, over its own square, of the image of a lens with a Gaussian blur. Edges are
+drawn by the part of each sample that they cover, so that nothing is rounded to a raster: a corner
+lies in the image where :meth:`~smartcam.calibration.CameraModel.project` puts it, to a few
+thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel, Transform
     from smartcam.geometry._inside import Array
 
-SAMPLES = 4
+SAMPLES_PER_SIDE = 4
 """A pixel is drawn from this many samples along each side."""
 
-QUIET = 1.0
-"""White paper around a target, sides of its squares or distances of its dots."""
+QUIET_ZONE_SQUARES = 1.0
+"""Width of the white paper around a target, in sides of its squares or distances of its dots."""
 
 
 def render(
@@ -48,15 +48,15 @@ def render(
     """Draw a camera's image of a target on white paper.
 
     Args:
-        target: what is printed.
+        target: the printed target.
         camera: lens that sees the target; its image size is that of the result.
-        T_camera_target: where the target is.
-        blur: standard deviation of the lens' blur, pixels; the pixels' own square comes on top.
+        T_camera_target: pose of the target in the camera's frame.
+        blur: standard deviation of the lens' blur, pixels; the square of each pixel adds to it.
         noise: standard deviation of each pixel, grey levels of 255.
         black: grey level of the print.
         white: grey level of the paper.
-        background: grey level of what lies around the paper.
-        random: source of the noise; None is one that starts the same each time.
+        background: grey level around the paper.
+        random: source of the noise; None for one that is the same each time.
 
     Returns:
         (H, W).
@@ -67,7 +67,7 @@ def render(
     """
     cv2 = load("cv2")
     image = np.full(camera.size[::-1], background, dtype=np.float32)
-    paper = _outline(target, QUIET)
+    paper = _outline(target, QUIET_ZONE_SQUARES)
     left, top, right, bottom = _box(paper, camera, T_camera_target, 2 + 4 * blur)
     if left < right and top < bottom:
         u, v = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
@@ -75,7 +75,9 @@ def render(
         inked = white + (black - white) * _black(target, sheet)
         fine = background + (inked - background) * _rectangle(sheet, paper)
         if blur > 0:
-            fine = cv2.GaussianBlur(fine, (0, 0), blur * SAMPLES, borderType=cv2.BORDER_REPLICATE)
+            fine = cv2.GaussianBlur(
+                fine, (0, 0), blur * SAMPLES_PER_SIDE, borderType=cv2.BORDER_REPLICATE
+            )
         size = (right - left, bottom - top)
         image[top:bottom, left:right] = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
     if noise > 0:
@@ -88,16 +90,16 @@ def render(
 class _Samples(NamedTuple):
     """The samples of a part of an image on a sheet; all of the same shape."""
 
-    x: Floats  # metres, in the target's frame
-    y: Floats  # the same
-    x_grain: Floats  # how much of x a sample covers
-    y_grain: Floats  # the same of y
+    x: Floats  # x of each sample, metres, in the target's frame
+    y: Floats  # y of each sample, metres, in the target's frame
+    x_grain: Floats  # extent of a sample along x, metres
+    y_grain: Floats  # extent of a sample along y, metres
 
 
 def _outline(target: Target, quiet: float = 0.0) -> Array:
-    """Return (2, 2), metres: the lower left and the upper right corner of what is printed.
+    """Return the lower left and the upper right corner of the print, (2, 2), metres.
 
-    With ``quiet`` times a square's side, or the distance of two dots, around it.
+    A margin of ``quiet`` times a square's side, or the distance of two dots, is included.
     """
     if isinstance(target, Charuco | Checkerboard):
         pitch = reach = target.square
@@ -110,7 +112,7 @@ def _outline(target: Target, quiet: float = 0.0) -> Array:
 
 
 def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tuple[int, ...]:
-    """Return the columns and rows in which paper is seen: left, top, right, bottom."""
+    """Return the columns and rows that show the paper: left, top, right, bottom."""
     if float(pose.rotation[:, 2] @ pose.translation) >= 0:
         raise Code.MIRRORED.refusal(
             f"{pose.label}: expected the sheet's front towards the camera, got its back",
@@ -132,7 +134,8 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
     seen, size = camera.project(rim), np.array(camera.size)
     low, high = np.floor(seen.min(axis=0) - more), np.ceil(seen.max(axis=0) + more)
     if (low < -size / 2).any() or (high > 1.5 * size).any():
-        return 0, 0, *camera.size  # so far outside a lens model may fold the rim back
+        # this far outside of the image a lens model may fold the rim back
+        return 0, 0, *camera.size
     left, top = np.maximum(low, 0).astype(int).tolist()
     right, bottom = np.minimum(high + 1, size).astype(int).tolist()
     return left, top, right, bottom
@@ -145,22 +148,22 @@ def _sheet(
     flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     rays = np.column_stack([flat, np.ones(len(flat))])
     normal = pose.rotation[:, 2]
-    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon: far away
+    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon, so far away
     seen = (rays * (normal @ pose.translation / slope)[:, None] - pose.translation) @ pose.rotation
     rows, columns = u.shape
-    fine = (columns * SAMPLES, rows * SAMPLES)
+    fine = (columns * SAMPLES_PER_SIDE, rows * SAMPLES_PER_SIDE)
     parts = []
     for axis in (0, 1):
         coarse = seen[:, axis].reshape(rows, columns).astype(np.float32)
         place = cv2.resize(coarse, fine, interpolation=cv2.INTER_LINEAR)
         by_row, by_column = np.gradient(coarse)
-        grain = (np.abs(by_row) + np.abs(by_column)) / SAMPLES
+        grain = (np.abs(by_row) + np.abs(by_column)) / SAMPLES_PER_SIDE
         parts += [place, cv2.resize(grain, fine, interpolation=cv2.INTER_LINEAR)]
     return _Samples(parts[0], parts[2], parts[1], parts[3])
 
 
 def _share(distance: Floats, grain: Floats) -> Floats:
-    """Return the share of a sample that lies on the positive side of an edge."""
+    """Return the part of a sample that lies on the positive side of an edge."""
     share: Floats = np.clip(distance / grain + np.float32(0.5), 0, 1)
     return share
 
@@ -172,7 +175,7 @@ def _rectangle(sheet: _Samples, outline: Array) -> Floats:
 
 
 def _black(target: Target, sheet: _Samples) -> Floats:
-    """Return the share of each sample that is printed on."""
+    """Return the part of each sample that is black."""
     match target:
         case Checkerboard():
             black = _squares(sheet, _outline(target), target.square)
@@ -189,7 +192,7 @@ def _black(target: Target, sheet: _Samples) -> Floats:
 
 
 def _squares(sheet: _Samples, outline: Array, side: float) -> Floats:
-    """Return squares that begin with a black one at the lower left."""
+    """Return the black parts of squares that begin with a black one at the lower left."""
     across = _turns(sheet.x, sheet.x_grain, outline[0, 0], side)
     upwards = _turns(sheet.y, sheet.y_grain, outline[0, 1], side)
     shares: Floats = np.float32(0.5) + across * upwards * np.float32(0.5)
@@ -198,10 +201,10 @@ def _squares(sheet: _Samples, outline: Array, side: float) -> Floats:
 
 
 def _turns(place: Floats, grain: Floats, least: float, side: float) -> Floats:
-    """Return 1 in the first stripe from ``least``, -1 in the next, and so on."""
+    """Return 1 in the first stripe after ``least``, -1 in the next, and so on."""
     part = np.mod((place - np.float32(least)) / np.float32(side), np.float32(2))
     inside = np.minimum(part, 1 - part)
-    inside[part > 1.5] = part[part > 1.5] - 2  # the next first stripe is nearer
+    inside[part > 1.5] = part[part > 1.5] - 2  # the edge of the next such stripe is nearer
     return 2 * _share(np.float32(side) * inside, grain) - 1
 
 
@@ -216,7 +219,7 @@ def _round_grain(sheet: _Samples) -> Floats:
 
 
 def _dots(target: CircleGrid, sheet: _Samples) -> Floats:
-    """Return the dots; shifted rows lie on a lattice of their own."""
+    """Return the black parts of dots; shifted rows are a lattice of their own."""
     pitch, grain = target.spacing, _round_grain(sheet)
     last_x, last_y = target.columns - 1, target.rows - 1
     if target.asymmetric:
@@ -269,7 +272,7 @@ def _charuco(target: Charuco, sheet: _Samples) -> Floats:
 
 
 def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
-    """Return markers, and of Kalibr's the squares between their corners."""
+    """Return markers, and for Kalibr's grids the squares between their corners."""
     pitch, side, gap = (
         np.float32(one) for one in (target.marker + target.gap, target.marker, target.gap)
     )
@@ -284,7 +287,7 @@ def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
         places.append(place.clip(0, count - 1).astype(np.intp))
         parts.append(part / side)
         markers.append(inside * _share(np.minimum(part, side - part), grain))
-        # the gap that is nearer: before the marker, or behind it
+        # the nearer gap: before the marker, or behind it
         near = np.where(part < side / 2, part + gap, part - side)
         whole = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
         between.append(whole * _share(np.minimum(near, gap - near), grain))

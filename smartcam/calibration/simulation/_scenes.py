@@ -1,7 +1,7 @@
-"""Cameras on robots whose truth is known: views with noise, poses with noise, and the bound.
+"""Simulate cameras on robots: views with noise, poses with noise, and the Cramer-Rao bound.
 
-Nothing is drawn: the points of a target are projected. What a calibration finds of it is compared
-with the truth, and its error with the Cramer-Rao bound, below which no unbiased one can be.
+Nothing is drawn: the points of a target are projected. Tests compare the result of a calibration
+with the truth, and its error with the Cramer-Rao bound, which no unbiased estimate can beat.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 MIN_VISIBLE_POINTS = 4
-"""Points that a view must have in the image."""
+"""A view must have at least this many points in the image."""
 
-GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+GOLDEN_ANGLE_RADIANS = math.pi * (3.0 - math.sqrt(5.0))
 """Angle between neighbours of a spiral that covers a disc evenly, radians."""
 
-EXACT = 1e-9
-"""Pixels: standard deviation that views without noise are given."""
+EXACT_SIGMA_PX = 1e-9
+"""Standard deviation, pixels, that views without noise state for their points."""
 
 
 def view(
@@ -53,18 +53,18 @@ def view(
     """Return a camera's view of a target.
 
     Args:
-        target: what is on the sheet.
+        target: target on the sheet.
         camera: the camera.
         transform: ``T_camera_target``.
         sigma: standard deviation of a coordinate of a point, pixels.
-        random: where the noise comes from.
+        random: source of the noise.
         name: name of the view, for messages.
 
     Returns:
         The points inside of the image.
 
     Raises:
-        CalibrationError: ``OUT_OF_FIELD``: fewer than 4 points are.
+        CalibrationError: ``OUT_OF_FIELD``: fewer than 4 points are inside of the image.
     """
     pixels = camera.project(transform.apply(target.points))
     pixels = pixels + sigma * random.normal(size=pixels.shape)
@@ -77,7 +77,7 @@ def view(
             MIN_VISIBLE_POINTS,
             len(ids),
         )
-    variance = max(sigma, EXACT) ** 2
+    variance = max(sigma, EXACT_SIGMA_PX) ** 2
     covariance = np.broadcast_to(variance * np.eye(2), (len(ids), 2, 2)).copy()
     return TargetView(
         target=target,
@@ -92,11 +92,11 @@ def view(
 def around(
     target: Target, count: int, *, tilt: float, distance: float, random: np.random.Generator
 ) -> list[Transform]:
-    """Return poses of a camera that looks at a target's centre from a cone over it.
+    """Return poses of a camera that looks at a target's centre from points on a cone above it.
 
     Args:
-        target: what is looked at.
-        count: count of poses.
+        target: target that the camera looks at.
+        count: number of poses.
         tilt: tilt of the outermost poses against the target's normal, radians.
         distance: distance from the target's centre, metres; it varies by a fifth to both sides.
         random: source of the distances, and of the turns about the optical axis, up to 90 degrees.
@@ -108,7 +108,7 @@ def around(
     poses = []
     for number in range(count):
         polar = tilt * math.sqrt((number + 0.5) / count)
-        azimuth = number * GOLDEN
+        azimuth = number * GOLDEN_ANGLE_RADIANS
         out = np.array(
             [
                 math.sin(polar) * math.cos(azimuth),
@@ -143,11 +143,11 @@ class HandEyeScene:
     """A robot, a camera and a target, as they really are.
 
     Attributes:
-        setup: where the camera is.
+        setup: place of the camera.
         camera: the camera.
         target: the target.
         camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
-        target_pose: ``T_base_target``; ``T_flange_target`` there.
+        target_pose: ``T_base_target``; ``T_flange_target`` for a camera beside the robot.
         robot_poses: ``T_base_flange`` of each view.
     """
 
@@ -166,12 +166,12 @@ class HandEyeScene:
     def measured(
         self, *, pixel_sigma: float, robot_sigmas: RobotSigmas, random: np.random.Generator
     ) -> tuple[list[Transform], list[TargetView]]:
-        """Return the robot's poses as its controller says them, and the views.
+        """Return the robot's poses with its controller's noise, and the views.
 
         Args:
             pixel_sigma: standard deviation of a coordinate, pixels.
             robot_sigmas: standard deviations of each axis of the robot's poses.
-            random: where the noise comes from.
+            random: source of the noise.
 
         Raises:
             CalibrationError: ``OUT_OF_FIELD``: the target is outside of an image.
@@ -193,8 +193,8 @@ class HandEyeScene:
     def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
         """Return the Cramer-Rao bound of the camera's pose.
 
-        The target's pose and the robot's true poses are unknown besides. A sigma of 0 means that it
-        is known to be.
+        The target's pose and the robot's true poses are unknown, too. A sigma of 0 means that there
+        is no noise, and that this is known.
         """
         # No unbiased estimate has a covariance below the inverse of Fisher's information, J^T C^-1
         # J of what is seen; the robot's true poses are eliminated from it.
@@ -214,7 +214,7 @@ class HandEyeScene:
         return Bound(math.sqrt(variances[:3].sum()), math.sqrt(variances[3:6].sum()))
 
     def errors(self, camera_pose: Transform) -> tuple[float, float]:
-        """Return by how much a pose of the camera is off: radians and metres."""
+        """Return the errors of a pose of the camera, in radians and metres."""
         turn = float(self.camera_pose.rigid.angle_to(camera_pose.rigid))
         return turn, float(np.linalg.norm(camera_pose.translation - self.camera_pose.translation))
 
@@ -235,13 +235,13 @@ def hand_eye_scene(
     distance: float,
     random: np.random.Generator,
 ) -> HandEyeScene:
-    """Return a scene with a camera that looks at a target from a cone.
+    """Return a scene with a camera that looks at a target from points on a cone above it.
 
     Args:
-        target: what is looked at.
+        target: target that the camera looks at.
         camera: the camera.
-        setup: where the camera is. Beside the robot it stands still, and the target moves.
-        poses: count of poses of the robot.
+        setup: place of the camera. A camera beside the robot is fixed, and the target moves.
+        poses: number of poses of the robot.
         tilt: tilt of the outermost views against the target's normal, radians.
         distance: distance of camera and target, metres; it varies by a fifth to both sides.
         random: source of the poses, and of the places of camera and target.

@@ -1,4 +1,4 @@
-"""Wizards: calibrations step by step, for any front-end."""
+"""Run calibrations step by step, for any front-end."""
 
 from __future__ import annotations
 

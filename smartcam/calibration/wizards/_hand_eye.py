@@ -1,7 +1,7 @@
-"""The wizard that finds where a camera is on a robot, or beside it.
+"""The wizard that calibrates the place of a camera on a robot, or beside it.
 
-It suggests from where to look, takes a picture, finds the target in it and reads the robot, as many
-times as one likes; it shows the error of poses that were left out, and names the worst pose.
+It suggests a view, takes a picture, finds the target in it and reads the robot, any number of
+times. It shows the error at poses that were left out, and names the worst pose.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from smartcam.calibration._verdict import VIEW_CURES, Judgement, refused
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
-    MAX_PREVIEW,
+    MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
     how_to_take,
     taker,
@@ -59,13 +59,13 @@ ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
 
 MAX_VIEWS = 40
-"""Largest number of views of one run: far more than it takes."""
+"""A run takes at most this many views: far more than it needs."""
 
 ADVISED_VIEWS = 10
-"""Views from which on the wizard offers to calculate first."""
+"""From this number of views on, the wizard offers to calculate first."""
 
 CALCULATION_TIMEOUT = 120.0
-"""Seconds that the calculation may take; of 15 views it takes a few."""
+"""Seconds that the calculation may take; with 15 views it takes a few."""
 
 _MOVES: Mapping[str, str] = {
     "eye-in-hand": "Bring the camera to where it looks at the sheet",
@@ -73,10 +73,11 @@ _MOVES: Mapping[str, str] = {
 }
 
 TOUCHES = 3
-"""Touches that verify a calibration: of points of the sheet that are far apart."""
+"""Number of touches that verify a calibration, at points of the sheet that are far apart."""
 
 SUGGESTIONS = tuple(look.text for look in LOOKS)
-"""Views to take, one after the other; then from the beginning, a bit beside the earlier ones."""
+"""Views to take, one after the other; then again from the beginning, a bit beside the earlier
+ones."""
 
 
 def hand_eye_wizard(
@@ -89,29 +90,29 @@ def hand_eye_wizard(
     camera: CameraModel | None = None,
     awaited: str = "",
 ) -> Wizard:
-    """Return the wizard.
+    """Return the wizard of a hand-eye calibration.
 
-    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
-    first step ``setup`` and ``robot`` (in whose convention poses are typed, a key of
-    :data:`~smartcam.calibration.formats._robots.ROBOTS`); ``target``: a description of what is on
-    the sheet, which is not asked then.
+    Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
+    first step ``setup`` and ``robot`` (the convention of typed poses, a key of
+    :data:`~smartcam.calibration.formats._robots.ROBOTS`); ``target``: a description of the target
+    on the sheet, which is then not asked for.
 
     Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,
     translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
 
     Args:
-        take_picture: takes a picture; the robot stands still. Or a source of frames that is open,
-            of which the first one counts that is exposed after the button.
-        save_to: returns the file for a name.
-        target: what is on the sheet, with the lengths that it has on paper; None: it is asked.
-        suggested: the default of what is asked.
-        read_robot: reads the pose of the flange; None: it is typed.
+        take_picture: function that takes a picture while the robot stands still; or an open source
+            of frames, of which the first frame exposed after the button is used.
+        save_to: function that returns the file for a name.
+        target: target on the sheet, with its lengths as they are on paper; None: it is asked for.
+        suggested: default of the target that is asked for.
+        read_robot: function that reads the pose of the flange; None: it is typed.
         camera: the camera's lens; None: calibrated from the same views.
-        awaited: description, for people, of the picture that ``take_picture`` waits for, as
-            :attr:`PictureFolder.awaited` says it; empty: ``take_picture`` takes one.
+        awaited: description, for people, of the picture that ``take_picture`` waits for, as from
+            :attr:`PictureFolder.awaited`; empty if ``take_picture`` takes one.
 
     Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
-    what it finds is dropped.
+    its result is dropped.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -135,7 +136,7 @@ def hand_eye_wizard(
 async def _ask_setup(
     parameters: Mapping[str, Any], *, typed: bool
 ) -> tuple[Setup, str, float | None]:
-    """Ask for the camera's place, the convention of typed poses, and the error that is allowed."""
+    """Ask for the camera's place, the convention of typed poses, and the allowed error."""
     setup = Option(
         name="setup",
         label="Where the camera is",
@@ -166,7 +167,7 @@ async def _ask_setup(
 
 @dataclass(eq=False)
 class _Views:
-    """One run of the wizard; holds nothing but what the answers gave."""
+    """One run of the wizard; its state follows from the answers alone."""
 
     _target: Target
     _setup: Setup
@@ -175,7 +176,7 @@ class _Views:
     _camera: CameraModel | None
     _awaited: str
     _samples: list[dict[str, Any]] = field(default_factory=list)
-    allowed: float | None = None  # metres, of an error that is good enough; None: nobody said
+    allowed: float | None = None  # largest allowed error, metres; None if the user gave none
 
     async def run(self) -> HandEyeCalibration:
         """Ask for views until a calibration is accepted; return it."""
@@ -197,7 +198,7 @@ class _Views:
                 more = len(self._samples) < MIN_POSES
 
     async def _verify(self, calibration: HandEyeCalibration) -> tuple[HandEyeCalibration, str]:
-        """Ask for touches of the sheet; return the calibration with what they say, and a note."""
+        """Ask for touches of the sheet; return the calibration with their result, and a note."""
         points = (calibration.target or self._target).points
         if self._setup == "eye-in-hand":
             places = calibration.target_pose.apply(points)
@@ -238,7 +239,7 @@ class _Views:
         return replace(calibration, warnings=others), note
 
     async def _lying(self, lens: CameraModel | None, _answers: Answers) -> dict[str, Any]:
-        """Take a picture of a sheet that lies there, and tell where."""
+        """Take a picture of a sheet that lies on the table, and return its pose."""
         image = await self._take_picture()
         view = await asyncio.to_thread(find_target, image, self._target)
         if lens is None:
@@ -246,7 +247,7 @@ class _Views:
         return motion_to_data(locate(view, lens).transform)
 
     async def _take_view(self) -> bool:
-        """Take one more view; return false where it is to be calculated instead."""
+        """Take one more view; return False if the user wants to calculate instead."""
         count = len(self._samples)
         if count >= MAX_VIEWS:
             return False
@@ -282,7 +283,7 @@ class _Views:
         return bool(sample)
 
     def _progress(self, count: int) -> str:
-        """Return a text of the views so far, the views advised and allowed, and the way to end."""
+        """Return a text with the number of views so far, and those advised and allowed."""
         end = (
             "to end, choose to calculate"
             if count >= MIN_POSES
@@ -291,11 +292,11 @@ class _Views:
         return f"{count} of {ADVISED_VIEWS} views, {MAX_VIEWS} at most; {end}"
 
     async def _sample(self, answers: Answers) -> dict[str, Any]:
-        """Take a picture and read the robot, if that is wanted."""
+        """Take a picture and read the robot, unless the user wants to calculate."""
         if answers.get("next") == "calculate":
             return {}
         typed = None
-        if isinstance(self._robot, str):  # a pose that is not valid shall not cost a picture
+        if isinstance(self._robot, str):  # a pose that is not valid must not cost a picture
             typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
         flange = typed or await self._flange()
@@ -317,7 +318,7 @@ class _Views:
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
     def _found(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
-        """Return the view found in a picture, an SVG of it, and what comes next.
+        """Return the view found in a picture, an SVG of it, and the next suggestion.
 
         A large SVG is left out.
         """
@@ -330,7 +331,7 @@ class _Views:
             suggested=following.outline,
             title=f"{name}; orange: the next one, about",
         )
-        return view, svg if len(svg) <= MAX_PREVIEW else "", following
+        return view, svg if len(svg) <= MAX_PREVIEW_BYTES else "", following
 
     def _views(self) -> list[TargetView]:
         """Return the views, named by their numbers."""
@@ -338,7 +339,7 @@ class _Views:
         return [replace(view, name=f"view {number}") for number, view in enumerate(views, 1)]
 
     def preview(self) -> dict[str, Any] | None:
-        """Return the picture of the last view; None where there is none."""
+        """Return the picture of the last view; None if there is none."""
         svg = self._samples[-1].get("preview") if self._samples else None
         return {"svg": svg} if svg else None
 
@@ -362,7 +363,7 @@ class _Views:
         return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
-        """Return the calibration without the samples' views, or why there is none."""
+        """Return the calibration without the samples' views, or the reason why there is none."""
         poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
         work = partial(
             calibrate_hand_eye,
@@ -404,7 +405,7 @@ class _Views:
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
-    """Return the inputs of a pose; where it is ``optional``, none is needed to calculate."""
+    """Return the inputs of a pose; if it is ``optional``, it may be left out to calculate."""
     convention = ROBOTS[robot]
     unit = "mm" if convention.metre > 1 else "m"
     return tuple(

@@ -1,8 +1,8 @@
-"""The journal of a sequence: a line for each thing that was done, on the disk before it counts.
+"""Keep the journal of a sequence: a line for each entry, on the disk before it counts.
 
-The first line tells whose it is, each other line is an entry. A line is written and synced before
-the next step is shown. A process that is killed leaves at most a piece of a line, which the next
-one takes away: what that line was to say had not been answered yet.
+The first line says which wizard it belongs to, each other line is an entry. A line is written and
+synced before the next step is shown. A killed process leaves at most a part of a line, which the
+next process removes: the answer in it had not been confirmed yet.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 MAX_ENTRIES = 10_000
-"""Entries of a journal; a calibration by hand has some dozens."""
+"""A journal has at most this many entries; a calibration by hand has some dozens."""
 
-MAX_LINE = 1 << 20
-"""Bytes of an entry; a result of 900 localizations has a quarter of it."""
+MAX_LINE_BYTES = 1 << 20
+"""An entry has at most this many bytes; a result of 900 localizations has a quarter of them."""
 
 _MAX_FILE = 1 << 28
 
@@ -34,14 +34,14 @@ _MAX_FILE = 1 << 28
 class Journal:
     """A journal in a file, for one sequence at a time.
 
-    The file is locked as long as it is open, so that no other process writes into it.
+    The file is locked while it is open, so that no other process writes into it.
 
     Args:
-        path: the file; made where it is not there. A symbolic link is refused.
+        path: the file, which is created if it does not exist. A symbolic link is refused.
 
     Attributes:
         path: the file.
-        header: what the first line says; None for a new file.
+        header: contents of the first line; None for a new file.
         entries: the entries.
 
     Raises:
@@ -72,16 +72,16 @@ class Journal:
     def start(self, header: dict[str, Any]) -> None:
         """Write the first line of a new file.
 
-        Raises ``NOT_STORABLE``; OSError: it cannot be written.
+        Raises ``NOT_STORABLE``, and OSError if the file cannot be written.
         """
         self.header = self._write(header)
         sync_folder(self.path.parent)
 
     def append(self, entry: dict[str, Any]) -> dict[str, Any]:
-        """Write an entry, return it as it will be read; it is on the disk then.
+        """Write an entry to the disk, and return it as it will be read.
 
-        Raises ``NOT_STORABLE``: no JSON, too long, or one too many; OSError: it cannot be written,
-        the file is as it was.
+        Raises ``NOT_STORABLE`` if the entry is not possible as JSON, too long, or one too many;
+        OSError if it cannot be written, which leaves the file as it was.
         """
         if len(self.entries) >= MAX_ENTRIES:
             raise Code.NOT_STORABLE.refusal(
@@ -125,9 +125,9 @@ class Journal:
             line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         except (TypeError, ValueError, RecursionError) as exc:
             raise Code.NOT_STORABLE.refusal(f"{self.path}: cannot be stored: {exc}") from exc
-        if len(line) > MAX_LINE:
+        if len(line) > MAX_LINE_BYTES:
             raise Code.NOT_STORABLE.refusal(
-                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most"
+                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE_BYTES} at most"
             )
         try:
             self._put(line)

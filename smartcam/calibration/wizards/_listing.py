@@ -1,4 +1,4 @@
-"""The list of a folder's calibrations: of when each is, how good, and what its last check said."""
+"""List the calibrations of a folder: the date of each, how good it is, and its last check."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from smartcam.calibration._files.load import KINDS
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.calibration.wizards._journal import MAX_LINE
+from smartcam.calibration.wizards._journal import MAX_LINE_BYTES
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._files.directory import Folder
 
-MOST: Final = 200
-"""Calibrations that are looked into; of more only the first ones, by name."""
+MAX_CALIBRATIONS: Final = 200
+"""At most this many calibrations, the first by name, are read."""
 
 
 def listing(folder: Folder) -> list[dict[str, Any]]:
-    """Return a row for each calibration of a folder, by name, JSON-able.
+    """Return a row for each calibration of a folder, by name, as JSON takes it.
 
-    ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (rms; None: not known)``,
-    checked_at`` and ``stale`` of the last check (None: there was none)``, problem`` (None: none).
-    A file that cannot be read has a ``problem`` and nothing else.
+    ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (RMS; None: not known)``,
+    checked_at`` and ``stale`` of the last check (None without a check)``, problem`` (None without
+    one). A file that cannot be read has a ``problem`` and nothing else.
     """
-    return [_row(folder, name) for name in folder.names()[:MOST]]
+    return [_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
 
 
 def _row(folder: Folder, name: str) -> dict[str, Any]:
@@ -41,7 +41,8 @@ def _row(folder: Folder, name: str) -> dict[str, Any]:
         row |= {"kind": document.kind, "written_at": document.written_at}
         row["held_out_mm"] = _held_out(document.kind, document.data)
         check = _last_check(folder.checks(name))
-        if check.get("calibration") == document.written_at:  # one before says nothing of this one
+        # a check before this calibration was written says nothing about it
+        if check.get("calibration") == document.written_at:
             row |= {"checked_at": check.get("at"), "stale": check.get("stale")}
     except (CalibrationError, OSError) as exc:
         row["problem"] = str(exc)
@@ -62,11 +63,11 @@ def _held_out(kind: str, data: dict[str, Any]) -> float | None:
 
 
 def _last_check(path: Path) -> dict[str, Any]:
-    """Return the last whole line of a file of checks, whoever writes it just now."""
+    """Return the last whole line of a file of checks, which may be being written."""
     try:
         with path.open("rb") as stream:
-            stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE))
-            *whole, _ = stream.read(2 * MAX_LINE).split(b"\n")
+            stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE_BYTES))
+            *whole, _ = stream.read(2 * MAX_LINE_BYTES).split(b"\n")
     except FileNotFoundError:
         return {}
     try:

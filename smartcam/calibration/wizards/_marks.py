@@ -1,4 +1,4 @@
-"""Marks that a camera localizes: how a wizard takes a picture of them, and which are touched."""
+"""Take pictures of marks that a camera localizes, and ask which of them are touched."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._steps import Answers
 
 MAX_MARKS = 25
-"""Marks of one picture that can be touched: 5 x 5."""
+"""At most this many marks of one picture can be touched: 5 x 5."""
 
 Localize = Callable[[], Awaitable[list[Localization]]]
-"""Takes a picture and returns what was found in it."""
+"""Function that takes a picture and returns the localizations in it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A point that the camera sees, to be touched."""
+    """A point that the camera sees and the robot will touch."""
 
-    feature: str  # its name; may be empty
-    x: float  # in the camera's unit; of a sheet's point metres on the sheet
-    y: float  # the same
-    theta: float  # radians
-    number: int | None = None  # of a sheet's point among those of its target; None: of no target's
+    feature: str  # name of the mark; may be empty
+    x: float  # x in the camera's unit; for a point of a sheet, metres on the sheet
+    y: float  # y in the same unit
+    theta: float  # angle, radians
+    number: int | None = None  # number of the point on its target; None for a mark of no target
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Mark:
@@ -39,7 +39,7 @@ class Mark:
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
     def text(self, unit: str) -> str:
-        """Return the mark as a text; ``unit`` of its place, metres are shown as millimetres."""
+        """Return the mark as a text, its place in a ``unit``; metres become millimetres."""
         name = self.feature if self.feature.isprintable() else repr(self.feature)
         factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
@@ -50,19 +50,20 @@ class MarkCamera:
     """A camera that localizes marks."""
 
     localize: Localize
-    feature: str = ""  # only localizations of this name are marks; empty: all of them
-    # whether ``localize`` turns the camera's y axis, which points down, up; None: not known
+    feature: str = ""  # only localizations with this name are marks; empty for all
+    # whether ``localize`` turns the camera's y axis up, which points down; None: not known
     y_down: bool | None = None
 
     async def picture(self, _answers: Answers) -> list[dict[str, Any]]:
-        """Take a picture: the action of a step.
+        """Take a picture, as the action of a step.
 
         Returns:
             A row for each mark: ``feature_id, quality, photo_index, frame_id, x, y, theta,
             y_down``.
 
         Raises:
-            CalibrationError: TOO_FEW: no mark; SHAPE: more than :data:`MAX_MARKS`.
+            CalibrationError: TOO_FEW: there is no mark; SHAPE: there are more than
+                :data:`MAX_MARKS`.
 
         Cancellation: as that of ``localize``.
         """
@@ -91,9 +92,9 @@ class MarkCamera:
         return rows
 
     def check_y_down(self, before: bool | None, what: str) -> None:
-        """Raise (MIRRORED) where the y axis is taken another way than ``before`` (None: unknown).
+        """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
 
-        ``what``: what was made then, for people.
+        ``what``: name, for people, of the thing that was made before.
         """
         if None not in {before, self.y_down} and before != self.y_down:
             raise Code.MIRRORED.refusal(
@@ -105,7 +106,7 @@ class MarkCamera:
 
 
 def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, Any]:
-    """Return a preview of marks, each of which stands for answers if it is clicked."""
+    """Return a preview of marks, each of which gives answers when it is clicked."""
     choices = [
         {"at": [mark.x, mark.y], "label": str(number), "answers": answer}
         for number, (mark, answer) in enumerate(zip(marks, answers, strict=True), 1)
@@ -114,7 +115,7 @@ def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, An
 
 
 async def choose(marks: list[Mark], unit: str) -> list[Mark]:
-    """Ask which marks will be touched, where there are several; ``unit`` of their places."""
+    """Ask which of several marks will be touched; their places have a ``unit``."""
     if len(marks) == 1:
         return marks
     flags = tuple(

@@ -1,4 +1,4 @@
-"""Pictures for the wizards: out of a file's bytes, or of a folder that a camera writes into."""
+"""Get pictures for the wizards: from a file's bytes, or from a folder that a camera writes to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.calibration._detection.image import MAX_SIDE, HasGrey
+from smartcam.calibration._detection.image import MAX_SIDE_PX, HasGrey
 from smartcam.geometry import Code
 
 if TYPE_CHECKING:
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 TakePicture = Callable[[], Awaitable[Any]]
-"""Takes a picture and returns it: uint8 or uint16, (H, W) or (H, W, 3)."""
+"""Function that takes a picture and returns it: uint8 or uint16, (H, W) or (H, W, 3)."""
 
 
 class Pictures(Protocol):
-    """A source of frames, as :func:`smartcam.frames.open` gives it; somebody has it open."""
+    """An open source of frames, as from :func:`smartcam.frames.open`."""
 
     def after(self, moment: float, /) -> Awaitable[HasGrey]:
         """Return the first frame whose exposure began after a moment of ``time.monotonic()``."""
@@ -38,8 +38,8 @@ class Pictures(Protocol):
 def taker(pictures: TakePicture | Pictures) -> TakePicture:
     """Return a function that takes a picture, or the first frame a source exposes after the call.
 
-    The picture is the frame's brightness. Errors of the source pass as they are: no such device, no
-    frame in time.
+    The picture is the frame's brightness. Errors of the source are passed on, such as a missing
+    device or no frame in time.
     """
     if callable(pictures):
         return pictures
@@ -52,83 +52,87 @@ def taker(pictures: TakePicture | Pictures) -> TakePicture:
     return take
 
 
-MAX_PREVIEW: Final = 700_000
-"""Bytes of a picture's preview, which is kept with its step: a line of a journal holds 1 MiB."""
+MAX_PREVIEW_BYTES: Final = 700_000
+"""Largest number of bytes of a picture's preview, which is kept with its step: a line of a journal
+holds 1 MiB."""
 
 PICTURE_TIMEOUT: Final = 60.0
-"""Seconds that a picture may take, with what is found in it."""
+"""Seconds that taking a picture and finding things in it may take."""
 
-MAX_PICTURE: Final = 1 << 26
-"""Bytes of a picture's file: 20 million pixels of colour in a bitmap."""
+MAX_PICTURE_BYTES: Final = 1 << 26
+"""Largest number of bytes of a picture's file: 20 million pixels of colour in a bitmap."""
 
 MAX_FILES: Final = 10_000
-"""Entries of a folder of pictures; it is looked through several times a second."""
+"""Largest number of entries of a folder of pictures, which is listed several times per second."""
 
-DEADLINE: Final = 25.0
-"""Seconds that a picture is waited for in a folder."""
+PICTURE_DEADLINE: Final = 25.0
+"""Seconds to wait for a picture in a folder."""
 
-PERIOD: Final = 0.2
-"""Seconds between two looks at a folder; a file that is as long in both is written whole."""
+LISTING_PERIOD: Final = 0.2
+"""Seconds between two listings of a folder; a file with the same length in both is complete."""
 
 SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
 )
-"""Suffixes of files that are pictures, in small letters."""
+"""Suffixes of picture files, in lower case."""
 
 
 def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     """Return the picture that a file's bytes hold, (H, W), grey, uint8 or uint16.
 
-    Bitmap, JPEG, PNG, TIFF or what else OpenCV reads; as the camera's pixels lie, whatever the file
-    says of how it was held. ``name`` is for messages. Raises BAD_PICTURE: too many bytes or pixels,
-    or no picture; MissingExtraError: OpenCV is not installed.
+    The file may be a bitmap, JPEG, PNG, TIFF or another format that OpenCV reads. Pixels are those
+    of the camera's sensor; an orientation in the file is ignored. ``name`` is for messages. Raises
+    BAD_PICTURE if the file has too many bytes or pixels, or is no picture; MissingExtraError:
+    OpenCV is not installed.
     """
-    if len(data) > MAX_PICTURE:
-        raise _bad(name, f"{MAX_PICTURE} bytes at most", f"{len(data)}")
+    if len(data) > MAX_PICTURE_BYTES:
+        raise _bad(name, f"{MAX_PICTURE_BYTES} bytes at most", f"{len(data)}")
     cv2 = load("cv2")
     try:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
-    except cv2.error:  # of no bytes, and of more pixels than OpenCV takes
+    except cv2.error:  # for no bytes, and for more pixels than OpenCV allows
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
-    if max(image.shape) > MAX_SIDE:
-        raise _bad(name, f"{MAX_SIDE} pixels along each side", f"{image.shape[1]}x{image.shape[0]}")
+    if max(image.shape) > MAX_SIDE_PX:
+        raise _bad(
+            name, f"{MAX_SIDE_PX} pixels along each side", f"{image.shape[1]}x{image.shape[0]}"
+        )
     picture: NDArray[Any] = image
     return picture
 
 
 def how_to_take(awaited: str) -> str:
-    """Return the sentence behind a step's description that says how to take an awaited picture."""
+    """Return the sentence at the end of a step's description that says how to take the picture."""
     if not awaited:
         return ""
     return f" Go on here first, then have the camera take its picture: {awaited}."
 
 
 class PictureFolder:
-    """A folder that a camera, or somebody, puts pictures into.
+    """A folder that a camera, or a person, puts pictures into.
 
     Args:
         path: the folder.
-        deadline: how long :meth:`take` waits, seconds.
+        deadline: time for which :meth:`take` waits, seconds.
 
     Attributes:
         path: the folder.
         deadline: the deadline as given, seconds.
 
     Raises:
-        CalibrationError: NO_PICTURE: it is no folder.
+        CalibrationError: NO_PICTURE: the path is no folder.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, deadline: float = DEADLINE) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, deadline: float = PICTURE_DEADLINE) -> None:
         self.path: Path = Path(path)
         self.deadline: float = deadline
         self._look()
 
     @property
     def awaited(self) -> str:
-        """Text for people that says which picture :meth:`take` waits for."""
+        """Text, for people, that says which picture :meth:`take` waits for."""
         return (
             f"the next file that comes into {self.path} counts, one that ends in "
             f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
@@ -138,12 +142,12 @@ class PictureFolder:
     async def take(self) -> NDArray[Any]:
         """Wait for the next picture and return it, (H, W).
 
-        What is in the folder already does not count, unless it is written anew: it shows what was
-        before the camera before. Of several that come the newest counts.
+        Pictures that are in the folder already do not count unless they are written again, since
+        they show an earlier scene. If several come, the newest is used.
 
         Raises:
             CalibrationError: NO_PICTURE: none came in time, or the folder is gone or has too many
-                files; BAD_PICTURE: one came that cannot be read, or is too large.
+                files; BAD_PICTURE: a picture came that cannot be read, or is too large.
 
         Cancellation: safe; no file is changed.
         """
@@ -152,7 +156,7 @@ class PictureFolder:
         try:
             async with asyncio.timeout(self.deadline):
                 while True:
-                    await asyncio.sleep(PERIOD)
+                    await asyncio.sleep(LISTING_PERIOD)
                     now = self._look()
                     fresh = [
                         name
@@ -172,14 +176,14 @@ class PictureFolder:
             ) from exc
 
     def _names(self) -> set[str]:
-        """Return the names of what is in the folder and no picture."""
+        """Return the names of the entries of the folder that are no pictures."""
         with contextlib.suppress(OSError):
             found = [one.name for one in itertools.islice(self.path.iterdir(), MAX_FILES)]
             return {one for one in found if Path(one).suffix.lower() not in SUFFIXES}
         return set()
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
-        """Return a note on files that came instead of a picture, and on the count there before."""
+        """Return a note on files that came instead of a picture, and on those there before."""
         said = [f"there before: {len(before)}"] if before else []
         came = sorted(self._names() - others)
         if came:
@@ -188,7 +192,7 @@ class PictureFolder:
         return f" ({'; '.join(said)})" if said else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:
-        """Return when each picture was written, ns, and how many bytes it has."""
+        """Return the time of writing, ns, and the number of bytes of each picture."""
         found: dict[str, tuple[int, int]] = {}
         try:
             for count, file in enumerate(self.path.iterdir()):
@@ -200,7 +204,7 @@ class PictureFolder:
                     continue
                 try:
                     about = file.stat()
-                except FileNotFoundError:  # taken away, or renamed, meanwhile
+                except FileNotFoundError:  # removed or renamed meanwhile
                     continue
                 found[file.name] = (about.st_mtime_ns, about.st_size)
         except OSError as exc:
@@ -212,7 +216,7 @@ class PictureFolder:
     def _read(self, name: str) -> NDArray[Any]:
         try:
             with (self.path / name).open("rb") as stream:
-                data = stream.read(MAX_PICTURE + 1)
+                data = stream.read(MAX_PICTURE_BYTES + 1)
         except OSError as exc:
             raise _bad(name, "a file that can be read", str(exc.strerror)) from exc
         return decode_picture(data, name)

@@ -1,8 +1,8 @@
 """The wizard that calibrates a smart camera's plane against a robot.
 
-The camera localizes marks, and each is touched with the robot's tip, as many as one likes; or it
-localizes the origin mark of the printed rays. It knows no client and no robot: it is given what
-takes a picture and, if the robot can be asked, what reads its pose.
+The camera localizes marks, and the robot's tip touches any number of them; or the camera localizes
+the origin mark of the printed rays. The wizard knows no client and no robot: it is given a function
+that takes a picture and, if the robot can be asked, one that reads its pose.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._plane.calibration import KIND, fit_plane
-from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration.wizards._marks import Mark, MarkCamera, clickable
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
@@ -42,12 +42,12 @@ def plane_wizard(
     y_down: bool | None = None,
     connect: Mapping[str, Any] | None = None,
 ) -> Wizard:
-    """Return the wizard.
+    """Return the wizard of a plane calibration.
 
-    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
     first step ``method`` (marks, rays), ``camera_unit`` (m, px), ``camera_frame``, ``robot_frame``,
-    ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks of this name
-    count.
+    ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks with this
+    name count.
 
     Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
     held_out_mm, predicted_mm, remarks``, ``path`` of the file, ``good_for_mm`` (95 of 100 new
@@ -55,13 +55,13 @@ def plane_wizard(
     ``python``. Points left out count in none of the errors.
 
     Args:
-        localize: takes a picture.
-        save_to: returns the file for a name.
-        read_robot: reads the robot's pose; None: it is typed.
-        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
-            known. It is kept with the calibration, and the same for all of its pictures.
-        connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
-            that use the result; None: it cannot be asked.
+        localize: function that takes a picture and localizes marks in it.
+        save_to: function that returns the file for a name.
+        read_robot: function that reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis up, which points down; None: not
+            known. It is stored with the calibration, and must be the same for all of its pictures.
+        connect: arguments of :func:`smartcam.connect` for the camera, ``url`` included, for the
+            lines that use the result; None: the camera cannot be asked.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -146,7 +146,7 @@ class _MarkSource(PointSource):
         return marks[int((await ask(step))["mark"]) - 1], scale
 
     async def _nominal_scale(self) -> float:
-        """Ask for metres for each unit of the camera, which touches of rays do not tell."""
+        """Ask for the metres per unit of the camera, which touches of rays do not determine."""
         if self.camera_unit == "px":
             label = "Size of a pixel on the plane"
             pixel = Number(name="pixel", label=label, unit="mm", minimum=1e-6, maximum=100.0)
@@ -159,10 +159,10 @@ class _MarkSource(PointSource):
             "be, so what the ruler really measures is the scale.",
             inputs=(ruler("ruler"),),
         )
-        return float((await ask(step))["ruler"]) / RULER
+        return float((await ask(step))["ruler"]) / RULER_MM
 
     async def _seen(self, step: Step) -> Sequence[Mapping[str, Any]]:
-        """Ask for a picture; remember which way its y axis was taken."""
+        """Ask for a picture; remember the direction of its y axis."""
         rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
         told = [row.get("y_down") for row in rows]
         self.y_down = next((one for one in told if one is not None), self.y_down)

@@ -1,8 +1,8 @@
-"""The wizard that calibrates a plane by touches, whatever its points come from.
+"""Calibrate a plane by touches, whatever source its points come from.
 
-A :class:`PointSource` says where they come from: marks that a camera localizes, or a sheet that is
-found in a picture. The robot touches as many of them as one likes, or the thesis' three: the origin
-and one point on each of the printed rays A and B.
+A :class:`PointSource` provides the points: marks that a camera localizes, or a sheet that is found
+in a picture. The robot touches any number of them, or the thesis' three: the origin and one point
+on each of the printed rays A and B.
 
 Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 """
@@ -10,6 +10,7 @@ Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -24,11 +25,19 @@ from smartcam.calibration._plane.order import Reordered, better_order
 from smartcam.calibration._plane.robust import MIN_POINTS
 from smartcam.calibration._plane.touches import fit_touches
 from smartcam.calibration._plane.validation import extent
-from smartcam.calibration._verdict import Judgement, refused
+from smartcam.calibration._verdict import CURES, Judgement, refused
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
-from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._touches import (
+    ALLOWED,
+    SIDE,
+    SIDES,
+    SIGMA,
+    UNIT,
+    Touch,
+    Touches,
+)
 from smartcam.calibration.wizards._usage import usage
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code
@@ -43,42 +52,43 @@ if TYPE_CHECKING:
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration.wizards._marks import Mark
     from smartcam.calibration.wizards._steps import Answers, Input
+    from smartcam.geometry._inside import Array
 
 MAX_POINTS = 200
-"""Touches of a calibration."""
+"""A calibration has at most this many touches."""
 
-LEAST = 3
-"""Touches that a plane takes."""
+MIN_TOUCHES = 3
+"""A plane needs at least this many touches."""
 
 _SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
-"""Warnings after which points may be left out; two that are wrong can hide each other."""
+"""Warnings after which points may be left out; two wrong points can hide each other."""
 
 
 class Calibrated(NamedTuple):
     """A calibration with its figures and notes."""
 
     calibration: AnyCalibration | HandEyeCalibration
-    figures: dict[str, Any]  # what the wizard's result says of it, JSON-able
-    notes: tuple[str, ...]  # what people should know of it, a line each
+    figures: dict[str, Any]  # facts for the wizard's result, as JSON takes them
+    notes: tuple[str, ...]  # notes for people, a line each
     judgement: Judgement
 
 
 class PointSource(Touches, ABC):
     """The source of a plane's points, and their touches: one run of a wizard.
 
-    Args: as of :class:`~smartcam.calibration.wizards._touches.Touches`; ``about`` answers
-        :func:`about_step`.
+    The arguments are those of :class:`~smartcam.calibration.wizards._touches.Touches`; ``about``
+    are the answers to :func:`about_step`.
 
     Attributes:
-        connect: what :func:`smartcam.connect` takes for the camera; None: it is not known.
+        connect: arguments of :func:`smartcam.connect` for the camera; None: it is not known.
         camera_frame: name of the only frame that localizations may come in; None: any.
         y_down: whether the camera's y axis was turned up; None: not known.
     """
 
     KIND: ClassVar[str]
     """Kind of the calibration in the store."""
-    FIRST: ClassVar[int] = LEAST
-    """Points that are touched before it is shown what came out."""
+    FIRST: ClassVar[int] = MIN_TOUCHES
+    """Number of points that are touched before the result is shown."""
     POINTS: ClassVar[str]
     """Name of the points, for people."""
     ORIGIN: ClassVar[str]
@@ -94,23 +104,23 @@ class PointSource(Touches, ABC):
 
     @abstractmethod
     async def add(self) -> None:
-        """Ask for touches of one more point or several."""
+        """Ask for touches of one or more further points."""
 
     @abstractmethod
     async def redo(self, index: int) -> None:
-        """Ask for another touch in the place of one."""
+        """Ask for a touch that replaces another one."""
 
     @abstractmethod
     async def ray_origin(self) -> tuple[Mark, float]:
-        """Return the origin of the rays, and metres for each unit of the camera."""
+        """Return the origin of the rays, and the metres per unit of the camera."""
 
     @abstractmethod
     def fit(self, *, robust: bool) -> PlaneCalibration:
-        """Fit a plane to the touches; CalibrationError: there is none."""
+        """Fit a plane to the touches; raise CalibrationError if none fits."""
 
     @abstractmethod
     def sample(self, touch: Touch) -> dict[str, Any]:
-        """Return the entries of a touch in a file's samples, JSON-able."""
+        """Return the entries of a touch in a file's samples, as JSON takes them."""
 
     @abstractmethod
     def example(self) -> tuple[float, float]:
@@ -121,7 +131,7 @@ class PointSource(Touches, ABC):
         """Return the calibration of a plane, with its figures and notes."""
 
     async def run(self, name: str, save_to: Callable[[str], Path]) -> dict[str, Any]:
-        """Ask for touches and whether to save what came out; return the wizard's result."""
+        """Ask for touches and whether to save the calibration; return the wizard's result."""
         rays = self.about["method"] == "rays"
         plane = self._allowing(await (self._touch_rays() if rays else self._touch_points()))
         about, outcome = self.about, self.outcome(plane)
@@ -188,7 +198,7 @@ class PointSource(Touches, ABC):
         while True:
             while len(self.touches) < wanted:
                 await self.add()
-            wanted = LEAST
+            wanted = MIN_TOUCHES
             plane, notes, judgement = self._try_fit(robust=robust)
             judgement = _other_advice(judgement, again, len(self.touches))
             order = self._better_order() if judgement.verdict.level == "poor" else None
@@ -204,14 +214,22 @@ class PointSource(Touches, ABC):
                     again.add(index + 1)
                 case "remove":
                     del self.touches[index]
-                    again.clear()  # numbers have moved
+                    again.clear()  # the numbers of points have changed
                 case "reorder" if order is not None:
                     self.touches = [
                         replace(one, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
                         for one, i in zip(self.touches, order.order, strict=True)
                     ]
+                case "side":
+                    await self._ask_side()
                 case _:
                     robust = choice["next"] == "robust"
+
+    async def _ask_side(self) -> None:
+        """Ask where the tool pointed at all touches."""
+        step = Step(id="side", title="Where the tool points", inputs=(SIDE,))
+        self.side = (await ask(step))["side"]
+        self.touches = [replace(one, tool_z=SIDES[self.side]) for one in self.touches]
 
     def _try_fit(
         self, *, robust: bool
@@ -225,19 +243,19 @@ class PointSource(Touches, ABC):
         return plane, notes, judgement
 
     def _allowing(self, plane: PlaneCalibration) -> PlaneCalibration:
-        """Return a calibration with the error that the user allows."""
+        """Return a calibration with the error that the user allows set in it."""
         allowed = self.about["allowed"]
         return replace(plane, allowed_error=None if allowed is None else 1e-3 * allowed)
 
     def _better_order(self) -> Reordered | None:
-        """Return the order of touches that explains them far better, if there is only one."""
+        """Return the order of touches that explains them far better, if there is exactly one."""
         touched = np.array(self.places)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
         marks = np.array([(one.mark.x, one.mark.y) for one in self.touches])
         return better_order(marks, touched, sigma)
 
     def _blamed(self, error: CalibrationError) -> Judgement:
-        """Return the judgement of an error; one touch far off can look like another scale."""
+        """Return the judgement of an error; one bad touch can look like another scale."""
         if (order := self._better_order()) is not None:
             numbers = np.arange(1, 1 + len(self.touches))
             return refused(Code.WRONG_ORDER, order.remark(numbers).text)
@@ -245,7 +263,19 @@ class PointSource(Touches, ABC):
             with contextlib.suppress(CalibrationError):
                 for index in self.fit(robust=True).outliers:
                     return refused(Code.OUTLIER, f"point {1 + index}")
+        elif len(fitting := [i for i in range(len(self.touches)) if self._fits_without(i)]) == 1:
+            return refused(Code.OUTLIER, f"point {1 + fitting[0]}")
         return refused(error.code or "", str(error))
+
+    def _fits_without(self, index: int) -> bool:
+        """Return True if the touches fit without one of them, and one more is left to show it."""
+        rest = copy.copy(self)
+        rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        try:
+            codes = {one.code for one in rest.fit(robust=False).warnings}
+        except CalibrationError:
+            return False
+        return len(rest.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,
@@ -270,6 +300,8 @@ class PointSource(Touches, ABC):
         if order is not None and order.sure:
             moved = ", ".join(str(1 + index) for index in order.moved)
             options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
+        if judgement.option == "side" and self.typed:
+            options["side"] = "say where the tool points"
         doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
         if robust:
             options["all"] = "count all points, also those that do not agree with the others"
@@ -282,7 +314,7 @@ class PointSource(Touches, ABC):
         return review_step(options, point, notes, judgement, self._preview(plane))
 
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
-        """Return the data from which a picture of the touches is drawn."""
+        """Return the data that a picture of the touches is drawn from."""
         if plane is None:
             return {**plain(self.touches), "choices": self._choices()}
         found = compared(
@@ -297,7 +329,7 @@ class PointSource(Touches, ABC):
         return {**found, **self.SHOWN, "choices": self._choices(found["points"])}
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Return the touches as choices of a point, where they are drawn."""
+        """Return the touches as clickable choices, at the places where they are drawn."""
         places = [one["at"][:2] for one in points] or [[t.mark.x, t.mark.y] for t in self.touches]
         return [
             {"at": place, "label": str(number), "answers": {"point": number}}
@@ -306,21 +338,22 @@ class PointSource(Touches, ABC):
 
 
 def _other_advice(judgement: Judgement, again: Collection[int], count: int) -> Judgement:
-    """Return a judgement that does not ask for one touch again and again.
+    """Return a judgement that does not ask for the same touch again and again.
 
-    ``again``: numbers of the points that were touched again already. ``count``: of all points.
+    ``again``: numbers of the points that were touched again already. ``count``: number of all
+    points.
     """
     number = judgement.number
     if judgement.option != "redo" or number not in again:
         return judgement
-    leave = "remove it, and touch another one" if count > LEAST else "touch more points first"
+    leave = "remove it, and touch another one" if count > MIN_TOUCHES else "touch more points first"
     text = (
         f"Not good enough: point {number} was touched again, and still does not agree with the "
         f"others. Look whether its mark has moved, whether another mark was touched, and whether "
         f"the tool is held as at the others; or {leave}"
     )
     verdict = replace(judgement.verdict, text=text)
-    return judgement._replace(verdict=verdict, option="remove" if count > LEAST else "more")
+    return judgement._replace(verdict=verdict, option="remove" if count > MIN_TOUCHES else "more")
 
 
 def about_step(
@@ -330,11 +363,11 @@ def about_step(
     *more: Input,
     typed: bool,
 ) -> Step:
-    """Return the first step of a wizard over a source of points.
+    """Return the first step of a wizard with a source of points.
 
-    ``methods``: what can be touched, for people; ``rays`` among them. ``parameters``: defaults of
-    its inputs, WRONG_ANSWERS where one is no answer. ``more``: what is asked for behind the method.
-    ``typed``: whether the robot's pose is typed.
+    ``methods``: things that can be touched, for people; ``rays`` is one. ``parameters``: defaults
+    of its inputs; raises WRONG_ANSWERS if one is not valid. ``more``: further inputs, after the
+    method. ``typed``: whether the robot's pose is typed.
     """
     step = Step(
         id="about",
@@ -360,7 +393,7 @@ def about_step(
 
 
 def accepting(judgement: Judgement) -> str:
-    """Return the text of the option to accept what came out."""
+    """Return the text of the option to accept the calibration."""
     if judgement.verdict.level == "good":
         return "accept it"
     return "accept it all the same; each program that loads it is warned"
@@ -373,7 +406,7 @@ def review_step(
     judgement: Judgement,
     preview: Mapping[str, Any] | None = None,
 ) -> Step:
-    """Return the step that shows what came out, and asks what ``next``, with which ``number``."""
+    """Return the step that shows the result and asks what to do ``next``, with a ``number``."""
     default = judgement.chosen(options)
     return Step(
         id="review",
@@ -393,7 +426,7 @@ async def ask_to_save(
     preview: Mapping[str, Any] | None = None,
     context: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Ask to save a calibration, and its context with it; return the wizard's result."""
+    """Ask whether to save a calibration with its context; return the wizard's result."""
     file = save_to(name)
 
     async def save(_answers: Answers) -> dict[str, Any]:
@@ -413,8 +446,13 @@ async def ask_to_save(
     return {"name": name, "file": file.name, "path": str(file), **outcome.figures}
 
 
-def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
-    """Return a plane's calibration with its figures, in mm, and its notes."""
+def calibrated_plane(
+    calibration: PlaneCalibration, what: str = "the camera's x axis", along: Array | None = None
+) -> Calibrated:
+    """Return a plane's calibration with its figures, in mm, and its notes.
+
+    ``what``: what lies ``along`` (3,) some direction of the robot; None: as the camera's x axis.
+    """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
     held_out, predicted = calibration.held_out_error, None
@@ -434,9 +472,9 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         )
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
-    x, y, z = calibration.rotation[:, 0]
+    x, y, z = calibration.rotation[:, 0] if along is None else along
     notes.append(
-        f"the camera's x axis lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
+        f"{what} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
     )
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]

@@ -10,14 +10,14 @@ r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end 
     step = session.current                                    # JSON-able: what to show
     step = await session.submit(step["token"], {"name": "Ada"})
 
-How it works: the coroutine awaits nothing but :func:`ask`. What touches the world (a camera, a
-robot, a file) is an *action* of a step: an async function that runs when the step is answered, and
-whose outcome is written into the journal together with the answers. So the coroutine's state is the
-list of its answers and outcomes, and nothing else. To undo is to run the coroutine again with one
-less; to resume after a crash is to run it again with all of them. Neither repeats an action.
+How it works: the coroutine awaits only :func:`ask`. Everything that uses a camera, a robot or a
+file is an *action* of a step: an async function that runs when the step is answered, and whose
+outcome is written into the journal together with the answers. So the state of the coroutine is only
+the list of its answers and outcomes. Undo runs the coroutine again with one entry less; resuming
+after a crash runs it again with all of them. Neither repeats an action.
 
 After an error the step stays the same, whether the answer was wrong, the action failed, or the
-coroutine failed before its next step. Only a step that was taken is written.
+coroutine failed before its next step. Only an answer that the coroutine accepted is written.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ SCHEMA = "smartcam.sequence/1"
 """Name of the journal's form, in its first line."""
 
 Action = Callable[["Answers"], Awaitable[Any]]
-"""Function that is run when a step is answered: takes the answers, returns something JSON-able.
+"""Function that runs when a step is answered: takes the answers, returns JSON data.
 
-A SmartCamError or an OSError of it (TimeoutError is one) is shown and keeps the step; a
-CalibrationError of code ``WRONG_ANSWERS`` whose ``got`` maps inputs to texts is shown with them.
+If it raises a SmartCamError or an OSError (TimeoutError is one), the error is shown and the step
+stays. A CalibrationError with the code ``WRONG_ANSWERS``, whose ``got`` maps inputs to texts, is
+shown beside those inputs.
 """
 
 State = Literal["asking", "ended", "aborted"]
@@ -56,7 +57,7 @@ State = Literal["asking", "ended", "aborted"]
 
 
 class StepAnswer(dict[str, Any]):
-    """Answers of a step by name, and the outcome of its action.
+    """Answers to a step by name, and the outcome of its action.
 
     Attributes:
         outcome: what the action returned, as JSON has it (lists for tuples); None without one.
@@ -73,7 +74,7 @@ class PendingStep:
 
     Attributes:
         step: the step.
-        action: what is done with the answers; None for nothing.
+        action: function that runs with the answers; None for nothing.
     """
 
     step: Step
@@ -84,14 +85,14 @@ class PendingStep:
 
 
 def ask(step: Step, action: Action | None = None) -> PendingStep:
-    """Return an awaitable that has a step answered.
+    """Return an awaitable that shows a step and waits for its answer.
 
     Args:
-        step: what is shown and asked for.
-        action: run once, when the step is answered.
+        step: the step to show.
+        action: function that runs once, when the step is answered.
 
     Returns:
-        Awaited, it gives the :class:`StepAnswer`.
+        An awaitable of the :class:`StepAnswer`.
     """
     return PendingStep(step, action)
 
@@ -101,10 +102,11 @@ class Wizard:
     """A sequence that can be started.
 
     Attributes:
-        name: what journals call it.
-        version: number to raise when the steps change, so that no journal is read with others.
+        name: name of the wizard in journals.
+        version: number to raise when the steps change, so that no journal is resumed with other
+            steps.
         script: the coroutine function; takes the parameters of the start, returns the result.
-        steps: number of steps that it takes as a rule; 0: nobody knows.
+        steps: usual number of steps; 0 if it is not known.
     """
 
     name: str
@@ -114,14 +116,14 @@ class Wizard:
 
 
 class _ScriptRun:
-    """The coroutine, run as far as some entries of the journal lead."""
+    """The coroutine, run to the step after some entries of the journal."""
 
     def __init__(
         self, wizard: Wizard, parameters: Mapping[str, Any], entries: list[dict[str, Any]]
     ) -> None:
         self._coroutine = wizard.script(copy.deepcopy(dict(parameters)))
         self.request: PendingStep | None = None
-        self.last: Step | None = None  # the step that was answered last
+        self.last: Step | None = None  # step that was answered last
         self.result: Any = None
         self._send(None)
         for number, entry in enumerate(entries, 1):
@@ -135,7 +137,7 @@ class _ScriptRun:
             self.take(entry)
 
     def take(self, entry: Mapping[str, Any]) -> None:
-        """Give the coroutine an answer."""
+        """Pass an answer to the coroutine."""
         self._send(StepAnswer(copy.deepcopy(entry["answers"]), copy.deepcopy(entry["outcome"])))
 
     def _send(self, answer: StepAnswer | None) -> None:
@@ -182,24 +184,25 @@ class _Replay:
 
 
 class WizardSession:
-    """A sequence under way. Calls may overlap: they take turns.
+    """A running sequence. Concurrent calls wait for each other.
 
     Args:
         wizard: the wizard.
-        journal: where its steps are kept; one with entries is resumed. None: nowhere.
-        parameters: JSON-able values for the wizard's start; a journal that is resumed has its own.
+        journal: journal of its steps; one with entries is resumed. None: steps are not kept.
+        parameters: JSON values for the wizard's start; a resumed journal has its own.
 
     Attributes:
         wizard: the wizard.
         flow: name of this run, part of its tokens.
         parameters: the parameters of its start.
-        resumed: ``since, last, done, parameters``: when the journal was begun and written last,
-            its answers, and what it was begun with; None for a new one, and once it goes on.
+        resumed: ``since, last, done, parameters``: times at which the journal was begun and last
+            written, its answers, and its parameters; None for a new journal, and once the sequence
+            goes on.
 
     Raises:
-        CalibrationError: ``WRONG_JOURNAL``: another wizard's, or another version's;
-            ``BROKEN_FILE``: not as a sequence writes it; ``NOT_STORABLE``: parameters that are no
-            JSON; or what the wizard finds wrong with the parameters.
+        CalibrationError: ``WRONG_JOURNAL``: the journal belongs to another wizard or version;
+            ``BROKEN_FILE``: the journal is damaged; ``NOT_STORABLE``: the parameters are not
+            possible as JSON; or the wizard's error about the parameters.
         OSError: the journal cannot be written.
     """
 
@@ -231,9 +234,9 @@ class WizardSession:
         self._scope: asyncio.Timeout | None = None
 
     def _told_of(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Return the facts of what was answered before; None where there is nothing to go on with.
+        """Return facts about the resumed journal; None if there is nothing to resume.
 
-        Measurements may be old: what was touched may have been moved since.
+        They are shown because measurements may be old: touched things may have been moved since.
         """
         if self.state != "asking" or not self._log.entries:
             return None
@@ -283,7 +286,7 @@ class WizardSession:
 
     @property
     def result(self) -> Any:
-        """The wizard's return value; None before its end."""
+        """Return value of the wizard; None before its end."""
         return self._run.result
 
     @property
@@ -299,18 +302,18 @@ class WizardSession:
 
     @property
     def samples(self) -> list[dict[str, Any]]:
-        """The answers and outcomes that count, in order: ``step, answers, outcome, at``."""
+        """Answers and outcomes that were not undone, in order: ``step, answers, outcome, at``."""
         names = ("step", "answers", "outcome", "at")
         return [{name: copy.deepcopy(one[name]) for name in names} for one in self._log.entries]
 
     @property
     def token(self) -> str:
-        """A word that a call must bring, so that none is done twice: it changes with each entry."""
+        """Word that a call must repeat, so that none counts twice: it changes with each entry."""
         return f"{self.flow}.{len(self._all)}"
 
     @property
     def current(self) -> dict[str, Any]:
-        """The view that a front-end shows, JSON-able.
+        """View for a front-end to show, as JSON takes it.
 
         Returns:
             ``flow, wizard, token, type, number`` (of the step, from 1)``, of`` (about how many
@@ -354,7 +357,7 @@ class WizardSession:
         }
 
     def _about(self) -> int | None:
-        """Return about how many steps there are; None where nobody knows."""
+        """Return the approximate number of steps; None if it is not known."""
         if not self.wizard.steps or self.step is None:
             return None
         rest = {"save": 0, "review": 1}.get(self.step.id, 2)
@@ -378,8 +381,8 @@ class WizardSession:
         """Answer the current step.
 
         Args:
-            token: token of the step. The one before with the same answers changes nothing: so a
-                call whose answer was lost can be made again.
+            token: token of the step. The previous token with the same answers changes nothing, so
+                that a call whose reply was lost can be repeated.
             answers: answers by the names of inputs; None for none.
 
         Returns:
@@ -388,7 +391,7 @@ class WizardSession:
         Raises:
             CalibrationError: ``STALE_STEP`` or ``NOT_POSSIBLE``.
 
-        Cancellation: the action is cancelled and the step stays, unless it was taken already.
+        Cancellation: the action is cancelled and the step stays, unless it was already accepted.
         """
         given = {} if answers is None else answers
         async with self._lock:
@@ -405,7 +408,7 @@ class WizardSession:
         return {**self._defaults(step), **given} if isinstance(given, Mapping) else given
 
     async def undo(self, token: str) -> dict[str, Any]:
-        """Go back to the step before; its answers stand there as defaults.
+        """Go back to the step before, with its answers as defaults.
 
         Arguments, result and errors are those of :meth:`submit`.
 
@@ -422,9 +425,9 @@ class WizardSession:
             return self.current
 
     async def repeat(self, token: str) -> dict[str, Any]:
-        """Do the action of the step before again, with the same answers.
+        """Run the action of the step before again, with the same answers.
 
-        The new outcome takes the place of the old one. An error leaves the old one and is shown.
+        The new outcome replaces the old one. An error is shown, and the old outcome stays.
         Arguments, result and errors are those of :meth:`submit`.
 
         Cancellation: the action is cancelled and the old outcome stays.
@@ -442,15 +445,14 @@ class WizardSession:
             return self.current
 
     async def abort(self, token: str) -> dict[str, Any]:
-        """End the sequence without a result; an action under way is cut off.
+        """End the sequence without a result; a running action is cancelled.
 
-        What was done stays in the journal. Arguments, result and errors are those of
-        :meth:`submit`.
+        The journal keeps all entries. Arguments, result and errors are those of :meth:`submit`.
 
         Raises:
             OSError: the journal cannot be written; the sequence goes on.
 
-        Cancellation: the sequence goes on; an action under way is cut off all the same.
+        Cancellation: the sequence goes on, but a running action is cancelled all the same.
         """
         if self._scope is not None and token == self.token:
             self._scope.reschedule(asyncio.get_running_loop().time())
@@ -490,7 +492,7 @@ class WizardSession:
         return request
 
     def _before(self, what: str, token: str) -> _ScriptRun:
-        """Return the coroutine as it was before the last step, for what is to be done with it."""
+        """Return the coroutine as it was before the last step; ``what`` names the call."""
         self._expect(token)
         if what not in self._can():
             raise self._impossible(what)
@@ -530,7 +532,7 @@ class WizardSession:
         return _stored(entry, f"step {request.step.id!r}: its outcome")
 
     def _take(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
-        """Give a run its answer, and keep both where the coroutine took it."""
+        """Pass an answer to a run, and keep both if the coroutine accepts it."""
         try:
             run.take(entry)
             self._commit(run, entry)
@@ -554,7 +556,7 @@ class WizardSession:
 
     @contextlib.contextmanager
     def _shown(self) -> Iterator[None]:
-        """Turn errors into those of the step."""
+        """Turn exceptions into errors that the step shows."""
         self._errors = {}
         try:
             yield
@@ -566,7 +568,7 @@ class WizardSession:
 
 
 def _shown_of(step: Step) -> dict[str, Any]:
-    """Return the things that stand beside the texts of a step."""
+    """Return the values that a step shows beside its texts."""
     return {
         "verdict": None if step.verdict is None else asdict(step.verdict),
         "preview": None if step.preview is None else dict(step.preview),

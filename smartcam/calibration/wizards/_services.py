@@ -1,7 +1,7 @@
-"""The services of a calibration over one folder: start, go on, export, load, transform.
+"""Offer calibration as services on one folder: start, go on, export, load, transform.
 
-A front-end needs nothing else: it starts a wizard under a name, shows what it is told and sends
-back what it is given. Whatever it sends, no file outside of the folder is read or written.
+A front-end needs nothing else: it starts a wizard under a name, shows its steps and sends the
+answers. Whatever it sends, no file outside of the folder is read or written.
 
 Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services.
 """
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.store import Document
     from smartcam.calibration.wizards._sequence import Wizard
 
-JOURNALS = 5
-"""Journals of earlier runs that are kept for each name."""
+MAX_EARLIER_JOURNALS = 5
+"""Number of journals of earlier runs that are kept for each name."""
 
 
-MATRIX = ".yaml"
-"""Suffix of the file of a matrix alone."""
+MATRIX_SUFFIX = ".yaml"
+"""Suffix of a file that holds only a matrix."""
 
 
 class CalibrationService:
     """Calibrations in a folder, and one wizard at a time that makes or checks one.
 
     Args:
-        folder: where calibrations and journals stand.
+        folder: folder of the calibrations and journals.
         wizards: the wizards that can be started, by their names; each gets ``name`` among its
             parameters.
 
@@ -52,7 +52,7 @@ class CalibrationService:
         folder: the folder.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(
@@ -72,10 +72,10 @@ class CalibrationService:
 
     @property
     def listing(self) -> list[dict[str, Any]]:
-        """A row for each calibration, JSON-able.
+        """A row for each calibration, as JSON takes it.
 
-        ``name, kind, written_at, held_out_mm, checked_at, stale, problem``, None where something is
-        not known; a file that cannot be read has a ``problem``.
+        ``name, kind, written_at, held_out_mm, checked_at, stale, problem``, with None for values
+        that are not known; a file that cannot be read has a ``problem``.
         """
         return listing(self.folder)
 
@@ -91,7 +91,7 @@ class CalibrationService:
 
     @property
     def session(self) -> WizardSession:
-        """The sequence under way, or the one that has ended last.
+        """The running sequence, or the one that ended last.
 
         Raises:
             CalibrationError: ``NO_SEQUENCE``.
@@ -110,16 +110,16 @@ class CalibrationService:
         *,
         fresh: bool = False,
     ) -> dict[str, Any]:
-        """Start a wizard, or go on with the one of that name that was broken off.
+        """Start a wizard, or resume the interrupted one of that name.
 
         Args:
             name: name of the calibration.
             wizard: kind of the wizard; each kind has a journal of its own for a name.
-            parameters: parameters of the wizard's start; one that is resumed has its own.
-            fresh: begin anew in any case. The journal of the run before is kept beside it.
+            parameters: parameters of the wizard's start; a resumed one has its own.
+            fresh: begin anew in any case. The journal of the run before is kept as an earlier one.
 
         Returns:
-            The first step, or the one where it was broken off: :attr:`WizardSession.current`.
+            The first step, or the one at which it was interrupted: :attr:`WizardSession.current`.
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND`` (the wizard), ``IN_USE``,
@@ -160,20 +160,21 @@ class CalibrationService:
 
         Args:
             name: name of the calibration.
-            target: name of the file. With ``.json`` it is a copy, which :meth:`load` takes; with
-                ``.yaml`` the matrix, which PyYAML and ``cv2.FileStorage`` read, and
+            target: name of the file. With ``.json`` it is a copy that :meth:`load` reads; with
+                ``.yaml`` it is the matrix, which PyYAML and ``cv2.FileStorage`` read, as does
                 :func:`~smartcam.calibration.formats.read_matrix`.
-            form: instead of the matrix, the frame of its plane in this format, a key of
-                :data:`~smartcam.calibration.formats.TRANSFORMS`; the scale stands in a comment.
+            form: write the frame of its plane in this format instead of the matrix, a key of
+                :data:`~smartcam.calibration.formats.TRANSFORMS`; the scale is in a comment.
 
         Returns:
             The file's path in the folder.
 
         Raises:
-            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read. ``UNKNOWN_FORMAT``;
-                ``WRONG_KIND``: a matrix is wanted of what is no plane's; ``NOT_SIMILAR``: it has no
-                frame; see :func:`~smartcam.calibration.formats.plane_frame`;
-                ``NOT_WRITTEN``: it cannot be written.
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or the calibration cannot be read.
+                ``UNKNOWN_FORMAT``; ``WRONG_KIND``: only a plane's calibration has a matrix;
+                ``NOT_SIMILAR``: the calibration has no frame; see
+                :func:`~smartcam.calibration.formats.plane_frame`; ``NOT_WRITTEN``: the file cannot
+                be written.
         """
         from smartcam.calibration.formats import PlaneMatrix, compose
         from smartcam.calibration.formats._opencv import compose_matrix
@@ -183,11 +184,11 @@ class CalibrationService:
         document = read_document(source)
         if form is None and path.suffix == ".json":
             body = source.read_bytes()
-        elif form is None and path.suffix != MATRIX:
+        elif form is None and path.suffix != MATRIX_SUFFIX:
             raise Code.UNKNOWN_FORMAT.refusal(
                 f"{path.name}: expected the format to be named, or a file that ends in .json or "
-                f"{MATRIX}",
-                [".json", MATRIX],
+                f"{MATRIX_SUFFIX}",
+                [".json", MATRIX_SUFFIX],
                 path.suffix,
             )
         else:
@@ -208,7 +209,7 @@ class CalibrationService:
                 folder.
 
         Raises:
-            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or the calibration cannot be read.
             OSError: the file cannot be read.
         """
         path = self.folder.find(name_or_path)
@@ -220,9 +221,9 @@ class CalibrationService:
 
         Args:
             x: coordinate to the right, in the unit of the calibration.
-            y: upwards: of a sheet's calibration, whose pixels count down, -v.
-            theta: counter-clockwise, radians.
-            frame: frame that the pose must come out in; None for the calibration's.
+            y: coordinate upwards; for a calibration by a sheet, whose pixels count down, it is -v.
+            theta: angle, counter-clockwise, radians.
+            frame: frame that the result must be in; None for the calibration's.
 
         Raises:
             CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``.
@@ -243,7 +244,7 @@ class CalibrationService:
         return calibration.to_robot(Localization("", 1.0, 0, pose)).pose
 
     def close(self) -> None:
-        """Free the sequence under way; it can be resumed. Does nothing where there is none."""
+        """Free the running sequence, which can be resumed; do nothing if there is none."""
         if self._session is not None:
             self._session.close()
         self._session = self._name = None
@@ -253,11 +254,11 @@ def _put_aside(path: Path) -> None:
     if not path.exists():
         return
     try:
-        Journal(path).close()  # nobody else writes it
+        Journal(path).close()  # nobody else writes this file
     except CalibrationError as exc:
         if exc.code != Code.BROKEN_FILE:
             raise
-    keep_backup(path, JOURNALS)
+    keep_backup(path, MAX_EARLIER_JOURNALS)
     path.unlink(missing_ok=True)
 
 

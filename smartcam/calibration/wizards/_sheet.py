@@ -1,9 +1,9 @@
 """The wizard that calibrates a camera's pixels against a robot, by a picture of a printed sheet.
 
 It asks which target lies there and how long its rulers are, takes a picture and finds the target in
-it; then the robot touches corners of the target, any number, or the origin and the rays A and B. It
-knows no camera and no robot: it is given what takes a picture and, if the robot can be asked, what
-reads its pose.
+it. Then the robot touches any number of the target's corners, or the origin and the rays A and B.
+The wizard knows no camera and no robot: it is given a function that takes a picture and, if the
+robot can be asked, one that reads its pose.
 
 Source: thesis 3.2.3.2 (published) for the origin that a camera finds in its image.
 """
@@ -23,7 +23,7 @@ from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.wizards._marks import Mark
 from smartcam.calibration.wizards._pictures import (
-    MAX_PREVIEW,
+    MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
     how_to_take,
     taker,
@@ -69,31 +69,32 @@ def sheet_wizard(
     connect: Mapping[str, Any] | None = None,
     awaited: str = "",
 ) -> Wizard:
-    """Return the wizard.
+    """Return the wizard of a calibration by a sheet.
 
-    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
     first step ``method`` (corners, rays), ``camera_frame``, ``robot_frame``, ``tool``, ``unit``
-    (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of what is on the sheet,
-    which is not asked then.
+    (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of the target on the sheet,
+    which is then not asked for.
 
-    Its result: as the plane's, and ``seen`` (points of the target in the picture)``, rms_px``
-    (of them about their plane); ``predicted_mm`` is at the points that were seen.
+    Its result: that of the plane's wizard, and ``seen`` (number of the target's points in the
+    picture)``, rms_px`` (RMS distance of these points from their fit); ``predicted_mm`` is for the
+    points that were seen.
 
     Args:
-        take_picture: takes a picture; or a source of frames that is open, of which the first one
-            counts that is exposed after the button.
-        save_to: returns the file for a name.
-        read_robot: reads the robot's pose; None: it is typed.
-        suggested: the target that lies there, as the default of what is asked.
-        camera: the lens, kept with each picture; None: a homography of what is seen.
-        lens_covariance: covariance of the lens' values, as :func:`calibrate_sheet` takes it.
-        connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
-            that use the result; None: it cannot be asked.
-        awaited: description, for people, of the picture that ``take_picture`` waits for, as
-            :attr:`PictureFolder.awaited` says it; empty: ``take_picture`` takes one.
+        take_picture: function that takes a picture; or an open source of frames, of which the first
+            frame exposed after the button is used.
+        save_to: function that returns the file for a name.
+        read_robot: function that reads the robot's pose; None: it is typed.
+        suggested: default of the target that is asked for.
+        camera: the lens, stored with each picture; None: a homography is fitted instead.
+        lens_covariance: covariance of the lens' values, as for :func:`calibrate_sheet`.
+        connect: arguments of :func:`smartcam.connect` for the camera, ``url`` included, for the
+            lines that use the result; None: the camera cannot be asked.
+        awaited: description, for people, of the picture that ``take_picture`` waits for, as from
+            :attr:`PictureFolder.awaited`; empty if ``take_picture`` takes one.
 
-    Cancellation: a picture under way is given up; what looks for the target in it ends in its
-    thread, and what that finds is dropped.
+    Cancellation: a picture under way is given up; the search for the target in it ends in its
+    thread, and its result is dropped.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -113,7 +114,7 @@ def sheet_wizard(
             suggested, known=parameters.get("target"), square=parameters.get("square")
         )
         source = _SheetSource(about, read_robot, target)
-        # pixels count down, positions that are mapped count up
+        # v of pixels counts down, y of mapped positions counts up
         source.connect = None if connect is None else {**connect, "y_down": True}
         await source.ask_picture(taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
@@ -147,7 +148,7 @@ class _SheetSource(PointSource):
         lens_covariance: ArrayLike | None,
         awaited: str,
     ) -> None:
-        """Ask for the picture, and keep what was found in it."""
+        """Ask for the picture, and keep the view found in it."""
 
         async def look(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
@@ -168,7 +169,7 @@ class _SheetSource(PointSource):
         found = (await ask(step, look)).outcome
         self._view = TargetView.from_data(found["view"], target=self._target)
         self._camera = None if found["camera"] is None else CameraModel.from_data(found["camera"])
-        self._lens_covariance = found.get("lens_covariance")  # older journals have none
+        self._lens_covariance = found.get("lens_covariance")  # older journals have no entry for it
         self._svg = found["preview"]
 
     def shown(self, mark: Mark) -> dict[str, Any]:
@@ -186,7 +187,7 @@ class _SheetSource(PointSource):
         return {"notes": tuple(notes), "preview": preview}
 
     def _corners(self) -> list[dict[str, Any]]:
-        """Return the points that were seen as choices, where the picture shows them."""
+        """Return the visible points as clickable choices, at their places in the picture."""
         columns, view = shape_of(self._target)[0], self._view
         places = np.round(place_in(view.size, view.points), 1).tolist()
         return [
@@ -211,7 +212,7 @@ class _SheetSource(PointSource):
         )
 
     async def _touch_corner(self, step_id: str, title: str, suggested: int) -> Touch:
-        """Ask for the touch of a point of the target, or of another one that is named."""
+        """Ask for the touch of a point of the target, or of another point that the user names."""
         columns, rows = shape_of(self._target)
         row, column = divmod(suggested, columns)
         step = Step(
@@ -237,9 +238,10 @@ class _SheetSource(PointSource):
         return Mark(f"point {column + 1} of row {row + 1}", x, y, 0.0, number)
 
     def _next(self) -> int:
-        """Return the number of the point that is to be touched next.
+        """Return the number of the point to touch next.
 
-        First the outermost ones that the picture shows, then the farthest from all touched ones.
+        First come the outermost points that the picture shows, then those farthest from all touched
+        ones.
         """
         ids = self._view.ids
         places = self._target.points[ids, :2]
@@ -279,7 +281,10 @@ class _SheetSource(PointSource):
             lens_covariance=self._lens_covariance,
             camera_frame=frame,
         )
-        _, figures, lines, _ = calibrated_plane(plane)
+        middle = self._view.points.mean(axis=0)
+        ends = found.transform(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
+        right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        _, figures, lines, _ = calibrated_plane(plane, "what is to the right in the picture", right)
         seen, predicted = len(self._view.ids), None
         notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:
@@ -305,13 +310,13 @@ class _SheetSource(PointSource):
 
 
 def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
-    """Return the view found in a picture, the lens and an SVG, if it is small, JSON-able."""
+    """Return a picture's view, the lens, and an SVG if it is small, as JSON takes them."""
     view = find_target(image, target)
     preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)
     return {
         "view": view.to_data(),
         "camera": None if lens is None else lens.to_data(),
-        "preview": preview if len(preview) <= MAX_PREVIEW else "",
+        "preview": preview if len(preview) <= MAX_PREVIEW_BYTES else "",
     }
 
 
@@ -320,7 +325,7 @@ def _answers(column: int, row: int) -> Answers:
 
 
 def shape_of(target: Target) -> tuple[int, int]:
-    """Return the number of points of a target's row, and the number of rows."""
+    """Return the number of points in a target's row, and the number of rows."""
     if isinstance(target, Charuco):
         return target.columns - 1, target.rows - 1
     return target.columns, target.rows

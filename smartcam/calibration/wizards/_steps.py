@@ -1,7 +1,7 @@
-"""Steps of a sequence: what is shown, and which answers are wanted.
+"""Define the steps of a sequence: the texts to show, and the answers to ask for.
 
-A step is data. Its inputs tell their JSON Schema, and check an answer by the same rules, so a
-front-end needs to know nothing about any wizard.
+A step is data. Its inputs have a JSON Schema, and check answers by the same rules, so a front-end
+needs to know nothing about any wizard.
 
 Source: thesis 2.2.1 and Figure 2.9 (published) for a step's parts and for the three lists of
 numbers, texts and options, which :func:`as_lists` and :func:`from_lists` derive.
@@ -28,16 +28,16 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Answers = dict[str, Any]
 """Answers by the names of their inputs."""
 
-_SHOWN = 40
-"""Characters of a wrong answer that its error shows."""
+_MAX_SHOWN_LENGTH = 40
+"""A message shows at most this many characters of a wrong answer."""
 
 _YES_NO = {"no": False, "yes": True}
-"""A flag in the thesis' lists."""
+"""Values of a flag by their words in the thesis' lists."""
 
 
 def _shown(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN_LENGTH else f"{text[:_MAX_SHOWN_LENGTH]}..."
 
 
 def _misfit(value: object, expected: str) -> ValueError:
@@ -50,8 +50,8 @@ class Input(ABC):
 
     Attributes:
         name: name of the answer.
-        label: what people read.
-        default: what stands there at first; None: nothing.
+        label: name for people.
+        default: value that is filled in at first; None: nothing.
     """
 
     name: str
@@ -61,12 +61,12 @@ class Input(ABC):
     def schema(self) -> dict[str, Any]:
         """Return the input's JSON Schema.
 
-        A unit stands in ``x-unit``, options as a ``const`` and a ``title`` each.
+        A unit is in ``x-unit``; each option is a ``const`` and a ``title``.
         """
         return {"title": self.label, **self._schema()}
 
     def checked(self, value: object) -> Any:
-        """Return an answer as it is used; ValueError: it is not valid, and what was expected."""
+        """Return an answer in its internal form; raise ValueError with what was expected."""
         return self._checked(value)
 
     @abstractmethod
@@ -78,12 +78,12 @@ class Input(ABC):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Number(Input):
-    """A number is asked for.
+    """Input for a number.
 
     Attributes:
-        unit: shown behind it; the answer comes in this unit.
-        minimum: smallest one taken.
-        maximum: largest one taken.
+        unit: unit of the answer, shown after the number.
+        minimum: smallest valid number.
+        maximum: largest valid number.
         integer: whether the number must be whole.
         optional: whether the answer may be left out (null).
     """
@@ -110,7 +110,7 @@ class Number(Input):
         whole = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise _misfit(value, whole)
-        if not self.minimum <= value <= self.maximum:  # NaN is in no range
+        if not self.minimum <= value <= self.maximum:  # NaN is outside of every range
             raise _misfit(value, f"{whole} from {self.minimum:g} to {self.maximum:g}")
         if not self.integer:
             return float(value)
@@ -121,13 +121,13 @@ class Number(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Text(Input):
-    """A text of one line is asked for.
+    """Input for a text of one line.
 
     Attributes:
-        pattern: a regular expression that all of it must match, in what Python and ECMAScript have
-            in common.
-        expected: what the pattern means, for people.
-        max_length: characters at most.
+        pattern: regular expression that the whole text must match, with only such syntax as Python
+            and ECMAScript share.
+        expected: meaning of the pattern, for people.
+        max_length: largest number of characters.
     """
 
     default: str | None = None
@@ -136,7 +136,7 @@ class Text(Input):
     max_length: int = 200
 
     def _schema(self) -> dict[str, Any]:
-        # not $, which in Python lets a line's end pass
+        # not $, which in Python allows a line feed after it
         pattern = rf"^(?:{self.pattern})(?![\s\S])"
         return {"type": "string", "pattern": pattern, "maxLength": self.max_length}
 
@@ -152,10 +152,10 @@ class Text(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Input):
-    """One of some options is asked for; without a default the first one is chosen at first.
+    """Input for one of some options; without a default the first one is preselected.
 
     Attributes:
-        options: what people read, by the answer that it stands for.
+        options: texts for people, by the answer that each stands for.
     """
 
     default: str | None = None
@@ -173,7 +173,7 @@ class Option(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flag(Input):
-    """Yes or no is asked for."""
+    """Input for yes or no."""
 
     default: bool = False
 
@@ -187,7 +187,7 @@ class Flag(Input):
 
 
 def pick(name: str, label: str, count: int, default: int) -> Number:
-    """Return an input for one of the numbers from 1 to ``count``."""
+    """Return an input for a number from 1 to ``count``."""
     return Number(name=name, label=label, integer=True, minimum=1, maximum=count, default=default)
 
 
@@ -197,16 +197,16 @@ class Step:
 
     Attributes:
         id: name of the step; the same one may come again.
-        title: one line.
+        title: heading of one line.
         description: what to do now.
-        button: what stands on the button that goes on.
-        inputs: what is asked for; none: only that the button is pressed.
-        notes: what came out so far, a line each; a warning begins with its code and a colon.
-        verdict: what came out is worth; None where nothing did.
-        preview: JSON-able, for a picture; None for none. ``choices`` in it are places that may be
-            clicked: ``at`` (in the picture), ``label``, and the ``answers`` that it stands for.
-        waiting: what is waited for while its action is under way.
-        timeout: seconds that the action behind the button may take.
+        button: text on the button that goes on.
+        inputs: inputs to fill in; without any, only the button has to be pressed.
+        notes: results so far, a line each; a warning begins with its code and a colon.
+        verdict: verdict on the result; None without a result.
+        preview: JSON data for a picture; None for no picture. ``choices`` in it are places that may
+            be clicked: ``at`` (in the picture), ``label``, and the ``answers`` that a click gives.
+        waiting: text that says what the step waits for while its action runs.
+        timeout: seconds that the action of the button may take.
     """
 
     id: str
@@ -231,7 +231,7 @@ class Step:
         }
 
     def defaults(self) -> Answers:
-        """Return the default answers by their inputs' names; inputs without one are left out."""
+        """Return the default answers by their inputs' names; inputs may have none."""
         values: Answers = {}
         for one in self.inputs:
             value = one.default
@@ -242,19 +242,19 @@ class Step:
         return values
 
     def with_defaults(self, parameters: Mapping[str, Any]) -> Step:
-        """Return the step with the parameters of its inputs' names as their defaults.
+        """Return the step with parameters as the defaults of the inputs of the same names.
 
         Raises:
-            CalibrationError: WRONG_ANSWERS: a parameter is no answer.
+            CalibrationError: WRONG_ANSWERS: a parameter is no valid answer.
         """
         return replace(self, inputs=tuple(_with_default(one, parameters) for one in self.inputs))
 
     def checked(self, answers: object) -> Answers:
-        """Return answers as they are used; a default stands for one that is missing.
+        """Return answers in their internal form, with defaults for missing ones.
 
         Raises:
-            CalibrationError: ``WRONG_ANSWERS``; ``got`` has a text for each wrong one, under
-                ``base`` what belongs to no input.
+            CalibrationError: ``WRONG_ANSWERS``; ``got`` has a text for each wrong answer, and under
+                ``base`` one for those that belong to no input.
         """
         if not isinstance(answers, Mapping):
             raise _wrong({"base": f"{_shown(answers)}: expected answers by the names of inputs"})
@@ -302,8 +302,8 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
     Returns:
         ``descriptions_for_needed_values``, ``default_needed_values`` and the same for ``strings``
         and ``options``. An option is one text, ``"DEFAULT OPT1 OPT2 ..."``; a flag is an option of
-        ``no`` and ``yes``; a number without a default has 0.0, which of one that may be missing and
-        cannot be 0 means none.
+        ``no`` and ``yes``; a number without a default has 0.0, which stands for no number if it may
+        be missing and cannot be 0.
 
     Source: thesis Figure 2.9 (published).
     """
@@ -337,7 +337,7 @@ def from_lists(
     texts: Sequence[str] = (),
     options: Sequence[str] = (),
 ) -> Answers:
-    """Return the answers that came as the thesis' three lists, to be checked by the step.
+    """Return the answers in the thesis' three lists, which the step then checks.
 
     Raises:
         CalibrationError: ``WRONG_ANSWERS``, a list is too short or too long.

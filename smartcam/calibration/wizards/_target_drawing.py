@@ -1,6 +1,6 @@
-"""A picture of a step that looks at a target, as SVG: what was seen, what is still missing.
+"""Draw, as SVG, the picture of a step that looks at a target: points found and areas missing.
 
-The camera's picture lies under it, grey and made smaller: a page loads it at every step.
+The camera's picture is its background, grey and reduced, since a page loads it at every step.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
     from smartcam.calibration._views import TargetView
     from smartcam.geometry._inside import Array
 
-MAX_SIDE: Final = 640
-"""Width and height at most of the camera's picture in the preview, pixels."""
+MAX_SIDE_PX: Final = 640
+"""Largest width and height of the camera's picture in the preview, pixels."""
 
 CELLS: Final = (6, 8)
-"""Rows and columns of an image's cells, which the views of a calibration are to cover."""
+"""Rows and columns of an image's cells, which the views of a calibration should cover."""
 
 WIDTH: Final = 900.0
 BORDER, HEAD, FOOT = 20.0, 40.0, 60.0
-"""Pixels of the preview: its picture's width; beside, above and below it."""
+"""Pixels of the preview beside, above and below its picture."""
 
-LONGEST: Final = 0.05
-"""Length of the longest residual as it is drawn, about; parts of the picture's width."""
+LONGEST_RESIDUAL_SHARE: Final = 0.05
+"""Approximate length at which the longest residual is drawn, as a part of the picture's width."""
 
 END: Final = "</svg>"
 
@@ -56,7 +56,7 @@ def cell_counts(views: Sequence[TargetView]) -> NDArray[np.intp]:
     """Count the points of one camera's views in each cell of its image, ``CELLS``."""
     counts = np.zeros(CELLS, dtype=np.intp)
     for view in views:
-        # a pixel's middle is a whole number: the image begins half a pixel before the first
+        # the centre of a pixel is a whole number, so the image begins half a pixel before the first
         part = (view.points + 0.5) / view.size
         column, row = np.floor(part * CELLS[::-1]).astype(np.intp).T
         inside = (row >= 0) & (row < CELLS[0]) & (column >= 0) & (column < CELLS[1])
@@ -74,21 +74,21 @@ def draw(
     suggested: ArrayLike | None = None,
     title: str = "",
 ) -> str:
-    """Return a preview.
+    """Draw a preview.
 
-    Blue circles are the points that were found, the filled one is the target's origin. Green cells
-    are those in which some view has points. From each point a red line goes towards where the
-    calibration expects it, larger by a factor that the preview names. Thick lines are the target's
-    x (red), y (green) and z (blue); an orange outline is where the next view would tell most.
+    Blue circles are the points that were found; the filled one is the target's origin. Green cells
+    are those in which some view has points. From each point a red line points to where the
+    calibration predicts it, enlarged by a factor that the preview names. Thick lines are the
+    target's x (red), y (green) and z (blue); an orange outline shows the most useful next view.
 
-    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red. ``view``: what was found
-    in it; None: nothing. ``earlier``: the views before. ``predicted`` (N, 2): where a calibration
-    has the points of ``view``, pixels; left out without one. ``axes`` (4, 2): the target's origin
-    and the ends of its x, y and z, pixels. ``suggested`` (M, 2): outline of the target in the view
-    that is wanted next, pixels. ``title``: a line on top.
+    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red. ``view``: view found in
+    it; None: nothing was found. ``earlier``: the views before. ``predicted`` (N, 2): places where a
+    calibration predicts the points of ``view``, pixels; None without a calibration. ``axes`` (4,
+    2): the target's origin and the ends of its x, y and z, pixels. ``suggested`` (M, 2): outline of
+    the target in the suggested next view, pixels. ``title``: a line on top.
 
-    The SVG document has a size of its own and no parts elsewhere; lines end with a line feed.
-    Raises SHAPE: no image; a view of another size; arrays of other shapes; NOT_FINITE.
+    The SVG document has a fixed size and loads no other files; lines end with a line feed. Raises
+    SHAPE if there is no image, the view has another size, or an array another shape; NOT_FINITE.
     """
     grey = grey_image(image)
     if view is not None and view.size != grey.size:
@@ -127,7 +127,7 @@ def draw(
 def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
     """Return a picture with the target's points and the directions of the rays A and B, as SVG.
 
-    ``plane``: from the view's pixels to the sheet. Raises as :func:`draw`.
+    ``plane``: map from the view's pixels to the sheet. Raises the errors of :func:`draw`.
     """
     reach = view.target.points.max(axis=0)
     rays = plane.in_image([[0.0, 0.0], [reach[0], 0.0], [0.0, reach[1]]])
@@ -177,7 +177,7 @@ def _shaped(given: ArrayLike, count: int) -> Array:
 def _png(image: NDArray[np.uint8]) -> str:
     cv2 = load("cv2")
     height, width = image.shape
-    factor = MAX_SIDE / max(width, height)
+    factor = MAX_SIDE_PX / max(width, height)
     if factor < 1:
         size = (max(round(width * factor), 1), max(round(height * factor), 1))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -186,14 +186,14 @@ def _png(image: NDArray[np.uint8]) -> str:
 
 
 class _Canvas:
-    """The place of an image's pixels in the preview."""
+    """The map from an image's pixels to the preview."""
 
     def __init__(self, width: int, height: int) -> None:
         self.zoom = WIDTH / width
         self.height = height * self.zoom
 
     def place(self, pixels: Array) -> Array:
-        """Return the preview's coordinates of pixels (..., 2)."""
+        """Map pixels (..., 2) to the preview's coordinates."""
         places: Array = (pixels + 0.5) * self.zoom + [BORDER, HEAD]
         return places
 
@@ -209,7 +209,7 @@ class _Canvas:
             yield circle(place, 5, "point" if number else "point origin")
 
     def residuals(self, view: TargetView, predicted: Array) -> tuple[list[str], str]:
-        """Return the lines, and what the legend says of them."""
+        """Return the lines, and their text in the legend."""
         apart = predicted - view.points
         lengths = np.linalg.norm(apart, axis=1)
         larger = _enlargement(float(lengths.max(initial=0.0)) * self.zoom)
@@ -232,7 +232,7 @@ class _Canvas:
 
 
 def _enlargement(longest: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, by which the longest residual becomes visible."""
+    """Return 1, 2 or 5 times a power of ten, a factor that makes the longest residual visible."""
     if not longest > 1e-6:
         return 1.0
-    return round_down(LONGEST * WIDTH / longest)
+    return round_down(LONGEST_RESIDUAL_SHARE * WIDTH / longest)

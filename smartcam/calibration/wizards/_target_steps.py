@@ -1,4 +1,4 @@
-"""Steps that ask which target is on a sheet, and how long its rulers came out."""
+"""Ask which target is on a sheet, and how long its printed rulers are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration._printing.sheets import scaled
 from smartcam.calibration._targets import target_from_data, target_to_data
 from smartcam.calibration.wizards._sequence import ask
@@ -52,29 +52,29 @@ _INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
         _length("origin_diameter", "Diameter of the dot at the origin, if larger", optional=True),
     ),
 }
-"""Inputs for each kind of target; names are its attributes', lengths in mm."""
+"""Inputs for each kind of target; names are those of its attributes, lengths are in mm."""
 
 
 def ruler(name: str, along: str = "") -> Number:
     """Return an input for the length of a printed ruler, mm."""
     return Number(
         name=name,
-        label=f"Length of the printed ruler{along}, which should be {RULER:g} mm",
+        label=f"Length of the printed ruler{along}, which should be {RULER_MM:g} mm",
         unit="mm",
-        default=RULER,
-        minimum=0.5 * RULER,
-        maximum=2.0 * RULER,
+        default=RULER_MM,
+        minimum=0.5 * RULER_MM,
+        maximum=2.0 * RULER_MM,
     )
 
 
 async def ask_target(
     suggested: Target | None = None, *, known: object = None, square: float | None = None
 ) -> Target:
-    """Ask what is on the sheet, and how large it was printed: lengths are those on paper.
+    """Ask for the target on the sheet and its printed size: lengths are those on paper.
 
-    ``suggested``: the default of what is asked. ``known``: a description of the target, which is
-    not asked then; None: there is none. ``square``: the default of a square's side, mm.
-    Refused as a step shows it: what is no description of a target, or rulers that
+    ``suggested``: default of the target. ``known``: a description of the target, which is then not
+    asked for; None: there is none. ``square``: default of a square's side, mm. A wrong description
+    of a target is refused as the step shows it, and so are rulers that
     :func:`~smartcam.calibration.scaled` refuses.
     """
     if known is None:
@@ -84,7 +84,7 @@ async def ask_target(
     step = Step(
         id="rulers",
         title="Was the sheet printed true to size?",
-        description=f"Printers scale. Measure both rulers; leave {RULER:g} mm where the lengths "
+        description=f"Printers scale. Measure both rulers; leave {RULER_MM:g} mm where the lengths "
         "that were given are already those of the paper.",
         inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
     )

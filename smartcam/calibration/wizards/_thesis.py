@@ -1,9 +1,9 @@
-"""A camera's calibrations as the thesis' five services have them: one wizard, without tokens.
+"""Offer a camera's calibrations as the thesis' five services: one wizard, without tokens.
 
-The steps are those of the page and of the terminal. In front of them stands one that asks what no
-field of the request says: the name, where the camera is, where pictures come from. A request names
-no step, so one call answers at a time, and a sequence belongs to whoever has started it until it
-ends, is aborted or is left alone.
+The steps are those of the page and of the terminal, after a first step that asks for things without
+a field in the request: the name, the camera's place, the source of pictures. A request does not
+name its step, so only one call is answered at a time, and a sequence belongs to the client that
+started it until it ends, is aborted or is abandoned.
 
 Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services and their fields.
 """
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
 
-from smartcam.calibration._files.directory import MAX_NAME, NAME, Folder
+from smartcam.calibration._files.directory import MAX_NAME_LENGTH, NAME, Folder
 from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
 from smartcam.calibration.wizards._plane import plane_wizard
 from smartcam.calibration.wizards._services import CalibrationService
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 SMARTCAMERA: Final = "SMARTCAMERA"
-"""Text in place of a topic that means the smart camera itself."""
+"""Text that stands in place of a topic for the smart camera itself."""
 
-ABANDONED: Final = 1800.0
-"""Seconds without a call after which a calibration under way is given up; its journal stays."""
+ABANDONED_AFTER: Final = 1800.0
+"""Seconds without a call after which a running calibration is given up; its journal stays."""
 
 FIXED: Final[Mapping[str, str]] = {
     "True": "fixed in the cell, beside the robot",
     "False": "on the flange of the robot",
 }
-"""Places of a camera, for people, by what a request says of it."""
+"""Places of a camera, for people, by their words in a request."""
 
 
 _ABORTED: Final = Step(
@@ -56,13 +56,13 @@ _ABORTED: Final = Step(
     description="There is no calibration. What was measured stays in the journal.",
     button="",
 )
-"""Step that tells the end of a calibration that was aborted."""
+"""Step that reports that a calibration was aborted."""
 
 T = TypeVar("T")
 
 
 class CalibrationCamera(Protocol):
-    """The smart camera that is calibrated, as the face of a call reaches it.
+    """The smart camera that is calibrated, as the front-end of a call reaches it.
 
     Attributes:
         name: name of the camera.
@@ -80,33 +80,33 @@ class CalibrationCamera(Protocol):
     def unit(self) -> str: ...
 
     async def localize(self) -> list[Localization]:
-        """Trigger; return the localizations in the camera's own frame."""
+        """Trigger, and return the localizations in the camera's own frame."""
         ...
 
     async def take_picture(self) -> Any:
-        """Take a picture; return its grey levels."""
+        """Take a picture, and return its grey levels."""
         ...
 
 
 class RobotGraph(Protocol):
-    """The part of ROS beside the camera: pictures on topics, and the frames of TF."""
+    """The part of ROS other than the camera: pictures on topics, and the frames of TF."""
 
     def check_topic(self, topic: str) -> None:
-        """Raise ConfigurationError where there can be no such topic."""
+        """Raise ConfigurationError if a topic cannot have this name."""
 
     def listen(self) -> None:
-        """Hear transforms from now on."""
+        """Receive transforms from now on."""
 
     async def picture(self, topic: str) -> tuple[Any, float | None]:
-        """Return the grey levels of a picture that is taken from now on, and its time, UTC."""
+        """Return the grey levels of a picture that is taken after the call, and its time, UTC."""
         ...
 
     async def lens(self, topic: str) -> CameraModel | None:
-        """Return the lens of the camera whose pictures are on a topic; None where nobody says."""
+        """Return the lens of the camera whose pictures are on a topic; None if unknown."""
         ...
 
     async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
-        """Return the pose of a frame in another one, at a time or, for None, now."""
+        """Return the pose of a frame in another one, at a time, or now for None."""
         ...
 
     async def root(self, frame: str) -> str:
@@ -115,7 +115,7 @@ class RobotGraph(Protocol):
 
 
 class CalibrationStart(NamedTuple):
-    """A request of StartCalibration; the names are the thesis'."""
+    """A request of StartCalibration, with the thesis' names."""
 
     topic_image1: str = ""
     topic_image2: str = ""
@@ -126,13 +126,13 @@ class CalibrationStart(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics with pictures that are named, the preferred one first."""
+        """Topics with pictures that the request names, the preferred one first."""
         said = (self.topic_image2, self.topic_image1)
         return [one for one in said if one not in {"", SMARTCAMERA}]
 
     @property
     def source(self) -> str:
-        """The source of pictures: a topic, SMARTCAMERA, or an empty text for neither."""
+        """Source of pictures: a topic, SMARTCAMERA, or an empty text for neither."""
         if self.topic_image2 == SMARTCAMERA and self.fixed_camera == "True":
             return SMARTCAMERA
         smart = SMARTCAMERA if SMARTCAMERA in {self.topic_image1, self.topic_image2} else ""
@@ -140,7 +140,7 @@ class CalibrationStart(NamedTuple):
 
 
 class StepRequest(NamedTuple):
-    """A request of PerformCurrentAndGetNextStep; the names are the thesis'."""
+    """A request of PerformCurrentAndGetNextStep, with the thesis' names."""
 
     repeat_last_step: bool = False
     abort: bool = False
@@ -157,7 +157,7 @@ class PixelPoseRequest(NamedTuple):
         y: coordinate upwards, in the same unit.
         theta: angle, counter-clockwise, radians.
         frame: frame that the pose was seen in; empty for the calibration's.
-        reference: frame that the pose is wanted in; empty for the calibration's.
+        reference: frame that the result must be in; empty for the calibration's.
         seq: number of the call.
         utc: time at which the pose was seen; None for now.
     """
@@ -173,15 +173,15 @@ class PixelPoseRequest(NamedTuple):
 
 @dataclass(eq=False)
 class _Sequence:
-    """A calibration under way: the step in front, then the wizard.
+    """A running calibration: the first step, then the wizard.
 
     Attributes:
-        asked: request that began the sequence, with the base that was found.
-        first: step in front of the wizard.
-        service: the running wizard; None before it was chosen.
-        shown: whether the current step was told to anybody.
+        asked: request that began the sequence, with the robot's base that was found.
+        first: step before the wizard.
+        service: service that runs the wizard; None before it was chosen.
+        shown: whether the current step was returned to a client.
         aborted: whether a call has ended it.
-        pictured: time of the last picture, UTC; None where that is not known.
+        pictured: time of the last picture, UTC; None if it is not known.
     """
 
     asked: CalibrationStart
@@ -198,7 +198,7 @@ class _Sequence:
 
     @property
     def step(self) -> Step | None:
-        """The current step, with the answers that were undone; None at the end."""
+        """Current step, with the answers that were undone; None at the end."""
         session = self.session
         if session is None:
             return self.first
@@ -213,22 +213,22 @@ class _Sequence:
 
 
 class ThesisCalibration:
-    """The calibrations of one camera, and the one that is under way; for all faces together.
+    """The calibrations of one camera, and the running one, for all front-ends together.
 
     Args:
-        folder: folder that calibrations and journals are in; nothing is written beside it.
+        folder: folder of calibrations and journals; nothing is written outside of it.
         name: name of the camera.
-        abandoned: seconds without a call after which a calibration under way is given up.
+        abandoned: seconds without a call after which a running calibration is given up.
 
     Attributes:
-        graph: topics and frames of ROS; None where the camera is not seen in ROS.
+        graph: topics and frames of ROS; None if the camera is not in ROS.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED
+        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED_AFTER
     ) -> None:
         self._files = CalibrationService(Folder(folder))
         self._name, self._abandoned = name, abandoned
@@ -244,12 +244,12 @@ class ThesisCalibration:
     # ------------------------------------------------------------------ StartCalibration
 
     async def start(self, asked: CalibrationStart) -> None:
-        """Begin a calibration; its first step is told by :meth:`perform`.
+        """Begin a calibration; :meth:`perform` returns its first step.
 
         Raises:
-            CalibrationError: ``IN_USE``: one is under way; ``NOT_POSSIBLE``: topics or frames are
-                named, and there is no ROS; ``WRONG_FRAME``: TF does not know the frame.
-            ConfigurationError: there can be no such topic.
+            CalibrationError: ``IN_USE``: one is running; ``NOT_POSSIBLE``: topics or frames are
+                named, but there is no ROS; ``WRONG_FRAME``: TF does not know the frame.
+            ConfigurationError: a topic cannot have this name.
         """
         self._check_free()
         graph = self.graph
@@ -273,7 +273,7 @@ class ThesisCalibration:
             )
 
     def _check_graph(self, topics: Sequence[str], frame: str) -> None:
-        """Refuse topics and frames of ROS where there is none, and names that no topic has."""
+        """Refuse topics and frames without ROS, and names that no topic can have."""
         named = [*topics, *((frame,) if frame else ())]
         if named and self.graph is None:
             raise Code.NOT_POSSIBLE.refusal(
@@ -288,16 +288,16 @@ class ThesisCalibration:
     # ------------------------------------------------------- PerformCurrentAndGetNextStep
 
     async def perform(self, asked: StepRequest, camera: CalibrationCamera) -> dict[str, Any]:
-        """Answer the step that was told last; return the fields of the answer, the next step's.
+        """Answer the step that was returned last; return the fields of the next step.
 
         Args:
-            asked: the request.
+            asked: request with the answers.
             camera: the camera, as it is reached for this call.
 
         Raises:
-            CalibrationError: ``NO_SEQUENCE``; ``NOT_POSSIBLE``: another call is under way.
+            CalibrationError: ``NO_SEQUENCE``; ``NOT_POSSIBLE``: another call is running.
 
-        Cancellation: an action under way is cancelled, and the step stays.
+        Cancellation: a running action is cancelled, and the step stays.
         """
         sequence = self._sequence
         if sequence is None:
@@ -316,7 +316,7 @@ class ThesisCalibration:
 
     @contextlib.contextmanager
     def _alone(self, what: str) -> Iterator[None]:
-        """Refuse a call while another one is under way, whose answer nobody has seen."""
+        """Refuse a call while another one is running, whose reply nobody has seen yet."""
         if self._busy:
             raise Code.NOT_POSSIBLE.refusal(
                 f"{self._name}: another call is under way; {what} was not done. Expected its "
@@ -331,11 +331,11 @@ class ThesisCalibration:
             self._touch()
 
     async def _performed(self, sequence: _Sequence, asked: StepRequest) -> Mapping[str, str]:
-        """Do what a request says; return its errors by the inputs' names."""
+        """Carry out a request; return its errors by the inputs' names."""
         first, sequence.shown = not sequence.shown, True
         try:
             if self.graph is not None and sequence.asked.tf_frame_robot_tcp:
-                self.graph.listen()  # so that it is known where the robot was meanwhile
+                self.graph.listen()  # so that the robot's pose at the picture is known
             if asked.repeat_last_step:
                 return await self._back(sequence)
             if first:
@@ -386,7 +386,7 @@ class ThesisCalibration:
             CalibrationError: as :meth:`CalibrationService.start`.
         """
         asked, name = sequence.asked, answers["name"]
-        self._files.folder.calibration(name)  # told before anything is measured
+        self._files.folder.calibration(name)  # refused before anything is measured
         fixed = asked.fixed_camera or answers["fixed_camera"]
         source = asked._replace(fixed_camera=fixed).source or answers["pictures"]
         if source != SMARTCAMERA:
@@ -457,7 +457,7 @@ class ThesisCalibration:
     # ------------------------------------------------------------------ its end
 
     def _told(self, sequence: _Sequence, errors: Mapping[str, str]) -> dict[str, Any]:
-        """Return the fields that tell the current step, or the end."""
+        """Return the fields of a reply with the current step, or with the end."""
         error = "; ".join(
             text if name == "base" else f"{name}: {text}" for name, text in errors.items()
         )
@@ -467,7 +467,8 @@ class ThesisCalibration:
             step = _last_step(name, view)
             if session.state == "ended":
                 self._end(sequence, f"{name!r} was finished")
-                with contextlib.suppress(CalibrationError, OSError):  # one that maps no pixels
+                # a calibration that maps no pixels
+                with contextlib.suppress(CalibrationError, OSError):
                     self.load(name)
         return _fields(step or sequence.first, error)
 
@@ -477,7 +478,7 @@ class ThesisCalibration:
         self._touch()
 
     def _touch(self) -> None:
-        """Begin the time anew after which a calibration under way is given up."""
+        """Restart the time after which a running calibration is given up."""
         loop = asyncio.get_running_loop()
         self._called = loop.time()
         if self._timer is not None:
@@ -492,7 +493,7 @@ class ThesisCalibration:
             self._end(self._sequence, text + "the same is started under the same name")
 
     def close(self) -> None:
-        """End what is under way; it can be resumed. Idempotent."""
+        """End the running calibration, which can be resumed. Idempotent."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
@@ -511,7 +512,7 @@ class ThesisCalibration:
         self._files.export(name, target)
 
     def load(self, name_or_path: str) -> None:
-        """Load a calibration, which :meth:`transform` uses from then on.
+        """Load a calibration for :meth:`transform` to use from now on.
 
         Raises:
             CalibrationError, OSError: as :meth:`CalibrationService.load`.
@@ -519,7 +520,7 @@ class ThesisCalibration:
         self._loaded = self._files.load(name_or_path)
 
     async def transform(self, seen: PixelPoseRequest) -> Pose:
-        """Return the robot's pose for what a camera sees, in the frame that is wanted.
+        """Return the robot's pose for a pose that a camera saw, in the wanted frame.
 
         Raises:
             CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``, ``BAD_TIME``.
@@ -545,7 +546,7 @@ class ThesisCalibration:
         return pose._replace(header=Header(seen.seq, at, wanted))
 
     async def _lead(self, robot: str, wanted: str, utc: float | None) -> Transform:
-        """Return the pose of the robot's frame in the frame that is wanted."""
+        """Return the pose of the robot's frame in the wanted frame."""
         if self.graph is None:
             raise Code.WRONG_FRAME.unexpected(
                 f"tf_frame_reference: expected {robot!r}, since this camera is not seen in ROS, "
@@ -560,10 +561,10 @@ class CalibrationDesks:
     """The calibrations of an agent's cameras, in one folder.
 
     Args:
-        folder: folder that calibrations and journals are in; made if need be.
+        folder: folder of calibrations and journals, which is created if needed.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -578,13 +579,13 @@ class CalibrationDesks:
         return desk
 
     def close(self) -> None:
-        """End what is under way; it can be resumed."""
+        """End running calibrations, which can be resumed."""
         for desk in self._desks.values():
             desk.close()
 
 
 def _there(value: T | None) -> T:
-    """Return a value that the checks before have made sure of."""
+    """Return a value that earlier checks have made sure is not None."""
     if value is None:
         raise Code.NOT_POSSIBLE.refusal(
             "the camera is not seen in ROS any more; expected it to come back, or abort"
@@ -593,15 +594,15 @@ def _there(value: T | None) -> T:
 
 
 def _first_step(asked: CalibrationStart, camera: str) -> Step:
-    """Return the step that asks for what a request does not say."""
+    """Return the step that asks for the facts that a request lacks."""
     inputs: list[Input] = [
         Text(
             name="name",
             label="Name of the calibration",
-            default=re.sub("[^A-Za-z0-9]+", "-", camera)[:MAX_NAME].strip("-") or "camera",
+            default=re.sub("[^A-Za-z0-9]+", "-", camera)[:MAX_NAME_LENGTH].strip("-") or "camera",
             pattern=NAME,
             expected="letters, digits, '-' and '_'",
-            max_length=MAX_NAME,
+            max_length=MAX_NAME_LENGTH,
         )
     ]
     if not asked.source:
@@ -614,7 +615,7 @@ def _first_step(asked: CalibrationStart, camera: str) -> Step:
 
 
 def _parameters(asked: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
-    """Return the defaults of a wizard's steps that a request says."""
+    """Return the defaults of a wizard's steps that a request gives."""
     found: dict[str, Any] = {"setup": "eye-in-hand"}
     if camera is not None:
         found["camera_unit"] = camera.unit
@@ -628,7 +629,7 @@ def _parameters(asked: CalibrationStart, camera: CalibrationCamera | None) -> di
 def _start(
     service: CalibrationService, name: str, wizard: str, parameters: Mapping[str, Any]
 ) -> None:
-    """Start a wizard, or go on with one that was started in the same way and broken off."""
+    """Start a wizard, or resume an interrupted one that was started in the same way."""
     try:
         service.start(name, wizard, parameters)
         same = service.session.parameters["asked"] == parameters["asked"]
@@ -641,14 +642,14 @@ def _start(
 
 
 def _unasked(asked: StepRequest) -> Mapping[str, str]:
-    """Return the error of answers to a step that was told to nobody."""
+    """Return the error for answers to a step that was never returned to a client."""
     if asked.value_inputs or asked.text_inputs or asked.option_inputs:
         return {"base": "this step was not shown before; expected no inputs in the first call"}
     return {}
 
 
 def _last_step(name: str, view: Mapping[str, Any]) -> Step:
-    """Return a step that tells what came out."""
+    """Return a step that reports the result."""
     verdict, file = view["verdict"], view["result"]["file"]
     said = "" if verdict is None else f"{verdict['text']} "
     text = f"{said}It is in the file {file}, and loaded where it maps pixels."
@@ -656,7 +657,7 @@ def _last_step(name: str, view: Mapping[str, Any]) -> Step:
 
 
 def _fields(step: Step, error: str) -> dict[str, Any]:
-    """Return the fields that tell a step."""
+    """Return the fields of a reply with a step."""
     texts = [step.description]
     for one in step.inputs:
         if isinstance(one, Option):

@@ -1,7 +1,7 @@
-"""Previews of a wizard's touches: data from which a front-end draws; JSON-able, metres.
+"""Make previews of a wizard's touches: JSON data, in metres, for a front-end to draw.
 
-A picture of touches that no calibration was made of yet is in the camera's frame, any other one
-along the axes of the plane, from the centre of the touches that the calibration was made of.
+Touches without a calibration are drawn in the camera's frame; others are drawn along the axes of
+the plane, from the centre of the touches that the calibration was made from.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._touches import Touch
     from smartcam.geometry._inside import Array
 
-CELLS = 24
-"""Cells of the heat map along its longer side."""
+HEAT_MAP_CELLS = 24
+"""Number of cells of the heat map along its longer side."""
 
-MARGIN = 0.25
-"""Width of the border around what is shown, parts of its extent."""
+MARGIN_RATIO = 0.25
+"""Width of the border around the drawn points, as a part of their extent."""
 
 
 def plain(touches: Sequence[Touch]) -> dict[str, Any]:
-    """Return touches as they are: ``points`` of ``label, feature, camera, robot``."""
+    """Return touches without a calibration: ``points`` of ``label, feature, camera, robot``."""
     points = [
         {
             "label": str(number) if one.what == "mark" else one.what,
@@ -45,7 +45,7 @@ def plain(touches: Sequence[Touch]) -> dict[str, Any]:
 def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[str, Any] | None:
     """Return touches with the ``marks`` of a picture and the one to be touched ``next``.
 
-    None where no marks are given: the camera does not see what will be touched.
+    None if no marks are given, since the camera does not see the next point.
     """
     if not marks:
         return None
@@ -66,17 +66,17 @@ def compared(
     worst: int,
     left_out: Collection[int] = (),
 ) -> dict[str, Any]:
-    """Return touches compared with what a calibration says.
+    """Return touches compared with a calibration.
 
-    ``seen`` (N, 2): the points of the camera that belong to them. ``offsets`` (N, 3): touched minus
-    mapped, metres; ``held_out`` (N, 3): touched minus what the other touches say; NaN or None: not
-    known. ``worst``: index of the touch that stands out. ``left_out``: of those that do not count.
+    ``seen`` (N, 2): camera points of the touches. ``offsets`` (N, 3): touched minus mapped, metres;
+    ``held_out`` (N, 3): touched minus predicted by the other touches; NaN or None: not known.
+    ``worst``: index of the worst touch. ``left_out``: indices of the touches that do not count.
 
-    What :func:`plain` returns, each point with ``at``, ``residual``, ``left_out``, ``held_out`` (or
-    None) and ``covariance`` (2 x 2, of the mapped point; None where no sigma is known); ``worst``,
-    ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right corner of what is to
-    be shown; ``heat``, rows of predicted errors in mm that cover the view, the lowest row first, or
-    None.
+    The result is that of :func:`plain`, each point with ``at``, ``residual``, ``left_out``,
+    ``held_out`` (or None) and ``covariance`` (2 x 2, of the mapped point; None if no sigma is
+    known); ``worst``, ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right
+    corner of the drawn area; ``heat``, rows of predicted errors in mm that cover the view, the
+    lowest row first, or None.
     """
     preview = plain(touches)
     across = calibration.rotation.T
@@ -111,23 +111,25 @@ def compared(
 
 
 def _view(points: Array, others: Array) -> Array:
-    """Return the corners of what is shown: the points (3, N), and others (3, K) that are near."""
+    """Return the corners of the area with the points (3, N), and those of others (3, K) nearby."""
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
     flat = others[:2].T
     near = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
     shown = np.vstack([low, high, near])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = MARGIN * float((high - low).max())
+    margin = MARGIN_RATIO * float((high - low).max())
     return np.array([low - margin, high + margin])
 
 
 def _heat(
     calibration: PlaneCalibration, view: Array, across: Array, centre: Array
 ) -> list[list[float]] | None:
-    """Return the predicted errors at the middles of the view's cells, mm."""
+    """Return the predicted errors at the centres of the view's cells, mm."""
     low, extent = view[0], view[1] - view[0]
-    columns, rows = np.maximum(1, np.round(CELLS * extent / extent.max())).astype(int).tolist()
+    columns, rows = (
+        np.maximum(1, np.round(HEAT_MAP_CELLS * extent / extent.max())).astype(int).tolist()
+    )
     x = low[0] + extent[0] * (np.arange(columns) + 0.5) / columns
     y = low[1] + extent[1] * (np.arange(rows) + 0.5) / rows
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

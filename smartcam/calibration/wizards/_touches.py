@@ -1,4 +1,4 @@
-"""Touches with a robot's tip: how a wizard asks for them."""
+"""Ask for touches with a robot's tip."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 ReadRobot = Callable[[], Awaitable[Pose]]
-"""Returns where the robot's tip is, in the robot's base, metres; its z points out of the tool."""
+"""Function that returns the pose of the robot's tip in the robot's base, metres; its z points out
+of the tool."""
 
 Vector = tuple[float, float, float]
 
 UNITS: Mapping[str, float] = {"mm": 1e-3, "m": 1.0}
-"""Metres, by the units that coordinates of the robot may be typed in."""
+"""Metres per unit, for the units that coordinates of the robot may be typed in."""
 
 UNIT = Option(
     name="unit",
     label="Unit of the robot's coordinates",
     options={"mm": "millimetres", "m": "metres"},
 )
-"""Asks for one of :data:`UNITS`."""
+"""Input for one of :data:`UNITS`."""
 
 SIGMA = Number(
     name="touch_sigma",
@@ -46,7 +47,7 @@ SIGMA = Number(
     maximum=100.0,
     optional=True,
 )
-"""Asks for a touch's sigma."""
+"""Input for a touch's sigma."""
 
 ALLOWED = Number(
     name="allowed",
@@ -56,7 +57,7 @@ ALLOWED = Number(
     maximum=1e4,
     optional=True,
 )
-"""Asks for the error that is allowed."""
+"""Input for the allowed error."""
 
 SIDES: Mapping[str, Vector | None] = {
     "-z": (0.0, 0.0, -1.0),
@@ -67,7 +68,7 @@ SIDES: Mapping[str, Vector | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-"""Directions of a tool's axis in the robot's base, by what people choose."""
+"""Directions of a tool's axis in the robot's base, by the words that people choose."""
 
 SIDE = Option(
     name="side",
@@ -75,37 +76,44 @@ SIDE = Option(
     options={name: f"{name} of the robot" for name in SIDES}
     | {"-z": "down: -z of the robot", "unknown": "not known"},
 )
-"""Asks for one of :data:`SIDES`."""
+"""Input for one of :data:`SIDES`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """A touch."""
+    """A touch of a point by the robot's tip."""
 
-    mark: Mark  # what the camera sees of it; of a ray its origin
-    robot: Vector  # where the tip was, in the robot's base, metres
-    tool_z: Vector | None  # where the tool pointed; None if that is not known
+    mark: Mark  # mark that the camera sees at the point; for a ray, its origin
+    robot: Vector  # position of the tip in the robot's base, metres
+    tool_z: Vector | None  # direction of the tool's axis; None if it is not known
     what: str = "mark"  # ``mark``, or the letter of a point of the rays
 
 
 @dataclass(eq=False)
 class Touches:
-    """Touches of one run of a wizard; holds nothing but what the answers gave.
+    """Touches of one run of a wizard; the state follows from the answers alone.
 
     Attributes:
-        about: answers of the first step: ``touch_sigma``, and where the robot's pose is typed
-            ``unit`` and ``side``, if they were asked for.
+        about: answers of the first step: ``touch_sigma``, and, if the robot's pose is typed,
+            ``unit`` and ``side``.
         marks: marks of the last picture.
         camera_unit: unit of the camera's positions.
+        side: one of :data:`SIDES`, where the tool points, of robots whose pose is typed.
     """
 
     about: StepAnswer
-    _read_robot: ReadRobot | None  # None: the robot's pose is typed
+    _read_robot: ReadRobot | None  # None if the robot's pose is typed
     camera_unit: str = field(default="m", init=False)
 
     def __post_init__(self) -> None:
         self.touches: list[Touch] = []
         self.marks: Sequence[Mark] = ()
+        self.side = str(self.about.get("side", "unknown"))
+
+    @property
+    def typed(self) -> bool:
+        """True if the user types the robot's pose."""
+        return self._read_robot is None
 
     @property
     def places(self) -> list[Vector]:
@@ -114,27 +122,28 @@ class Touches:
 
     @property
     def tool_z(self) -> Array | None:
-        """Mean of where the tool pointed; None if that is not known."""
+        """Mean direction of the tool's axis; None if it is not known."""
         axes = [one.tool_z for one in self.touches if one.tool_z is not None]
         return np.mean(axes, axis=0) if axes else None
 
     @property
     def sigma(self) -> float | None:
-        """Standard deviation of a touch, metres; None if that is not known."""
+        """Standard deviation of a touch, metres; None if it is not known."""
         sigma = self.about["touch_sigma"]
         return None if sigma is None else 1e-3 * sigma
 
     def check_count(self, more: int, most: int, noun: str) -> None:
-        """Raise (SHAPE) where some more touches are too many."""
+        """Raise SHAPE if ``more`` touches would be too many."""
         count = len(self.touches) + more
         if count > most:
             raise Code.SHAPE.refusal(f"{count} {noun}, expected {most} at most", most, count)
 
     async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
-        """Ask which marks of a picture are touched, and for their touches.
+        """Ask which marks of a picture will be touched, then for their touches.
 
-        ``rows``: of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.picture`. ``most``:
-        touches of a run (SHAPE: more). ``noun``: what they are called.
+        ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.picture`.
+        ``most``: largest number of touches of a run; raises SHAPE for more. ``noun``: name of the
+        points, for people.
         """
         marks = await choose([Mark.of(row) for row in rows], self.camera_unit)
         self.check_count(len(marks), most, noun)
@@ -149,7 +158,7 @@ class Touches:
     ) -> Touch:
         """Ask for a touch.
 
-        ``place``: text that says what to touch. ``mark``: position at which the camera sees it.
+        ``place``: text that says what to touch. ``mark``: mark that the camera sees there.
         ``what``: attribute of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
@@ -163,9 +172,9 @@ class Touches:
     async def ask_touch(
         self, step: Step, mark_of: Callable[[StepAnswer], Mark], what: str = "mark"
     ) -> Touch:
-        """Ask for a touch by a step that says of what; its answer tells the mark.
+        """Ask for a touch by a step that names the point; its answer decides the mark.
 
-        Where the robot is not read, ``x, y, z`` are asked for behind the step's inputs.
+        If the robot cannot be read, inputs for ``x, y, z`` follow those of the step.
         """
         if self._read_robot is not None:
             answer = await ask(
@@ -179,7 +188,7 @@ class Touches:
         text = f"{step.description} Then take its position from the robot, in its base."
         answer = await ask(replace(step, description=text, inputs=(*step.inputs, *place)))
         x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
-        return Touch(mark_of(answer), (x, y, z), SIDES[self.about.get("side", "unknown")], what)
+        return Touch(mark_of(answer), (x, y, z), SIDES[self.side], what)
 
 
 async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Lines that use a calibration, to copy: for the command line, and for Python."""
+"""Write lines that use a calibration, to copy to a shell or into Python."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def usage(
     connect: Mapping[str, Any] | None = None,
     point: Sequence[float] = (),
 ) -> dict[str, str]:
-    """Return lines that use a calibration: ``command``, of a shell, and ``python``.
+    """Return lines that use a calibration: ``command`` for a shell, and ``python``.
 
-    ``path``: of its file. ``connect``: what :func:`smartcam.connect` takes for the camera, ``url``
-    among it; None: there is no camera to be asked. ``point`` (2,): one that the camera saw.
+    ``path``: path of its file. ``connect``: arguments of :func:`smartcam.connect` for the camera,
+    ``url`` included; None: there is no camera to ask. ``point`` (2,): a point that the camera saw.
     """
     text = str(path)
     if kind == HAND_EYE or connect is None:

@@ -1,7 +1,7 @@
-"""The wizard that asks whether a calibration is still true: touch some marks again, and compare.
+"""The wizard that checks whether a calibration still holds: touch some marks again, and compare.
 
-A camera that was knocked sees everything shifted; a few touches tell. What they say is compared
-with what the touches' noise explains, that of now and that of the calibration.
+A camera that was knocked sees everything shifted, which a few touches show. Their offsets are
+compared with the noise of the touches, both of the new ones and of those in the calibration.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ WIZARD = "drift"
 """Name of the wizard."""
 
 CHECKS = "smartcam.checks/1"
-"""Name of the form of a file of checks, in its first line."""
+"""Name of the format of a file of checks, in its first line."""
 
-KNOCK = 0.001
+KNOCK_M = 0.001
 """Shift of a camera that was knocked, metres: a check should notice it."""
 
-NOTICED = 0.95
-"""Part of all checks that should notice it."""
+NOTICED_SHARE = 0.95
+"""Part of all checks that should notice such a knock."""
 
 MAX_TOUCHES = 100
-"""Touches of a check; what more of them would tell is less than what the calibration knows."""
+"""Largest number of touches of a check; more would add less than the calibration's own error."""
 
 
 def drift_wizard(
@@ -63,24 +63,25 @@ def drift_wizard(
     read_robot: ReadRobot | None = None,
     y_down: bool | None = None,
 ) -> Wizard:
-    """Return the wizard.
+    """Return the wizard that checks a calibration.
 
-    Its parameters: ``name`` (of the calibration), ``feature`` (only marks of this name count), and
-    as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
+    Its parameters: ``name`` (of the calibration), ``feature`` (only marks with this name count),
+    and as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
 
     Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm,
     z, chance, needed, needed_at`` (at the best mark, see :func:`touches_needed`)``, file``.
 
-    Each check that is finished is a line of a file, whose first line tells its form: there a drift
-    is seen that is too slow for any single check. The calibration's own file stays as it is. Of
-    checks it takes as many as a journal takes entries.
+    Each finished check is a line of a file, whose first line names its format: so a drift can be
+    seen that is too slow for any single check. The calibration's own file is not changed. The file
+    takes as many checks as a journal takes entries.
 
     Args:
-        localize: takes a picture.
-        find: returns the file of a calibration by its name, or raises CalibrationError.
-        record_to: returns the file of its checks.
-        read_robot: reads the robot's pose; None: it is typed.
-        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+        localize: function that takes a picture and localizes marks in it.
+        find: function that returns the file of a calibration by its name, or raises
+            CalibrationError.
+        record_to: function that returns the file of its checks.
+        read_robot: function that reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis up, which points down; None: not
             known. A calibration that was made the other way is refused.
     """
 
@@ -99,35 +100,35 @@ def touches_needed(
     calibration: PlaneCalibration,
     camera_point: ArrayLike,
     *,
-    knock: float = KNOCK,
-    noticed: float = NOTICED,
+    knock: float = KNOCK_M,
+    noticed: float = NOTICED_SHARE,
 ) -> int | None:
-    """Return the number of touches of one mark that it takes to notice a knock.
+    """Return the number of touches of one mark that are needed to notice a knock.
 
-    None where none up to :data:`MAX_TOUCHES` does: the calibration itself is known too badly there.
-    ``camera_point`` (2,): where the camera sees the mark. ``knock``: how far the camera's plane is
-    shifted, in the direction that is the hardest to notice, metres. ``noticed``: in how many of all
-    checks it must be called stale, 0 to 1. Raises SHAPE or NOT_FINITE; UNVERIFIED: nothing tells
-    the touches' sigma; MissingExtraError: SciPy is not installed.
+    The result is None if :data:`MAX_TOUCHES` are not enough, since the calibration itself is too
+    uncertain there. ``camera_point`` (2,): place of the mark for the camera. ``knock``: shift of
+    the camera's plane, metres, in the direction that is hardest to notice. ``noticed``: part of all
+    checks, 0 to 1, that must find it. Raises SHAPE or NOT_FINITE; UNVERIFIED if the touches' sigma
+    is not known; MissingExtraError: SciPy is not installed.
     """
     known = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
-        # the mean of the touches, minus where the calibration says that they are
+        # variance of the mean of the touches minus their place by the calibration
         variance = known + sigma**2 / count
-        shift = min(knock**2 / max(variance, knock**2 / _PLAIN), _PLAIN)
+        shift = min(knock**2 / max(variance, knock**2 / _MAX_SHIFT), _MAX_SHIFT)
         if _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift) >= noticed:
             return count
     return None
 
 
-_PLAIN = 1e4
-"""A shift's square over its variance from which on it is noticed in any case."""
+_MAX_SHIFT = 1e4
+"""A shift whose square is more than this many times its variance is always noticed."""
 
 
 def _power(level: float, freedom: int | None, shift: float) -> float:
-    """Return the probability that a test at a level calls a shift's three coordinates stale."""
+    """Return the probability that a test at a level notices a shift of three coordinates."""
     special = load("scipy.special")
     if freedom is None:
         return 1.0 - float(special.chndtr(special.chdtri(3, level), 3, shift))
@@ -152,7 +153,7 @@ def _about(name: str, *, typed: bool) -> Step:
 async def _loaded(
     find: Callable[[str], Path], name: str, camera: MarkCamera, answers: Answers
 ) -> dict[str, Any]:
-    """Read the file of a calibration, so that a check that is resumed has the same."""
+    """Read the file of a calibration into the journal, so that a resumed check has the same one."""
     file = find(name)
     calibration = PlaneCalibration.load(file)
     camera.check_y_down(calibration.y_down, f"{name} was made")
@@ -289,7 +290,7 @@ class _DriftCheck(Touches):
     async def _end(
         self, drift: Drift, figures: Mapping[str, Any], answers: Answers
     ) -> dict[str, str] | None:
-        """Note the check in its file, if it is to end: the action of the last step."""
+        """Write the check to its file if the user ends it, as the action of the last step."""
         if answers["next"] != "finish":
             return None
         file = self._record_to(self.name)
@@ -322,9 +323,9 @@ class _DriftCheck(Touches):
 
 
 def _notes(figures: Mapping[str, Any]) -> list[str]:
-    """Return the notes of a verdict, a line each."""
+    """Return the notes on a verdict, a line each."""
     count, offsets = figures["touches"], figures["offsets_mm"]
-    knock = f"a knock of {1e3 * KNOCK:g} mm is noticed in {100 * NOTICED:g} of 100 checks"
+    knock = f"a knock of {1e3 * KNOCK_M:g} mm is noticed in {100 * NOTICED_SHARE:g} of 100 checks"
     needed = figures["needed"]
     return [
         f"{_touches(count)}: {figures['rms_mm']:.3f} mm rms off, where noise explains "

@@ -1,6 +1,6 @@
-"""From where a camera is to look at a target, one view after the other, and how that looks.
+"""Suggest the views from which a camera should look at a target, and draw their outlines.
 
-The first views are always the same. As soon as they tell the lens, what they leave open says which
+The first views are always the same. As soon as they determine a lens, its uncertainty decides which
 view helps most.
 """
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 
 class Look(NamedTuple):
-    """A view that tells something which the others do not."""
+    """A view that adds information to that of the others."""
 
-    text: str  # for people
+    text: str  # text for people
     # direction in the image about which the target is tilted, degrees from u towards v
     axis: float = 0.0
-    tilt: float = 0.0  # degrees
-    roll: float = 0.0  # about the line of sight, degrees
+    tilt: float = 0.0  # tilt, degrees
+    roll: float = 0.0  # turn about the line of sight, degrees
     fill: float = 0.6  # part of the image's width or height that the target takes
-    place: tuple[float, float] = (0.5, 0.5)  # its middle, in parts of the image's width and height
+    place: tuple[float, float] = (0.5, 0.5)  # its centre, as parts of the image's width and height
 
 
 LOOKS: Final = (
@@ -55,24 +55,24 @@ LOOKS: Final = (
         place=(0.27, 0.27),
     ),
 )
-"""The views, in the order in which they are best taken."""
+"""Views to take, in the best order."""
 
-ROLLS: Final = (0.0, math.pi / 2, -math.pi / 2)
-"""Turns about the line of sight, radians, one after the other: a robot's camera needs them."""
+ROLLS_RADIANS: Final = (0.0, math.pi / 2, -math.pi / 2)
+"""Turns about the line of sight, radians, one after the other, which a camera on a robot needs."""
 
 
 class Suggestion(NamedTuple):
     """The suggestion for the next view."""
 
-    text: str  # for people
-    outline: Array  # (4, 2), of the target in the image, pixels
-    gain: str = ""  # what the view is worth; empty where that is not known
+    text: str  # text for people
+    outline: Array  # (4, 2), outline of the target in the image, pixels
+    gain: str = ""  # benefit of the view, for people; empty if it is not known
 
 
 def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
     """Return the next view to take after views (one or more) of one target.
 
-    ``lens_known``: True if the views need not tell anything of the lens.
+    ``lens_known``: True if the views need not determine the lens.
     """
     guided = None if lens_known else _guided(views)
     if guided is None:
@@ -87,25 +87,27 @@ def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
 
 
 def _guided(views: Sequence[TargetView]) -> NextView | None:
-    """Return the view that helps the lens most; None where the views do not tell it yet."""
+    """Return the view that helps the lens most; None if the views do not determine it yet."""
     if len(views) < MIN_VIEWS:
         return None
     try:
         lens = calibrate_intrinsics(views)
     except CalibrationError:
         return None
-    # where the target is, there the parts will be, about
+    # parts will be about as far away as the target is
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
-    found = suggest_views(lens, distance=distance, roll=ROLLS[len(views) % len(ROLLS)])
+    found = suggest_views(
+        lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]
+    )
     return found[0] if found else None
 
 
-FOCAL: Final = 1.2
-"""Focal length of the camera that outlines are drawn for, image widths."""
+FOCAL_LENGTH_WIDTHS: Final = 1.2
+"""Focal length, in image widths, of the camera that outlines are drawn for."""
 
 
 def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
-    """Return the outline of a target's points in a view, (4, 2) pixels; of a camera like most.
+    """Return the outline of a target in a view by an average camera, (4, 2), pixels.
 
     ``size``: width and height of the image, pixels.
     """
@@ -116,9 +118,9 @@ def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
     facing = np.diag([1.0, -1.0, -1.0])
     tilted = rotation_zyx(axis, 0.0, tilt) @ rotation_zyx(-axis, 0.0, 0.0) @ facing
     placed = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
-    focal, image = FOCAL * size[0], np.array(size, dtype=np.float64)
+    focal, image = FOCAL_LENGTH_WIDTHS * size[0], np.array(size, dtype=np.float64)
     away = 10.0 * float(np.linalg.norm(half))
-    for _ in range(5):  # a little nearer or farther changes the perspective a little, too
+    for _ in range(5):  # moving it a little nearer or farther changes the perspective slightly, too
         seen = focal * placed[:, :2] / (placed[:, 2:] + away)
         away *= float((np.ptp(seen, axis=0) / image).max()) / look.fill
     seen = focal * placed[:, :2] / (placed[:, 2:] + away)

@@ -10,16 +10,9 @@ from smartcam.conformance.camera._items import ITEMS
 from smartcam.conformance.camera._options import ConformanceOptions
 from smartcam.conformance.camera._raw_client import EndedError
 from smartcam.conformance.camera._report import CameraReport
-from smartcam.conformance.camera._results import (
-    CameraFinding,
-    CheckOutcome,
-    Differs,
-    Item,
-    NotObserved,
-    Question,
-    Undescribed,
-)
+from smartcam.conformance.camera._results import CameraFinding, CheckOutcome, Item, Question
 from smartcam.conformance.camera._session_under_test import CameraUnderTest
+from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -115,7 +108,7 @@ def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
 
 
 def _unfit(camera: CameraUnderTest, item: Item) -> str:
-    """Return the reason why a check makes no sense here, "" where it does."""
+    """Return the reason why a check makes no sense here, "" if it does."""
     try:
         dialect = camera.dialect
     except Differs as exc:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from smartcam.conformance._dialects import SMART
-from smartcam.conformance.camera._results import Differs, check
+from smartcam.conformance.camera._results import check
+from smartcam.conformance.camera._verdicts import Differs
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import EndedError, RawClient
-from smartcam.conformance.camera._results import Differs, NotObserved, Undescribed
+from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
@@ -28,7 +28,7 @@ INSPECTIONS = 3
 """Inspections that are looked at: an order that changes shows."""
 
 REBOOT_POLL_INTERVAL = 0.25
-"""Seconds between two Connects to a camera that restarts, at most."""
+"""Seconds after which a camera that restarts gets the next Connect at the latest."""
 
 
 def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:
@@ -44,7 +44,7 @@ def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest]
 class ObservedRun(NamedTuple):
     """One trigger and what came of it."""
 
-    sent_at: float  # when it was sent
+    sent_at: float  # time of sending
     came: list[Heard]  # the frames from then on until the camera waited for the next one
     under_way: int | None  # status word that was asked for right behind the trigger; ``bid`` only
     word: int  # size of a number, bytes
@@ -191,10 +191,10 @@ def no_id(camera: CameraUnderTest) -> bool:
 class DoubleTrigger(NamedTuple):
     """Two triggers at once and what came of them."""
 
-    results: int  # how many results came
-    rose_at: float | None  # when the status with Overtriggered came, None where none did
-    fell_at: float | None  # when the status without it came
-    text: str  # what came, in words
+    results: int  # number of results that came
+    rose_at: float | None  # time of the status with Overtriggered; None without one
+    fell_at: float | None  # time of the status without it
+    text: str  # observation in words
 
 
 def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
@@ -232,7 +232,7 @@ class Stopped(NamedTuple):
     """A trigger to a stopped camera and what came of it."""
 
     came: list[Heard]
-    text: str  # what came, in words
+    text: str  # observation in words
 
 
 @_once
@@ -257,8 +257,8 @@ class Switch(NamedTuple):
     application: int  # the one that was asked for
     came: list[Heard]  # the frames until the answer and the status that is not busy
     answer: Heard
-    active: int  # what Query told afterwards
-    seconds: float  # from the request to the answer
+    active: int  # application that Query reported afterwards
+    seconds: float  # seconds from the request to the answer
 
 
 @_once
@@ -307,7 +307,7 @@ def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> Non
 class Downtime(NamedTuple):
     """A restart."""
 
-    seconds: float  # from the request to the first answered Connect
+    seconds: float  # seconds from the request to the first answered Connect
     application: int  # the active one afterwards
     running: bool  # run mode afterwards
 

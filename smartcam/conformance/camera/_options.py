@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 MAX_SECONDS = 3600.0
 """Seconds that may be waited for one thing at most."""
 
-MAX_INPUT_DATA = 1 << 16
-"""Bytes of input data: about 64 kB, as a container (HAL 15, published for the other direction)."""
+MAX_INPUT_DATA_BYTES = 1 << 16
+"""Largest number of bytes of input data: about 64 kB, as a container (HAL 15, published for the
+other direction)."""
 
 
 class Allow(enum.Flag):
@@ -92,8 +93,8 @@ class ConformanceOptions:
         switch_timeout: longest time for loading an application.
         reboot_timeout: longest time for a restart.
         sequence_offset: where in the application's results the int32 stands that is the sequence
-            number, counted behind the application's id; None where it is not in them.
-        input_data: bytes that the application takes as input data, None where it takes none.
+            number, counted behind the application's id; None if it is not in them.
+        input_data: bytes that the application takes as input data, None if it takes none.
 
     Raises:
         ConfigurationError: a number cannot work.
@@ -130,9 +131,9 @@ class ConformanceOptions:
             raise ConfigurationError(f"both applications are {self.application}: name another one")
         if self.input_data is not None:
             object.__setattr__(self, "input_data", check_bytes(self.input_data, "input_data"))
-        if self.input_data is not None and len(self.input_data) > MAX_INPUT_DATA:
+        if self.input_data is not None and len(self.input_data) > MAX_INPUT_DATA_BYTES:
             raise ConfigurationError(
-                f"input_data has {len(self.input_data)} bytes: {MAX_INPUT_DATA} at most"
+                f"input_data has {len(self.input_data)} bytes: {MAX_INPUT_DATA_BYTES} at most"
             )
 
 

@@ -19,13 +19,9 @@ from smartcam.conformance.camera._observations import (
 )
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import EndedError
-from smartcam.conformance.camera._results import (
-    Differs,
-    NotObserved,
-    Undescribed,
-    question,
-)
+from smartcam.conformance.camera._results import question
 from smartcam.conformance.camera._setting_checks import next_number
+from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
@@ -35,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 MAX_CONTAINERS = 1024
-"""Input containers sent at most, to find how many are queued."""
+"""Largest number of input containers sent to find how many are queued."""
 
 MAX_LEFT = 64
 """Triggers at most to use up the input containers that somebody else has left."""

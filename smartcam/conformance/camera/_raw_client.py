@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
-MAX_HEARD = 1 << 24
-"""Bytes of bodies that one client keeps: 256 of the largest results; more end the experiment."""
+MAX_HEARD_BYTES = 1 << 24
+"""Largest number of bytes of bodies that one client keeps: 256 of the largest results; more end the
+experiment."""
 
 MAX_TRAIL = 60
-"""Lines of what went over the wire that a report shows: the last ones."""
+"""Largest number of lines of what went over the wire that a report shows: the last ones."""
 
 FAREWELL = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
@@ -51,12 +52,12 @@ class RawClient:
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
     _quiet: float  # seconds of silence that count as no answer
-    _trail: deque[str]  # where everything that passes is written down
+    _trail: deque[str]  # record of everything that passes
     _on_change: Callable[[], None]  # before something goes out that changes the camera's state
 
     def __post_init__(self) -> None:
         self.heard: list[Heard] = []  # every frame that came, in order
-        self.status: int | None = None  # the last status word, None where none came
+        self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
         self._buffer = b""
@@ -139,7 +140,7 @@ class RawClient:
     # ------------------------------------------------------------------ in
 
     def next(self, within: float) -> Heard | None:
-        """Return the next frame, None where none comes ``within`` so many seconds.
+        """Return the next frame, None if none comes ``within`` so many seconds.
 
         Raises:
             EndedError: the camera ends the link.
@@ -174,8 +175,8 @@ class RawClient:
         heard = Heard(time.monotonic(), message_id, body)
         self._note("<", self.wire.spell(heard))
         self._kept += len(body)
-        if self._kept > MAX_HEARD:
-            raise NotObserved(f"the camera sent more than {MAX_HEARD} bytes meanwhile")
+        if self._kept > MAX_HEARD_BYTES:
+            raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
         self.heard.append(heard)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]

@@ -23,26 +23,6 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 
-@dataclass(eq=False)
-class Differs(Exception):  # noqa: N818 - it is a verdict on the camera
-    """The camera does something else than the documents say."""
-
-    expected: str  # what the documents say
-    came: str  # what was seen instead
-
-    def __str__(self) -> str:
-        """Return both."""
-        return f"expected: {self.expected}; came: {self.came}"
-
-
-class Undescribed(Differs):
-    """A question was answered by something that no setting of its quirk describes."""
-
-
-class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment
-    """The camera could not be seen doing it; the text says why, as what follows "because"."""
-
-
 class CheckOutcome(enum.Enum):
     """The outcome of a check or a question."""
 
@@ -89,7 +69,7 @@ class Question(Item):
     def quirk(self) -> str | None:
         """The field of :class:`~smartcam.emulator.Quirks` that the answer is a value of.
 
-        None where it is a fact for people.
+        None if it is a fact for people.
         """
         return self.name if self.name in Quirks.model_fields else None
 

@@ -9,7 +9,8 @@ from smartcam.conformance._dialects import SMART
 from smartcam.conformance.camera._observations import inspection_time
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import EndedError
-from smartcam.conformance.camera._results import Differs, NotObserved, check
+from smartcam.conformance.camera._results import check
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import MAX_TRAIL, EndedError, RawClient
-from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import RawDialect
 from smartcam.doctor._inside import trials as probe_trials
 from smartcam.exceptions import ConfigurationError
@@ -43,7 +43,7 @@ class StateBefore(NamedTuple):
     """The camera's state that is put back."""
 
     application: int  # id of the active one
-    running: bool  # in run mode
+    running: bool  # whether the camera is in run mode
 
 
 class CameraUnderTest:
@@ -55,10 +55,10 @@ class CameraUnderTest:
 
     def __init__(self, options: ConformanceOptions) -> None:
         self.options: ConformanceOptions = options
-        self.before: StateBefore | None = None  # what is put back, None until the first session
+        self.before: StateBefore | None = None  # state to restore; None until the first session
         self.gone: str = ""  # why there is no camera any more, "" while there is one
-        self.left: str = ""  # what could not be put back, "" where everything was
-        # what went over the wire since the last forget_trail
+        self.left: str = ""  # state that could not be restored; "" if everything was
+        # messages on the wire since the last forget_trail
         self.trail: deque[str] = deque(maxlen=MAX_TRAIL)
         # frames of the camera that are not documented, as texts, each kind once
         self.flaws: dict[str, str] = {}

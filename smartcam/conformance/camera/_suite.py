@@ -86,7 +86,7 @@ class CameraConformance:
 
     @pytest.fixture
     def camera_address(self, request: pytest.FixtureRequest) -> str | None:
-        """The camera's address, None where there is none."""
+        """The camera's address, None if there is none."""
         address: str | None = self.camera_url or request.config.getoption("--camera-url", None)
         return address
 

@@ -36,9 +36,9 @@ class BadBytesError(Exception):
 class Heard(NamedTuple):
     """One frame of the camera."""
 
-    at: float  # when its last byte came, time.monotonic()
+    at: float  # time of arrival of the last byte, time.monotonic()
     message_id: int
-    body: bytes  # the bytes behind the header
+    body: bytes  # the bytes after the header
 
 
 def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
@@ -162,7 +162,7 @@ class RawDialect:
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
 
     def flaw(self, heard: Heard) -> str | None:
-        """Return the undocumented property of a frame of the camera, None where there is none."""
+        """Return the undocumented property of a frame of the camera, None if there is none."""
         if self.is_bid and self.numbers(heard.body) in _REFUSALS:
             return None  # a refusal may be nothing but its code, whatever was asked
         size = self._sizes().get(heard.message_id)

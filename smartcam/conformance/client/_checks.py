@@ -1,4 +1,4 @@
-"""The rules for a client: the scene, the weight, and the state of the camera's side.
+"""The rules for a client, each with its scene, its weight and the state of the camera.
 
 Sources are the keys of the list in ``docs/sources.md``.
 """
@@ -24,26 +24,26 @@ class Grade(enum.Enum):
     """The weight of a check."""
 
     MUST = "must"
-    """Without it the client is wrong: a test fails."""
+    """A client that breaks the rule is wrong: a test fails."""
     SHOULD = "should"
-    """The client is better with it; the documents leave it open, or it costs something: only
-    reported."""
+    """A client that keeps the rule is better, but the documents leave it open, or it costs
+    something: only reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientCheck:
     """A rule in a scene."""
 
-    name: str  # in reports and for ``-k``
+    name: str  # name of the check, in reports and for ``-k``
     scene: Scene  # the camera and the task
-    rule: Callable[[ClientRun], str | None]  # returns what was wrong, None where nothing was
-    expects: str  # what the camera's documents make a client do
-    source: str  # where that stands, with its grade
-    grade: Grade = Grade.MUST  # how much it matters
-    dialects: tuple[str, ...] = EVERY_DIALECT  # those it is about
+    rule: Callable[[ClientRun], str | None]  # function that returns the fault, or None
+    expects: str  # behaviour that the camera's documents require of a client
+    source: str  # source in the documents, with its grade
+    grade: Grade = Grade.MUST  # severity
+    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that the check is about
 
     def applies(self, dialect: str, transport: str) -> bool:
-        """Return True if the check is about such a camera."""
+        """Return True if the check applies to such a camera."""
         scene = self.scene
         return (
             dialect in self.dialects and dialect in scene.dialects and transport in scene.transports

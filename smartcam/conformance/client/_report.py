@@ -1,4 +1,4 @@
-"""Report on a client to people: in a failed test, and at the end of a run."""
+"""Report on a client in words: in a failed test, and at the end of a run."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class ClientFinding(NamedTuple):
     check: str
     grade: str  # ``must`` or ``should``
     camera: str  # dialect and transport
-    scene: str  # what was special about the camera
-    task: str  # what the client had to do
-    wrong: str  # what was wrong
-    expects: str  # what the documents make a client do
-    source: str  # where that stands
-    wire: tuple[str, ...]  # what went over the wire, one line each
-    said: str  # what the client printed
+    scene: str  # special condition of the camera
+    task: str  # task of the client
+    wrong: str  # fault of the client
+    expects: str  # behaviour that the documents require of a client
+    source: str  # source in the documents
+    wire: tuple[str, ...]  # messages on the wire, one line each
+    said: str  # output of the client
 
     def __str__(self) -> str:
         """Return the finding as lines."""
@@ -55,7 +55,7 @@ class ClientFinding(NamedTuple):
 
 
 def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
-    """Judge a run of a check's scene; return the finding, None where all is well."""
+    """Judge a run of a check's scene; return the finding, None if all is well."""
     wrong = check.rule(run)
     if wrong is None:
         return None
@@ -77,8 +77,8 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
 def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """Write findings into pytest's report.
 
-    What must be is shown in full by its failed test, so here it is a line; what should be is shown
-    in full.
+    A breach of ``must`` is shown in full by its failed test, so here it is one line; a breach of
+    ``should`` is shown in full.
     """
     reporter.section("smartcam: the client")
     for grade in Grade:

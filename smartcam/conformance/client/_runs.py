@@ -26,20 +26,20 @@ SETTLING = 0.3
 """Seconds that the camera gets to hear the end of a client that has ended: loopback is faster."""
 
 MAX_LINES = 40
-"""Lines of the wire that a finding shows: the last ones."""
+"""Largest number of lines of the wire that a finding shows: the last ones."""
 
 
 class Said(NamedTuple):
     """Something that went over the wire."""
 
     time: float  # seconds since the scene began
-    sender: Sender  # whose it is
+    sender: Sender  # side that sent it
     peer: str  # address and port of the client
-    message: Message | None  # what it is; None for bytes that make no message of the dialect
+    message: Message | None  # decoded message; None for bytes that are no message of the dialect
     text: str  # the message with its fields, ``?`` for none
     hex: str  # the frame as it passed, or the bytes
-    error: str | None = None  # why the camera ignored it, None where it did not
-    lost: bool = False  # it did not pass
+    error: str | None = None  # reason why the camera ignored it; None if it did not
+    lost: bool = False  # whether the message was lost on the way
 
     def __str__(self) -> str:
         """Return the message as a line: seconds, direction, message, bytes."""

@@ -1,4 +1,4 @@
-"""Scenes: a camera with its trouble, and the task that a client gets there."""
+"""Define scenes: a camera with a fault, and the task of a client in it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
 an id that no application has."""
 
 WAIT = 0.25
-"""Seconds that something is held back; a client's time-outs are longer."""
+"""Seconds for which a message is held back; a client's time-outs are longer."""
 
 LONG = 1.0
-"""Seconds of BUSY behind a switch's answer: a client that starts slowly must come into it, too."""
+"""Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to meet
+it."""
 
 STATUS_GO = 0x280
 """Status with Running and Waiting for Trigger."""
@@ -35,12 +36,12 @@ _CONTAINER = struct.Struct("<ii")
 
 
 def container(application: int, turn: int) -> bytes:
-    """Return the data of a result: the application that made it, and its how many-th run it was."""
+    """Return the data of a result: its application, and the number of the run."""
     return _CONTAINER.pack(application, turn)
 
 
 def read_container(data: bytes) -> tuple[int, int] | None:
-    """Return application and turn of a result's data, None where it is no such data."""
+    """Return the application and the run of a result's data; None for other data."""
     if len(data) != _CONTAINER.size:
         return None
     application, turn = _CONTAINER.unpack(data)
@@ -75,7 +76,7 @@ def _none(dialect: FramedDialect) -> Sequence[BaseFault]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """A camera, and what a client shall do with it.
+    """A camera with a fault, and the task of a client.
 
     Attributes:
         name: name of the scene.
@@ -84,9 +85,9 @@ class Scene:
         number: number of the task.
         active: application that is loaded at first.
         running: whether the camera is in run mode at first.
-        faults: the trouble, in a dialect.
+        faults: the faults, in a dialect.
         quirks: quirks of the camera.
-        stale: turns of the application that the client did not trigger.
+        stale: runs of the application that the client did not trigger.
         dialects: dialects in which the scene makes sense.
         transports: transports over which the scene makes sense.
     """
@@ -189,7 +190,7 @@ _BROKEN: tuple[tuple[str, str, BaseFault], ...] = (
         f.Truncate(on="ResultContainer", keep=9, times=None),
     ),
 )
-"""Scenes in which nothing but a fault is special."""
+"""Scenes that differ only by their fault."""
 
 SCENES: Mapping[str, Scene] = {
     scene.name: scene

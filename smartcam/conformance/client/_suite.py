@@ -29,7 +29,7 @@ _RUNS: pytest.StashKey[dict[tuple[type, str, str, str], ClientRun]] = pytest.Sta
 class ClientOptions(NamedTuple):
     """The options that describe the client."""
 
-    command: str | None = None  # ``--client-command``, None where it is not given
+    command: str | None = None  # ``--client-command``, None if it is not given
     dialects: tuple[str, ...] | None = None  # ``--client-dialect``, names with commas between them
     transports: tuple[str, ...] | None = None  # ``--client-transport``, the same
     timeout: float | None = None  # ``--client-timeout``, seconds
@@ -118,7 +118,7 @@ class ClientConformance:
         metafunc.parametrize("client_case", cases)
 
     def client(self, config: pytest.Config) -> Client | None:
-        """Return the client that is judged, None where nothing says which one."""
+        """Return the client that is judged, None if nothing says which one."""
         if type(self).perform is not ClientConformance.perform:
             return FunctionClient(self.perform)
         command = self.command or read_options(config).command

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 UNSUPPORTED = 77
 """Exit code of a command that cannot do such a task: what automake's tests mean by "skipped"."""
 
-MAX_OUTPUT = 1 << 20
-"""Bytes of a command's output that are read; a client that prints more has failed."""
+MAX_OUTPUT_BYTES = 1 << 20
+"""Largest number of bytes of a command's output that are read; a client that prints more has
+failed."""
 
 SHOWN = 2000
 """Characters of a command's output that a report shows."""
@@ -87,7 +88,7 @@ class Outcome(NamedTuple):
 
     Attributes:
         results: data of the results that the client gave, in order.
-        error: the client's words on its failure; None where the client reports success.
+        error: the client's words on its failure; None if the client reports success.
         ended: whether the client came to an end in time.
         supported: whether the client can do such a task at all.
         seconds: duration of the task.
@@ -291,7 +292,7 @@ async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:
     async def all_of(stream: asyncio.StreamReader | None) -> bytes:
         data = b""
         while stream is not None and (more := await stream.read(1 << 16)):
-            data += more[: MAX_OUTPUT - len(data)]
+            data += more[: MAX_OUTPUT_BYTES - len(data)]
         return data
 
     out, err = await asyncio.gather(all_of(process.stdout), all_of(process.stderr))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class Behaviour:
     """The behaviour of a camera beyond its answers to requests."""
 
-    coded: bool = False  # its answers tell a result code
+    coded: bool = False  # whether its answers have a result code
     acknowledges: bool = False  # every request is answered with one
     tells_bad_messages: bool = False  # unknown and malformed requests are answered with one, too
     answers_disconnect: bool = False  # so is Disconnect

@@ -25,7 +25,7 @@ _UNITS = ("year", "month", "day", "hour", "minute", "second")
 class CalendarClock:
     """Year to second, without a time zone."""
 
-    _time: datetime  # what it showed when it was set
+    _time: datetime  # time that the clock showed when it was set
     _set_at: int  # the device's time then, nanoseconds
 
     def __post_init__(self) -> None:
@@ -104,6 +104,6 @@ class InputQueue:
 class RunChange:
     """The changes that faults make to one inspection."""
 
-    late: int = 0  # how much longer it takes, nanoseconds
-    silent: bool = False  # it sends nothing
-    extra: int = 0  # how often its container comes beside the first time
+    late: int = 0  # additional duration, nanoseconds
+    silent: bool = False  # whether the evaluation sends nothing
+    extra: int = 0  # number of times that its container comes again

@@ -1,10 +1,10 @@
 """The camera behind the wire: a model that is moved by time differences.
 
 It knows no socket, loop or clock. Messages of the active session go in by :meth:`Device.handle`,
-time by :meth:`Device.tick`; what the camera says is taken with :meth:`Device.take_output`.
+time by :meth:`Device.tick`; the camera's messages are taken with :meth:`Device.take_output`.
 
-Inside, time is whole nanoseconds and every future thing is a row of one small table: instant by
-kind. What falls on the same instant happens in the order of :class:`_Event`.
+Inside, time is in whole nanoseconds, and each future event is a row of one small table: instant by
+kind. Events at the same instant happen in the order of :class:`_Event`.
 
 Facts stand in ``docs/protocol.md``. Where the documents are silent the choice is a field of
 :class:`~smartcam.emulator.Quirks`, or is marked *inferred* here.
@@ -81,7 +81,7 @@ class Mode(enum.Enum):
 
 
 class _Event(enum.IntEnum):
-    """Kinds of future things, in the order in which they happen at one instant."""
+    """Kinds of future events, in their order at one instant."""
 
     INSPECTED = 0
     OVERTRIGGER_ENDS = 1
@@ -90,11 +90,11 @@ class _Event(enum.IntEnum):
     BUSY_ENDS = 4
     FREE_RUN = 5
 
-    __hash__ = int.__hash__  # Enum's own is a function in Python
+    __hash__ = int.__hash__  # that of Enum is a slow function in Python
 
 
 class _Inspection(NamedTuple):
-    """An inspection under way: what was fixed when it began."""
+    """The values of a running inspection that were fixed when it began."""
 
     number: int
     turn: int
@@ -104,7 +104,7 @@ class _Inspection(NamedTuple):
 
 
 class LastReport(NamedTuple):
-    """The report of a run, whether anybody heard it or not."""
+    """The report of a run, whether or not a client received it."""
 
     time: float  # seconds
     byte_order: ByteOrder
@@ -120,18 +120,18 @@ class Device:
 
     Args:
         applications: the programs stored on it; at least one, ids differ.
-        active: id of the loaded one; default the first.
+        active: id of the loaded one; by default the first.
         running: True for run mode from the beginning.
-        quirks: what is not known about real cameras.
-        clock_time: what its clock shows at first; a time without a zone is taken as it is.
-        scene: the table it looks at.
+        quirks: assumptions about unknown behaviour of real cameras.
+        clock_time: first time of its clock; a time without a zone is used unchanged.
+        scene: the scene that the camera looks at.
         behaviour: behaviour of the camera in its dialect.
 
     Attributes:
         around: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,
-            :meth:`switch_application`, :meth:`reboot`, :meth:`set_condition`,
-            :meth:`set_endian`) happens inside this context. A server puts one here that first
-            brings the device's time up and afterwards sends what the action caused.
+            :meth:`switch_application`, :meth:`reboot`, :meth:`set_condition`, :meth:`set_endian`)
+            happens inside this context. A server sets a context that first updates the device's
+            time and afterwards sends the messages that the action caused.
 
     Raises:
         ConfigurationError: no application, one id twice, or ``active`` is none of them.
@@ -155,7 +155,7 @@ class Device:
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         self._on_entered: Callable[[DeviceState], None] | None = None
         self._entered: list[DeviceState] = []
-        self._bits = 0  # of the status word, as last seen
+        self._bits = 0  # bits of the status word, as last seen
         first = next(iter(self._applications)) if active is None else active
         self._take_up(self._applications[self._known(first)])
         self._now = 0
@@ -171,11 +171,11 @@ class Device:
         self._endian = 0
         self._next_number = 0
         self._processing = False
-        self._inspector: Inspector | None = None  # while it has a run
+        self._inspector: Inspector | None = None  # inspector of the present run
         self._held_busy = False
-        self._trigger_drops = 0  # triggers still to be dropped
-        self._change = RunChange()  # of the inspection under way, else of the next
-        # a reference value is there until the next one, it does not queue
+        self._trigger_drops = 0  # number of triggers still to be dropped
+        self._change = RunChange()  # change of the running inspection, else of the next
+        # a reference value stays until the next one; it does not queue
         depth = 1 if behaviour.acknowledges else self.quirks.input_queue_depth
         self._inputs = InputQueue(depth)
         self._clock = CalendarClock(clock_time, self._now)
@@ -241,7 +241,7 @@ class Device:
 
     @property
     def clock_time(self) -> datetime:
-        """Time that the device's clock shows; the zone means nothing."""
+        """Time that the device's clock shows; the zone has no meaning."""
         return self._clock.read(self._now)
 
     @property
@@ -274,7 +274,7 @@ class Device:
     def handle(self, message: m.Message) -> None:
         """Take a message of the client; without a session everything but Connect is ignored.
 
-        The caller sees to it that only one client's messages come here. Never raises.
+        The caller must pass only one client's messages. Never raises.
         """
         if self._mode is Mode.REBOOTING:
             return
@@ -289,9 +289,9 @@ class Device:
         self._advance(self._now)
 
     def connect(self) -> None:
-        """Begin a session: the answer, then a status, whatever it is.
+        """Begin a session: send the answer, then any status.
 
-        Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
+        Source: SC manual p. 28, 29 (published); that ``bid`` sends no status is inferred.
         """
         self._session, self._owes_switch = True, False
         self.sessions += 1
@@ -304,7 +304,7 @@ class Device:
             self._reported = (self._status_word(), self._endian)
 
     def disconnect(self) -> None:
-        """End the session; the camera goes on with what it does, in silence.
+        """End the session; the camera goes on without sending anything.
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
@@ -314,16 +314,16 @@ class Device:
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
-        """Have every state told that the device enters from now on.
+        """Call a function for every state that the device enters from now on.
 
-        It is told right behind the event that brought the device there; behind a message or an
-        operator's action by the next :meth:`tell_entered`.
+        It is called right after the event that led to the state; after a message or an operator's
+        action by the next :meth:`tell_entered`.
         """
         self._on_entered = on_entered
         self._bits = self._status_word()
 
     def tell_entered(self) -> None:
-        """Tell of the states that were entered since the last time."""
+        """Report the states that were entered since the last call."""
         while self._entered and self._on_entered is not None:
             states, self._entered = self._entered, []
             for state in states:
@@ -335,7 +335,7 @@ class Device:
         return output
 
     def tick(self, dt: float) -> None:
-        """Let ``dt`` seconds pass; what happens in them happens at its own instant.
+        """Let ``dt`` seconds pass; each event happens at its own instant.
 
         Raises:
             ConfigurationError: a negative time.
@@ -344,7 +344,7 @@ class Device:
         self._advance(self._now + nanoseconds(dt))
 
     def next_event_in(self) -> float | None:
-        """Return the seconds until something happens by itself, None where nothing will."""
+        """Return the seconds until something happens by itself, None if nothing will."""
         if not self._events:
             return None
         return max(0, min(when for when, _ in self._events.values()) - self._now) / NANOSECONDS
@@ -370,7 +370,7 @@ class Device:
         return taken
 
     def switch_application(self, application: int, *, running: bool = False) -> bool:
-        """Load another application behind the client's back.
+        """Load another application without the client's knowledge.
 
         It is stopped for that, whatever the quirks say about a client's switch.
 
@@ -398,7 +398,7 @@ class Device:
         """Restart the camera, as by its power switch.
 
         Args:
-            seconds: until it is up again; None: what the quirk ``reboot_time`` says.
+            seconds: until the restart is done; None: the quirk ``reboot_time``.
         """
         seconds = check_seconds_or_none(seconds, "seconds", "device")
         with self.around():
@@ -411,7 +411,7 @@ class Device:
         (inferred); a reboot clears it.
 
         Raises:
-            ConfigurationError: another bit; those follow from what the camera does.
+            ConfigurationError: another bit, which follows from the camera's state.
         """
         condition = check_kind(condition, Status, "condition", "a Status", "device")
         on = check_flag(on, "on", "device")
@@ -429,7 +429,7 @@ class Device:
     def set_endian(self, endian: int) -> None:
         """Set the byte order of result containers and input data: 0 little, 1 big.
 
-        Other values are reported as they are and build little endian.
+        Other values are reported unchanged, and containers are little endian.
         """
         endian = check_integer(endian, "endian", 0, 0xFFFFFFFF, "device")
         with self.around():
@@ -442,7 +442,7 @@ class Device:
         """Set BUSY and keep it; no inspection begins meanwhile.
 
         Args:
-            seconds: how long; None: until a reboot or :meth:`end_faults`.
+            seconds: duration; None: until a reboot or :meth:`end_faults`.
         """
         seconds = check_seconds_or_none(seconds, "seconds", "device")
         with self.around():
@@ -456,7 +456,7 @@ class Device:
             self._advance(self._now)
 
     def drop_triggers(self, count: int) -> None:
-        """Drop so many triggers as if the last image were still analysed."""
+        """Drop the next ``count`` triggers, as if the last image were still being analysed."""
         self._trigger_drops += check_integer(count, "count", 0, who="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
@@ -479,7 +479,7 @@ class Device:
                 self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
 
     def end_faults(self) -> None:
-        """Undo what still lasts of them: BUSY falls, the next triggers are taken as ever."""
+        """Undo all faults: BUSY falls, and the next triggers are taken as usual."""
         with self.around():
             self._forget_faults()
             self._report()
@@ -550,7 +550,7 @@ class Device:
         return ResultCode.BUSY if self._status_word() & _BUSY else ResultCode.OK
 
     def _name_active(self) -> m.QueryAnswer:
-        """Tell the active application; ``bid`` does not while another one is loaded."""
+        """Send the active application; ``bid`` does not while another one is being loaded."""
         if self.behaviour.acknowledges and self._mode is Mode.SWITCHING:
             return m.QueryAnswer(code=ResultCode.BUSY, application=0)
         code = ResultCode.OK_INSPECTION_ID if self.behaviour.coded else 0
@@ -579,7 +579,7 @@ class Device:
         self._report()
 
     def _trigger(self) -> bool:
-        """Begin an inspection, or drop the trigger and say so.
+        """Begin an inspection, or drop the trigger and report that.
 
         A stopped, switching or untriggered application ignores it (mvBlueGEMINI manual p. 31 and
         the newest SC manual p. 48, published).
@@ -605,7 +605,7 @@ class Device:
             return
         if self._mode is Mode.SWITCHING:
             return  # not answered: inferred
-        target = self._applications.get(application)  # 0 is never among them
+        target = self._applications.get(application)  # 0 is never used
         stopped = always or self._mode is not Mode.RUNNING
         how = "allow" if stopped else self.quirks.switch_while_running
         if target is None or how == "refuse":
@@ -614,7 +614,7 @@ class Device:
             self._load(target, answer=True, running=False)
 
     def _load(self, target: Application, *, answer: bool, running: bool) -> None:
-        """Begin to load ``target``; the status says BUSY until it is there."""
+        """Begin to load ``target``; the status has BUSY until it is loaded."""
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
         self._set_mode(Mode.SWITCHING)
@@ -624,7 +624,7 @@ class Device:
         self._report()
 
     def _reboot(self, seconds: float | None = None) -> None:
-        """Go down: the session is gone without a word.
+        """Restart: the session ends without a message.
 
         Source: mvBlueGEMINI manual p. 31 (published for the sibling).
         """
@@ -665,7 +665,7 @@ class Device:
         self._active = application
         self._period = application.period
         self._containers: dict[tuple[int, ByteOrder], m.ResultContainer] = {}
-        self._runs = 0  # since it was loaded
+        self._runs = 0  # runs since the application was loaded
 
     def _finish_load(self, target: Application, *, running: bool) -> None:
         self._take_up(target)
@@ -683,7 +683,7 @@ class Device:
             self._enter_run_mode()
 
     def _finish_boot(self) -> None:
-        """Come up: the last application, stopped; numbering at 0, the clock is lost.
+        """End a restart: the last application is stopped, numbers begin at 0, the clock is lost.
 
         Source: newest SC manual p. 48 (numbering) and BVS ID guide p. 231 (clock), published;
         stopped, and a cleared System Error: inferred.
@@ -724,7 +724,7 @@ class Device:
             return
         self._begin_run()
         if not self._change.late and _Event.INSPECTED in self._events:
-            # a run never reaches into the next, however both were rounded
+            # a run never overlaps with the next, however both were rounded
             (ends, action), (following, _) = (
                 self._events[_Event.INSPECTED],
                 self._events[_Event.FREE_RUN],
@@ -754,7 +754,7 @@ class Device:
         application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
 
     def _inspected(self, run: _Inspection, found: Values | None) -> None:
-        """Take what an inspector has found; a fault may make the run's end late."""
+        """Take an inspector's result; a fault may make the run's end late."""
         self._inspector = None
         with self.around():
             finish = functools.partial(self._finish_run, run, found)
@@ -775,7 +775,7 @@ class Device:
         self._report()
 
     def _result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
-        """Return the result; one that comes again and again is built once."""
+        """Return the result; a repeated one is built only once."""
         if self._period is None:
             return self._build_result(run, found)
         key = (run.turn % self._period, self._byte_order)
@@ -833,7 +833,7 @@ class Device:
         return True
 
     def _read_input(self, data: bytes) -> Mapping[str, Any] | None:
-        """Return the values of input data; None where the application takes none such."""
+        """Return the values of input data; None if the application takes no such data."""
         if isinstance(self._active, InspectedApplication):
             return {_DATA: data}
         layout = self._active.input_layout
@@ -850,7 +850,7 @@ class Device:
     def _next_input(self) -> Mapping[str, Any] | None:
         inspected = isinstance(self._active, InspectedApplication)
         if inspected and not self._inputs.was_given:
-            return None  # a program may have no use for any
+            return None  # a program may use no input data
         if not inspected and self._active.input_layout is None:
             return None
         values, fits = self._inputs.take()
@@ -858,9 +858,9 @@ class Device:
         return values
 
     def _in_step(self, *, fits: bool) -> None:
-        """Set the bit where containers and inspections are out of step, clear it where not.
+        """Set the bit if containers and inspections are out of step, else clear it.
 
-        A reference value, which does not queue, cannot be.
+        A reference value does not queue, so it cannot get out of step.
         """
         self._conditions &= ~_INPUT_CONTAINER
         if not fits and not self.behaviour.acknowledges:
@@ -886,7 +886,7 @@ class Device:
         self._enter(DeviceState(mode.value))
 
     def _note_bits(self, word: int) -> None:
-        """Look which bits of the status word have risen."""
+        """Note which bits of the status word have risen."""
         risen, self._bits = word & ~self._bits, word
         self._entered += risen_states(risen)
 
@@ -900,7 +900,7 @@ class Device:
             self._say(_status_report(*now))
 
     def _say_status(self) -> None:
-        """Send the status, whatever the client has."""
+        """Send the status, even if the client has it."""
         self._reported = now = (self._status_word(), self._endian)
         self._say(_status_report(*now))
 

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import Protocol
 
 MAX_ORDERED = 1000
-"""Answers that may be ordered in advance at most."""
+"""Largest number of answers that may be ordered in advance."""
 
 
 class _Ordered(NamedTuple):
@@ -161,7 +161,7 @@ class EmulatedInSight(LineCamera):
             ROWS,
             line_end=words.LINE_END,
             ends=words.COMMAND_ENDS,
-            max_line=words.MAX_LINE,
+            max_line=words.MAX_LINE_BYTES,
             encoding=words.ENCODING,
         )
 

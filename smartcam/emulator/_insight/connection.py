@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_codec import LineServer
 
 MAX_SESSIONS = 16
-"""Connections at a time. For a newcomer the one makes room that waits for its login for longest;
-where all are logged in, it is closed at once. The real camera's bound is not published."""
+"""Largest number of connections at a time. For a newcomer the one makes room that waits for its
+login for longest; where all are logged in, it is closed at once. The real camera's bound is not
+published."""
 
 WRITE_LIMIT = 1 << 25
 """Bytes kept for a client that does not read; more end its connection. An image of 8 megapixels
@@ -31,7 +32,7 @@ def _code(line: str) -> int:
 
 
 def _value(line: str) -> int:
-    """Return the number behind the status code, or that of no job."""
+    """Return the number after the status code, or that of no job."""
     code, _, value = line.partition("\r\n")
     return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
 

@@ -1,7 +1,7 @@
-"""The emulated In-Sight camera itself: its jobs, its mode and its runs, without sockets and words.
+"""Model an In-Sight camera: its jobs, its mode and its runs, without sockets and commands.
 
-Its time is what :meth:`InSightDevice.advance_to` tells it. What the public documents leave open is
-decided in ``docs/insight.md``.
+Its clock is moved by :meth:`InSightDevice.advance_to`. Questions that the public documents leave
+open are decided in ``docs/insight.md``.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
-_MAX_NUMBER = 0xFFFFFFFF  # largest number of a run, as at other cameras
+_MAX_NUMBER = 0xFFFFFFFF  # largest number of a run, as for other cameras
 
 
 class _PendingEvent:
-    """An acquisition and what follows, or a soft event."""
+    """An acquisition with its evaluation, or a soft event."""
 
     def __init__(self, told: Told | None) -> None:
         self.over: bool = False
@@ -57,7 +57,7 @@ class _PendingEvent:
             told(code)
 
     def end(self, code: StatusCode) -> None:
-        """Finish, one way or the other."""
+        """Finish the event, whatever its outcome."""
         self.over = True
         self.tell(code)
 
@@ -65,12 +65,12 @@ class _PendingEvent:
 class InSightDevice:
     """A camera with jobs and an image.
 
-    The methods that clients' commands call return, or tell, the status code of the answer.
+    Methods for clients' commands return the status code of the answer, or pass it to a callback.
 
     Its arguments are those of :class:`~smartcam.emulator.EmulatedInSight`.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     def __init__(
@@ -81,27 +81,28 @@ class InSightDevice:
         online: bool = False,
         image: Any = None,
     ) -> None:
-        self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])  # by file name
-        # the active one, None for one that was never saved
+        # jobs by file name
+        self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])
+        # active job; None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
-        # a context around what an operator does, where something is to follow
+        # context around actions of an operator, if something has to follow them
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
-        # returns the image of the last run, where an inspector takes the pictures
+        # function that returns the image of the last run, if an inspector takes the pictures
         self.sight: Callable[[], Any] | None = None
-        self.runs: int = 0  # acquisitions with a result since it was made
+        self.runs: int = 0  # number of acquisitions with a result since the device was created
         self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
         self._now = 0
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._wanted_online = online  # by clients
-        self._allowed_online = True  # by the operator or an input
+        self._wanted_online = online  # whether clients want it online
+        self._allowed_online = True  # whether the operator or an input holds it offline
         self._loading = False
-        self._blind = False  # what its pictures come from is lost
-        self._inspector: Inspector | None = None  # while it has a run
+        self._blind = False  # whether the source of its pictures is lost
+        self._inspector: Inspector | None = None  # whether a run is under way
         self._run: _PendingEvent | None = None
-        self._turn = 0  # acquisitions since the job was loaded
+        self._turn = 0  # number of acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
-        self._generation = 0  # of free running: an older one has ended
+        self._generation = 0  # generation of free running: an older one has ended
         if active is not None:
             self.job = self.find(active)
         self._begin_job()
@@ -115,7 +116,7 @@ class InSightDevice:
 
     @property
     def mode(self) -> Literal["running", "stopped", "switching"]:
-        """Mode in the words of other cameras: online, offline, or a job is loaded."""
+        """Mode in the terms of other cameras: online, offline, or loading a job."""
         if self._loading:
             return "switching"
         return "running" if self.online else "stopped"
@@ -132,7 +133,7 @@ class InSightDevice:
 
     @property
     def image(self) -> NDArray[np.uint8]:
-        """The image that the camera sees; one that is not 8 bit grey is a ConfigurationError."""
+        """Image that the camera sees; one that is not 8 bit grey raises ConfigurationError."""
         return self._image
 
     @image.setter
@@ -155,18 +156,18 @@ class InSightDevice:
 
     @property
     def now(self) -> int:
-        """Its time, nanoseconds since it was made."""
+        """Time of the device, nanoseconds since its creation."""
         return self._now
 
     @property
     def due(self) -> int | None:
-        """Time of the next event that comes by itself, nanoseconds; None if there will be none."""
+        """Time of the next scheduled event, nanoseconds; None if there is none."""
         return self._agenda[0][0] if self._agenda else None
 
     def advance_to(self, now: int) -> None:
-        """Move the device's time on, nanoseconds, and do what falls due, in order of time.
+        """Advance the device's time, nanoseconds, and run the due events in order of time.
 
-        An earlier time than before changes nothing.
+        A time before the present one changes nothing.
         """
         while self._agenda and self._agenda[0][0] <= now:
             at, _, action = heapq.heappop(self._agenda)
@@ -175,7 +176,7 @@ class InSightDevice:
         self._now = max(self._now, now)
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do something after some seconds; at once for 0."""
+        """Run an action after some seconds; at once for 0."""
         if seconds <= 0:
             action()
             return
@@ -249,7 +250,7 @@ class InSightDevice:
         return StatusCode.STILL_OFFLINE if online and not self.online else StatusCode.DONE
 
     def request_job(self, job: str | int, told: Told) -> None:
-        """Load a job for a client (``LF``, ``SJ``); the code is told at its end, or at once."""
+        """Load a job for a client (``LF``, ``SJ``); ``told`` gets the code at the end or now."""
         try:
             found = self.find(job)
         except ConfigurationError:
@@ -269,9 +270,10 @@ class InSightDevice:
         self.after(found.load_time, loaded)
 
     def request_event(self, event: int, told: Told, *, at_image: bool) -> None:
-        """Cause an event, 0 to 8, for a client; ``told`` is told the code.
+        """Cause an event, 0 to 8, for a client; ``told`` gets the code.
 
-        That is when the image is there (``SE``), or when the cells are (``SW``).
+        It gets the code after the image was taken (``SE``), or after the cells were computed
+        (``SW``).
         """
         if not self._begin_run(event, told, at_image=at_image):
             told(StatusCode.FAILED)
@@ -286,7 +288,7 @@ class InSightDevice:
         self._cells[key] = shown(value)
         return StatusCode.DONE
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ internals
 
     def _begin_job(self) -> None:
         self._turn = 0
@@ -381,7 +383,7 @@ class InSightDevice:
                 return
             if not isinstance(job, InspectedJob):
                 self._finish_acquisition(job)
-            elif not (self.busy or self._blind):  # the last run is late, or there is no picture
+            elif not (self.busy or self._blind):  # the last run came late, or there is no picture
                 run = self._run = _PendingEvent(None)
                 self._inspect(job, run, at_image=False)
             self.after(period, turn)

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 23
-"""Pixels of an image at most; larger ones are refused. Real sensors have up to 5 megapixels."""
+"""Largest number of pixels of an image; larger ones are refused. Real sensors have up to 5
+megapixels."""
 
 _FILE_HEADER = struct.Struct("<2sIHHI")
 _INFO_HEADER = struct.Struct("<IiiHHIIiiII")
@@ -22,7 +23,7 @@ _PALETTE = b"".join(bytes((grey, grey, grey, 0)) for grey in range(256))
 
 
 def grey_pattern(width: int = 64, height: int = 48) -> NDArray[np.uint8]:
-    """Return a picture, in pixels, that shows which way round it is: grey rises right and down."""
+    """Return a picture that shows its orientation: grey levels rise to the right and downwards."""
     across = np.linspace(0, 191, width)
     down = np.linspace(0, 64, height)
     return (across[np.newaxis, :] + down[:, np.newaxis]).astype(np.uint8)
@@ -48,9 +49,9 @@ def check_image(image: Any) -> NDArray[np.uint8]:
 
 
 def bitmap(image: NDArray[np.uint8]) -> bytes:
-    """Return an image as a BMP file: 8 bits a pixel, a palette of greys, the last row first.
+    """Return an image as a BMP file: 8 bits per pixel, a palette of greys, the last row first.
 
-    That the camera sends a standard BMP is published; which of its forms is not.
+    That the camera sends a standard BMP is published; the form of the BMP is not.
     """
     height, width = image.shape
     rows = np.pad(image[::-1], ((0, 0), (0, -width % 4))).tobytes()

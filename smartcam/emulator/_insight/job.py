@@ -24,8 +24,8 @@ _log = logging.getLogger("smartcam.emulator")
 EXTENSIONS = (".job", ".jobx")
 """The extensions of job files: the one of older, then the one of newer cameras (published)."""
 
-MAX_CELL_TEXT = 1024
-"""Characters of a cell's text; a bound of the emulator."""
+MAX_CELL_TEXT_CHARACTERS = 1024
+"""Largest number of characters of a cell's text; a bound of the emulator."""
 
 CellValue: TypeAlias = bool | int | float | str
 """A value that a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or
@@ -47,7 +47,7 @@ class Control(EmulatorData):
     low: float | None = Field(default=None, description="least number that is taken")
     high: float | None = Field(default=None, description="greatest number that is taken")
     max_length: int = Field(
-        default=255, ge=1, le=MAX_CELL_TEXT, description="characters of a string"
+        default=255, ge=1, le=MAX_CELL_TEXT_CHARACTERS, description="characters of a string"
     )
 
     def admits(self, value: CellValue) -> bool:
@@ -270,9 +270,10 @@ def shown(value: Any) -> str:
         ValueError: a text that does not fit a line.
     """
     if isinstance(value, str):
-        if len(value) > MAX_CELL_TEXT or not (value == "" or _printable(value)):
+        if len(value) > MAX_CELL_TEXT_CHARACTERS or not (value == "" or _printable(value)):
             raise ValueError(
-                f"a text has at most {MAX_CELL_TEXT} printable Latin-1 characters, got {value!r}"
+                f"a text has at most {MAX_CELL_TEXT_CHARACTERS} printable Latin-1 characters, "
+                f"got {value!r}"
             )
         return value
     if not isinstance(value, Real):

@@ -1,4 +1,4 @@
-"""Put an emulated camera together: a scenario, and the options that were given beside it."""
+"""Merge a scenario and the options that were given with it into an emulated camera."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def make_plan(
     timeline: Iterable[Cue | Mapping[str, Any]],
     **given: Any,
 ) -> Scenario:
-    """Return the scenario with what was given beside it; None is not given.
+    """Return the scenario with the given options; None stands for an option that was not given.
 
     Raises:
-        ConfigurationError: something is wrong, or more than the camera can do.
+        ConfigurationError: an option is wrong, or not supported by the camera.
     """
     changes = {key: value for key, value in given.items() if value is not None}
     for what, names in _KNOWN.items():

@@ -101,7 +101,7 @@ class Scenario(EmulatorData):
         return any(cue.is_random for cue in self.timeline)
 
     def mistake(self) -> Mistake | None:
-        """Return the place in it of what the camera cannot do, and why; None where all is well."""
+        """Return the place in it of what the camera cannot do, and why; None if all is well."""
         from smartcam.emulator._makes import emulated_class  # stands on this module
 
         try:
@@ -186,7 +186,7 @@ class ScenarioFile(Scenario):
 
 
 def _first_double(values: Iterable[T]) -> T | None:
-    """Return the first value that was there before; None where there is none."""
+    """Return the first value that was there before; None if there is none."""
     seen: set[T] = set()
     for value in values:
         if value in seen:

@@ -49,7 +49,7 @@ MAX_AT_ONCE = 1000
 with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
-"""Faults of one cue at most, far more than anybody writes."""
+"""Largest number of faults of one cue, far more than anybody writes."""
 
 _MOMENTS = ("at", "entering", "command")
 
@@ -153,8 +153,8 @@ class _CueState:
 
     cue: Cue
     random: Random  # one for each cue, so that none changes the chance of another
-    seen: int = 0  # how often its moment came
-    done: int = 0  # how often its faults were injected
+    seen: int = 0  # number of times that its moment came
+    done: int = 0  # number of times that its faults were injected
 
     @property
     def over(self) -> bool:

@@ -95,10 +95,10 @@ __all__ = [
 ]
 
 MAX_FAULTS = 10_000
-"""Faults that wait at one time; every message is compared with all of them."""
+"""Largest number of faults that wait at one time; every message is compared with all of them."""
 
 MAX_FIRED = 1000
-"""Records kept of faults that have happened; the oldest go first."""
+"""Largest number of records kept of faults that have happened; the oldest go first."""
 
 
 # ---------------------------------------------------------------------- on the wire
@@ -504,8 +504,8 @@ class FiredFault(NamedTuple):
     Attributes:
         time: seconds of the emulator's clock.
         fault: the fault, as it was given.
-        message: the message that the fault applied to, as its sender meant it; None where it
-            waited for none.
+        message: the message that the fault applied to, as its sender meant it; None if it waited
+            for none.
     """
 
     time: float

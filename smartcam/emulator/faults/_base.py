@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAX_BYTES = 1 << 16
-"""Bytes that one fault inserts: about as many as the largest container has."""
+"""Largest number of bytes that one fault inserts: about as many as the largest container has."""
 
 MESSAGE_NAMES: Mapping[str, type[m.Message]] = {
     row.type.__name__: row.type for dialect in BVS.dialects.values() for row in dialect.table
@@ -156,7 +156,7 @@ class BaseFault(EmulatorData):
 
     @property
     def speaker(self) -> m.Sender | None:
-        """Sender of the message that the fault waits for, None where it acts at once."""
+        """Sender of the message that the fault waits for, None if it acts at once."""
         if isinstance(self.on, str):
             return MESSAGE_NAMES[self.on].sender
         if self.sender is not None:

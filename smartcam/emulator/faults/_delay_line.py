@@ -21,27 +21,29 @@ if TYPE_CHECKING:
 class Ending(NamedTuple):
     """The end of a connection: its kind, its cause, and its time if it is half open."""
 
-    # what happens; ``eof`` is that the sender has ended
+    # event; ``eof`` means that the sender has ended
     how: Literal["close", "reset", "stall", "half_open", "eof"]
     cause: str  # kind of the fault, or name of the rule, behind it
-    seconds: float | None = None  # how long a half-open connection stays; None: as long as it can
+    # seconds that a half-open connection stays; None: as long as possible
+    seconds: float | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Transmission:
     """Something that passes a link, and how."""
 
-    parts: list[bytes]  # what is still to pass; each part is one write
+    parts: list[bytes]  # bytes still to pass; each part is one write
     _: KW_ONLY
     pauses: list[float] = field(
         default_factory=list[float]
     )  # seconds before each part but the first
     delay: float = 0.0  # seconds before the first part
-    overtaken: bool = False  # whether later ones may pass it while it waits
-    # how much of what follows it waits for, and for how many seconds at most
+    overtaken: bool = False  # whether later parts may pass this one while it waits
+    # number of following parts that it waits for, and the most seconds
     gather: tuple[int, float] | None = None
-    behind: bool = False  # where there is no order: it goes behind those and not in one with them
-    end: Ending | None = None  # what happens to the connection behind it
+    # without an order: whether it goes after those parts and not together with them
+    behind: bool = False
+    end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
         default_factory=list[str]
     )  # kinds, or names of rules, that acted on it
@@ -70,7 +72,7 @@ class _Waiting(Generic[T]):
         self.missing, seconds = sent.gather or (0, 0.0)
         # when it waits for that no longer, nanoseconds
         self.until = self.due + nanoseconds(seconds)
-        self.company: list[T] = []  # what has come for it, where there is no order
+        self.company: list[T] = []  # parts that have come for it, without an order
         self.paused = False  # whether a part has passed and the pause behind it has not begun
         self.turns = 0  # how often the timer has to go off before it passes
 
@@ -103,7 +105,7 @@ class DelayLine(Generic[T]):
     carry: Callable[[list[tuple[T, bytes]]], None]
     end: Callable[[Ending], None]  # does to the connection what a transmission says
     lost: Callable[[T], None]  # told of each one that was under way when the line was closed
-    turns: int = 0  # of the event loop that a pause of no time takes
+    turns: int = 0  # turns of the event loop that a pause of no time takes
 
     def __post_init__(self) -> None:
         self.size: int = 0  # bytes on it

@@ -42,7 +42,7 @@ class Row:
     """A fault that waits."""
 
     fault: Fault
-    left: int | None  # how often it will still apply; None: always
+    left: int | None  # number of times that it will still apply; None: always
     seen: int = 0  # messages that fitted so far
 
     def count(self) -> bool:
@@ -63,9 +63,9 @@ class FaultQueue:
     """
 
     _dialect: WireCodec
-    _clock: Clock  # whose time the record tells
-    _applications: Container[int] = ()  # ids of those that the camera has
-    _kinds: frozenset[str] = frozenset(FAULTS)  # those that it can do
+    _clock: Clock  # clock of the times in the record
+    _applications: Container[int] = ()  # ids of the camera's applications
+    _kinds: frozenset[str] = frozenset(FAULTS)  # kinds of faults that the camera can do
 
     def __post_init__(self) -> None:
         self.said: list[Row] = []  # wire faults on messages of the camera
@@ -164,7 +164,7 @@ def misfit(
     applications: Container[int],
     kinds: Container[str] = FAULTS,
 ) -> tuple[str, str] | None:
-    """Return the field of a fault that a camera cannot do and why, None where it can do all."""
+    """Return the field of a fault that a camera cannot do and why, None if it can do all."""
     if fault.kind not in kinds:
         able = ", ".join(kind for kind in FAULTS if kind in kinds)
         return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"

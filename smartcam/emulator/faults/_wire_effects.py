@@ -94,9 +94,9 @@ class WireMessage(Transmission):
     """A message on its way, or something inserted."""
 
     what: Frame | bytes  # the frame that its sender meant; bytes where they make no frame
-    original: bytes  # its bytes
-    changeable: bool = True  # whether later faults act on it
-    passed: bytearray = field(default_factory=bytearray)  # what has passed
+    original: bytes  # original bytes of the message
+    changeable: bool = True  # whether later faults act on the message
+    passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
     def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
@@ -105,7 +105,7 @@ class WireMessage(Transmission):
 
     @property
     def wire(self) -> bytes | None:
-        """The bytes that passed, None where they are those that were meant."""
+        """The bytes that passed, None if they are those that were meant."""
         return None if self.passed == self.original else bytes(self.passed)
 
     def place(self, offset: int) -> tuple[int, int]:

@@ -68,15 +68,16 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_PROGRAMS_PER_ROLE = 4096
-"""Programs of each role that may be here at a time; a crowd of one role keeps no other out."""
+"""Largest number of programs of each role that may be here at a time; a crowd of one role keeps no
+other out."""
 
 PRESENCE_WITHIN = 10.0
 """Seconds behind its first call within which a program's presence must be seen: the call may have
 come before it. One without presence is forgotten then, as nobody would see that it is gone."""
 
 MAX_CALLS_PER_PROGRAM = 256
-"""Calls of one program that may be under way at a time, for each camera of the agent; questions
-and commands each."""
+"""Largest number of calls of one program that may be under way at a time, for each camera of the
+agent; questions and commands each."""
 
 MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
 """Questions of all programs of one role that may be under way at a time, for each camera."""
@@ -168,7 +169,7 @@ class Guest:
         self.under_way[command] += 1
 
     def end(self, command: bool, call: int) -> asyncio.Task[None] | None:
-        """Count a call as under way no more; return its task, None where it was counted before."""
+        """Count a call as under way no more; return its task, None if it was counted before."""
         task = self.tasks.pop((command, call), None)
         if task is not None:
             self.under_way[command] -= 1
@@ -189,7 +190,7 @@ class Agent:
         observers: observers of all sessions.
         standby: settings of standing by for cameras that others have; None: the agent does not.
         on_retired: callback for the end of all cameras, since another agent has the name.
-        calibrations: calibrations of the cameras; None where there is no folder for them.
+        calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Attributes:
         retired_by: why the agent has no cameras any more.
@@ -226,15 +227,17 @@ class Agent:
         self._present = collections.defaultdict[str, set[str]](set)
         self._gone = collections.defaultdict[str, dict[str, int]](dict)
         self._of_role: collections.Counter[str] = collections.Counter()  # programs that are here
-        self._questions: collections.Counter[str] = collections.Counter()  # of theirs, under way
+        # running questions, by program
+        self._questions: collections.Counter[str] = collections.Counter()
         self._numbers = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
         self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
-        self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
+        # numbers of cameras that were shared before
+        self._numbers_at: dict[str, tuple[int, ...]] = {}
         self._plain = Plain(self, keys, bus, calibrations)
         self.leaving: set[Host] = set()  # are being closed
-        self.past: Totals = Totals()  # of cameras shared no more
+        self.past: Totals = Totals()  # counts of cameras that are no longer shared
         self._summaries = Summaries(self, keys, bus)
         self._bundle = AgentBundle(name, self.epoch, keys, bus)
         self.stands_by: bool = standby is not None
@@ -374,7 +377,7 @@ class Agent:
         await self._claims.want(name, settings)
 
     async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
-        """Raise where the fleet has a camera under another name already.
+        """Raise if the fleet has a camera under another name already.
 
         Raises:
             ConfigurationError: the fleet has it; says which camera and whose that is.
@@ -631,7 +634,7 @@ class Agent:
         command: bool,
         reservation: int | None,
     ) -> float | None:
-        """Return the seconds that a call may take; None where it is not done, or not again."""
+        """Return the seconds that a call may take; None if it is not done, or not again."""
         if guest is None or epoch != self.epoch:
             kind = ConnectionLostError if reservation is None else ReservationLostError
             stranger = kind(
@@ -662,7 +665,7 @@ class Agent:
     def _refusal(
         self, host: Host, guest: Guest, said: str, left: float, command: bool
     ) -> SmartCamError | None:
-        """Return why a call is not done, None where it is."""
+        """Return why a call is not done, None if it is."""
         if said not in ACTIONS or (said in COMMANDS) != command:
             return UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         if left < 0:

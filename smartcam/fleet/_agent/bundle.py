@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 BUNDLE_INTERVAL = 0.005
-"""Seconds between two bundles, at least."""
+"""Seconds that must pass between two bundles."""
 
 FULL_BUNDLE_BYTES = 1 << 15
 """Bytes of results with which a bundle goes at once."""

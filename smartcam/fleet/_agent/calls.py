@@ -37,7 +37,7 @@ T = TypeVar("T")
 Answer = tuple[dict[str, Any], list[bytes]]
 NOTHING: Answer = ({}, [])
 MAX_REPLY_BYTES = 1 << 20
-"""Bytes of results, or of states, that one reply brings at most."""
+"""Largest number of bytes of results, or of states, that one reply brings."""
 
 
 class ProgramCall(NamedTuple):
@@ -66,7 +66,7 @@ class ProgramCall(NamedTuple):
     reservation: int | None = None
 
     def argument(self, name: str, check: Callable[..., T], *bounds: Any) -> T | None:
-        """Return an argument; None where it is not given.
+        """Return an argument; None if it is not given.
 
         Args:
             name: name of the argument.

@@ -89,7 +89,7 @@ class Claims:
         self._name: list[Handle] = []
 
     async def refuse_namesake(self, timeout: float) -> None:
-        """Raise where an agent of this name is there; before anything is said under it.
+        """Raise if an agent of this name is there; before anything is said under it.
 
         Raises:
             ConfigurationError: an agent is there, and stays for longer than one that has died
@@ -187,7 +187,7 @@ class Claims:
             )
 
     async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
-        """Raise where the fleet has a camera of these under another name: it serves one client.
+        """Raise if the fleet has a camera of these under another name: it serves one client.
 
         Nothing happens between the last look at this agent's own cameras and the return. Two agents
         that look at the same time do not see each other.
@@ -248,7 +248,7 @@ class Claims:
             self._watch = None
 
     async def _refuse(self) -> None:
-        """Raise where another agent has a camera of ours, and neither is one that stands by.
+        """Raise if another agent has a camera of ours, and neither is one that stands by.
 
         One that neither answers nor goes may have died a moment ago: its presence ends with the
         engine's lease.

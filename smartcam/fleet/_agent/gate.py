@@ -22,7 +22,7 @@ class InLine:
         program: name of the waiting program.
         reservation: key of the reservation; None for a command.
         granted: whether the turn has come.
-        wake: future that is done when the turn comes; None where nobody waits.
+        wake: future that is done when the turn comes; None if nobody waits.
     """
 
     program: str
@@ -41,7 +41,7 @@ class Gate:
 
     Attributes:
         on_change: callback for a program's reservation of the camera, and for its end.
-        holder: program that has reserved the camera; None where none has.
+        holder: program that has reserved the camera; None if none has.
     """
 
     on_change: Callable[[Change, str], None] = _tell_nobody

@@ -1,4 +1,4 @@
-"""A camera at its agent: the session with it, what it said last, and who may command it."""
+"""Hold an agent's camera: its session, its last state, and the right to command it."""
 
 from __future__ import annotations
 
@@ -51,22 +51,23 @@ if TYPE_CHECKING:
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
 STATUS_DELAY = 0.005
-"""Seconds that a status may wait for others, so that one message tells them. The program whose
-trigger it belongs to hears of it with the reply."""
+"""Seconds that a status may wait for others, so that one message carries them. The program that
+triggered gets it with the reply."""
 
 CATCH_UP = 0.2
-"""Seconds behind such a reply after which the number of the next state is told where no state was:
-the reply may have been lost, and nothing else would tell."""
+"""Seconds after such a reply until the number of the next state is sent, if no state was: otherwise
+a lost reply would stay unnoticed."""
 
 RESULTS_INTERVAL = 0.002
-"""Seconds between two messages with results, at least: those that come faster go together."""
+"""Seconds that must pass between two messages with results: those that come faster are sent
+together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
-"""Bytes of results that go at once, however soon after the last."""
+"""Results of this many bytes are sent at once, without RESULTS_INTERVAL."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds behind the last results after which their numbers are told again: the last of them may
-have been lost on the way, and nothing else would tell."""
+"""Seconds after the last results until their numbers are sent again: otherwise a loss of the last
+ones would stay unnoticed."""
 
 
 class Host:
@@ -78,24 +79,24 @@ class Host:
         bus: bus on which results and states are sent.
         keys: keys of the fleet.
         epoch: number of the agent's start.
-        history: numbers of results and of bytes that are kept at most.
-        on_event: callback for what happens to the camera.
+        history: largest numbers of results and of bytes that are kept.
+        on_event: callback for the camera's events.
         topics: topics of the agent's cameras in JSON.
         frames: frames of the camera.
         bundle: sender of the results of all the agent's cameras together.
         observers: observers of the camera's sessions.
 
     Attributes:
-        epoch: number of the agent's start, or of this time that it has the camera.
-        began: the number of the first result since then.
-        final: no other agent takes the camera over when there will be no session any more.
+        epoch: number of the agent's start, or of its present hold of the camera.
+        began: number of the first result since then.
+        final: whether no other agent takes the camera over after the last session.
         gate: gate that decides which program's commands may pass.
         results: the last results.
-        states: the last things that happened.
+        states: the last states of the camera.
         outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: why there is no session yet, None where there is or was one.
+        failure: why there is no session yet, None if there is or was one.
         triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
     """
 
@@ -126,19 +127,20 @@ class Host:
         self.began: int = 1
         self.final: bool = True
         self._tell, self._bundle, self._observers = on_event, bundle, observers
-        Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
+        # programs decide about that
+        Interpretation(settings.interpret_as, lenient=True, y_down=False)
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
-        self._fresh: list[bytes] = []  # runs that are not said yet
+        self._fresh: list[bytes] = []  # runs that are not sent yet
         self._fresh_states: list[bytes] = []
         self._fresh_bytes = 0
-        self._due: asyncio.Handle | None = None  # says the results
+        self._due: asyncio.Handle | None = None  # task that sends the results
         self._said_at = -math.inf
         self._held = DeadlineTimer(self._flush_states)
         self._catch_up = DeadlineTimer(self._put_states)
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
-        self._over = False  # there will be no session any more
+        self._over = False  # whether no further session will come
         self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
@@ -149,7 +151,7 @@ class Host:
 
     @property
     def was_tried(self) -> bool:
-        """True once the first attempt has ended, well or not."""
+        """True once the first attempt has ended, with or without success."""
         return self._opened.is_set()
 
     @property
@@ -159,7 +161,7 @@ class Host:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers that what is said next has."""
+        """The numbers of the next message."""
         topics = self.topics
         return self.results.following, self.states.following, topics.statuses, topics.events
 
@@ -175,7 +177,7 @@ class Host:
     # ------------------------------------------------------------------ life
 
     async def run(self) -> None:
-        """Have a session, as soon as there is a camera; ends when there will be none."""
+        """Keep a session once there is a camera; return after the last one."""
         backoff = self.settings.reconnect
         delays = iter(()) if backoff is None else backoff.delays()
         try:
@@ -198,14 +200,14 @@ class Host:
             self._say({"kind": "Tried"})
 
     async def tried(self, timeout: float) -> None:
-        """Wait until the first try has come to an end, well or not; bounded."""
+        """Wait until the first attempt has ended, with or without success; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await self._opened.wait()
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
-        self._opened.clear()  # what is said from now on is no news
+        self._opened.clear()  # later messages bring nothing new
         try:
             await self.frames.close()
         finally:
@@ -231,7 +233,7 @@ class Host:
         """Return the camera.
 
         Raises:
-            LinkError: there is no session, and why.
+            LinkError: there is no session; the text says why.
         """
         if self.failure is not None or not (self._opened.is_set() or self.connected):
             why = self.failure or "it tries for the first time"
@@ -242,7 +244,7 @@ class Host:
 
     @contextlib.contextmanager
     def counted(self, said: str) -> Iterator[None]:
-        """Count how the trigger in the block ends, if ``said`` is a trigger."""
+        """Count the outcome of the trigger in the block, if ``said`` is a trigger."""
         outcome = RESULT
         try:
             yield
@@ -268,7 +270,7 @@ class Host:
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
 
-        Where another agent may take the camera over, only who has it can reserve it.
+        If another agent may take the camera over, only the agent that has it can reserve it.
 
         Raises:
             ResponseTimeoutError: another program has it for ``timeout`` seconds more.
@@ -289,7 +291,7 @@ class Host:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
-            ReservationLostError: the reservation has ended, or was another agent's to keep.
+            ReservationLostError: the reservation has ended, or was kept by another agent.
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(
@@ -301,8 +303,8 @@ class Host:
     async def keeps(self, reservation: Hashable, timeout: float) -> bool:
         """Return True if a reservation still holds and no other agent has the camera by now.
 
-        Where another agent may take over, the camera is asked: it serves one client, so that an
-        agent that gets an answer still has the camera.
+        If another agent may take over, the camera is asked: it serves one client, so that an agent
+        that gets an answer still has the camera.
 
         Raises:
             SmartCamError: the camera does not answer.
@@ -313,7 +315,7 @@ class Host:
         return self.gate.holds(reservation)
 
     def lose_reservation(self) -> None:
-        """Have the reservation end before its holder releases it, if there is one."""
+        """End a reservation, if there is one, before its holder releases it."""
         if self.gate.holder is not None:
             self.gate.forget(self.gate.holder)
 
@@ -334,13 +336,13 @@ class Host:
     # ------------------------------------------------------------------ what the camera is
 
     def state(self) -> dict[str, Any]:
-        """Return the fields that every state message has of the camera."""
+        """Return the camera's fields of every state message."""
         camera = self._camera
         try:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
-        # a link that has just ended is no loss yet: what came before is not all told
+        # a link that has just ended is no loss yet: earlier results are still to be sent
         trouble = self.failure or camera.trouble
         fields: dict[str, Any] = {
             "connected": trouble is None,
@@ -355,7 +357,7 @@ class Host:
         return fields
 
     def known(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return the presence of a session, its status, its application and why there is none."""
+        """Return the presence of a session, its status and application, or why there is none."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)
@@ -365,7 +367,7 @@ class Host:
         return trouble is None, status, camera.active_application, why
 
     def about(self) -> dict[str, Any]:
-        """Return the fields on the camera that stay the same for a whole session."""
+        """Return the fields of the camera that stay the same for a whole session."""
         camera, settings = self._camera, self.settings
         fields: dict[str, Any] = {
             "camera": self.name,
@@ -393,7 +395,7 @@ class Host:
     def _on_event(self, event: CameraEvent) -> None:
         self._tell(event)
         if isinstance(event, StatusChanged):
-            return  # a status tells that
+            return  # a status reports that
         self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
@@ -411,15 +413,15 @@ class Host:
         self.lose_reservation()
 
     def say_removed(self, why: str) -> None:
-        """Say that this agent shares the camera no more, and why."""
+        """Announce that this agent no longer shares the camera, and why."""
         self._say({"kind": "Removed", "why": why})
 
     def _on_taken(self) -> None:
-        """Say that another client has the camera: it is tried again now and then."""
+        """Announce that another client has the camera, which is tried again at intervals."""
         self._say({"kind": "Taken"})
 
     def _say(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
-        """Send an event with the camera's state; within ``hold`` seconds, or with the next one."""
+        """Send an event with the camera's state, within ``hold`` seconds or with the next event."""
         clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
         self._have_said(encode_state(said), clock, hold)
@@ -434,7 +436,7 @@ class Host:
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
-        """Keep results that came together, and say them: soon, with what comes meanwhile."""
+        """Keep results that came together, and send them soon, with those that come meanwhile."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
@@ -471,12 +473,12 @@ class Host:
         self.topics.on_run(run)
 
     def untold(self, since: int) -> list[bytes]:
-        """Return the states that are not said yet, from number ``since`` on."""
+        """Return the states that are not sent yet, from number ``since`` on."""
         fresh = self._fresh_states
         return fresh[max(0, since - self.states.following + len(fresh)) :]
 
     def forget_fresh(self) -> None:
-        """Drop the states that were not sent yet, since all who hear them were told."""
+        """Drop the states that were not sent yet, since all their receivers have them."""
         self._held.clear()
         self._fresh_states.clear()
         self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP)
@@ -518,7 +520,7 @@ class Host:
             self._remind(0)
 
     def _remind(self, step: int) -> None:
-        """Tell the last number again in a while; after the last reminder, no more."""
+        """Send the last number again later; stop after the last reminder."""
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None

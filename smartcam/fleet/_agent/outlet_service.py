@@ -32,10 +32,10 @@ MAX_STORE_QUESTIONS = 4
 """Questions to stores of one agent that are under way at most; each has a thread."""
 
 MAX_STORED_ROWS = 1000
-"""Rows of a store in one answer."""
+"""Largest number of rows of a store in one answer."""
 
 MAX_ROWS_BYTES = 1 << 23
-"""Bytes of rows in one answer; beyond, the oldest are left out."""
+"""Largest number of bytes of rows in one answer; beyond, the oldest are left out."""
 
 ROW_BYTES = 300
 """Bytes of a row beside its value and its error, about."""
@@ -51,7 +51,7 @@ class ToldOutlet(NamedTuple):
         delivered: results and errors that the far end took.
         spooled: results and errors that wait.
         dropped: results and errors that were given up, by the reason.
-        trouble: why nothing is delivered, or spooled, at the time; "" where all is well.
+        trouble: why nothing is delivered, or spooled, at the time; "" if all is well.
     """
 
     agent: str
@@ -68,7 +68,7 @@ class ToldStore(NamedTuple):
 
     Attributes:
         agent: name of the agent.
-        outlet: name of the outlet that writes the store; "" where the agent could not answer.
+        outlet: name of the outlet that writes the store; "" if the agent could not answer.
         rows: rows that were asked for, the oldest first, with the columns of the store's table
             ``results`` by their names.
         total: results, errors and gaps of the time and the cameras, shown or not.
@@ -77,7 +77,7 @@ class ToldStore(NamedTuple):
         gaps: number of gaps.
         lost: results that the gaps tell of.
         at_least: whether more may be lost than the gaps count.
-        error: why the store could not be asked; "" where it was.
+        error: why the store could not be asked; "" if it was.
     """
 
     agent: str

@@ -78,7 +78,7 @@ class FleetServer(Server):
         observers: observers of all sessions; add them before the server is started.
         outlet_states: function that returns the states of the outlets, by name.
         stored_results: function that returns what the stores of results say, by outlet.
-        calibrations: calibrations of the cameras; None where there is no folder for them.
+        calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Raises:
         ConfigurationError: something in the file cannot work.
@@ -120,7 +120,7 @@ class FleetServer(Server):
         section = self.file.ros2
         self._restore = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # what is told of cameras in ROS, of those that a reload brings, too
+        # settings of cameras for ROS, also of those that a reload adds
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
@@ -195,7 +195,7 @@ class FleetServer(Server):
         """Return the calibrations of the cameras, in the folder that the file says.
 
         Raises:
-            ConfigurationError: the folder cannot be made.
+            ConfigurationError: the folder cannot be created.
         """
         if self.file.calibrations is None:
             return None

@@ -29,7 +29,7 @@ IN_A_TURN = 50
 """Cameras that are told, or read, before the event loop has another turn."""
 
 MAX_PATTERN_BYTES = 4096
-"""Bytes of a question at most."""
+"""Largest number of bytes of a question."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +41,9 @@ class CameraSummary:
         agent: name of the agent that shares the camera.
         connected: whether the agent has a session with it.
         status: last status that the camera told; None before the first.
-        application: active application; None where it is not known.
+        application: active application; None if it is not known.
         reserved_by: the program that has reserved the camera, in words; None without one.
-        reason: why there is no session; None where there is one.
+        reason: why there is no session; None if there is one.
     """
 
     camera: str

@@ -191,9 +191,10 @@ class BusQuestion(abc.ABC):
 
 
 class MemoryBus:
-    """A bus inside this process, for ends in one event loop.
+    """A bus inside this process, for agents and programs in one event loop.
 
-    ``MemoryBus().end()`` gives an end. Deliveries are calls of the event loop, in order.
+    Hand ``MemoryBus().end()`` to each as its ``bus``. Deliveries are calls of the event loop, in
+    order.
     """
 
     def __init__(self) -> None:

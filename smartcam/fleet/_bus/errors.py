@@ -16,7 +16,7 @@ from smartcam.exceptions import (
 from smartcam.models import jsonable
 
 MAX_CHAIN = 8
-"""Causes behind causes of one error that cross the bus at most."""
+"""Largest number of chained causes of one error that cross the bus."""
 
 
 def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:

@@ -50,7 +50,8 @@ def meets(one: str, other: str) -> bool:
 
 def _meet(one: Sequence[str], other: Sequence[str]) -> bool:
     """Return True if the chunks of two patterns meet, in as many steps as pairs of chunks."""
-    # for each beginning of the other one: whether what was seen of the first meets it
+    # for each beginning of the other pattern: whether the part of the first that was seen matches
+    # it
     row: list[bool] = [True]
     for chunk in other:
         row.append(row[-1] and chunk == "**")

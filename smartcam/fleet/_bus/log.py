@@ -30,7 +30,7 @@ class Numbered(Protocol):
 
     @property
     def next(self) -> int:
-        """The number behind the last one."""
+        """The number after the last one."""
         ...
 
     @property
@@ -142,8 +142,8 @@ class Feed(Generic[NumberedT]):
 
     Args:
         take: gets each thing once, in order of the numbers.
-        miss: function that is told how many could not be had any more, and what came next; None
-            where nothing did.
+        miss: function that is told how many could not be had any more, and what came next; None if
+            nothing did.
         lacks: function that is called where something is missing; then who made the feed is to ask
             the agent for what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
@@ -175,8 +175,8 @@ class Feed(Generic[NumberedT]):
         self._held_bytes, self._most_held = 0, most_held
         self._returns = returns
         self._announced = 0  # the highest number of this epoch that the agent said comes next
-        self._places: dict[int, int] = {}  # of epochs before: the number to come next
-        self._said: dict[int, int] = {}  # of other epochs: the number that was said to come next
+        self._places: dict[int, int] = {}  # next expected number, by earlier epoch
+        self._said: dict[int, int] = {}  # next number that was announced, by other epoch
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Take what has ``expected`` or a later number, of this epoch of the agent.

@@ -248,6 +248,11 @@ def decode_runs(payload: bytes, what: str) -> Batch:
     return Batch(epoch, following, runs)
 
 
+def decode_own_run(data: bytes) -> ResultRun:
+    """Return the run that :meth:`ResultRun.encode` made in this process."""
+    return _decode_run(data, 0)[0]
+
+
 def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
     number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
         _RUN.unpack_from(payload, place)
@@ -373,7 +378,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
 
 
 def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
-    """Return the program and its call in ``payload``; None where it is a JSON message.
+    """Return the program and its call in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``what`` names it.
@@ -440,7 +445,7 @@ def encode_outcome(
 
 
 def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
-    """Return the reply to a trigger in ``payload``; None where it is a JSON message.
+    """Return the reply to a trigger in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``what`` names it.

@@ -1,8 +1,9 @@
 """The bus between processes and hosts: Zenoh, whose binding calls back in threads of its own.
 
-What comes is put into one queue, and a burst wakes the event loop once. Nothing is said in a way
-that could make the loop wait: what does not fit into the engine's buffers is dropped there, and who
-hears it finds the gap by the numbers. What is long, or much, goes out in a thread, which may wait.
+What comes is put into one queue, and a burst wakes the event loop once. The loop waits for room in
+the engine's buffers, but a millisecond at most. Results, states and parts of frames that find none
+are dropped there, and who hears them finds the gap by their numbers. Calls and replies are never
+dropped for want of room: those that were slow to go are said again by a thread, which may wait.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from smartcam._zenoh import (
     MAX_WAITING_BYTES,
     NOT_ZENOH,
     QUERY_BYTES,
+    ROOM_TIMEOUT,
     BusLink,
     ZenohDeclared,
     ZenohSession,
@@ -50,10 +52,12 @@ LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
 BURST_PERIOD = 0.01
 """Seconds in which a few messages go out at once, and further ones together."""
 
-MAX_EXPRESS_MESSAGES, MAX_DIRECT_MESSAGES = 8, 64
-"""Messages in that time that each go out at once, and those that the loop says itself. The engine
-has room for 16 packets of a kind on their way: the next go in packets of many, up to a millisecond
-later, and what comes then is said by the thread, for the engine would drop it."""
+MAX_EXPRESS_MESSAGES = 8
+"""Messages in that time that each go out at once. The engine has room for 16 packets of a kind on
+their way: the next messages go in packets of many, up to a millisecond later."""
+
+SENDERS = 8
+"""Threads that say what may have to wait; a program that does not read blocks one of them."""
 
 
 class ZenohEnd(ZenohSession, Bus):
@@ -68,8 +72,9 @@ class ZenohEnd(ZenohSession, Bus):
         super().__init__(link, more)
         self._warned: tuple[bytes, int] | None = None
         self._looking: asyncio.Task[None] | None = None
-        self._sender: ThreadPoolExecutor | None = None
+        self._senders: dict[int, ThreadPoolExecutor] = {}
         self._sending = 0
+        self._doubtful = 0  # messages that may have been dropped, and are not said again yet
         self._behind: collections.Counter[str] = collections.Counter()
         self._calm_since, self._said = -BURST_PERIOD, 0
         zenoh = self._zenoh
@@ -88,8 +93,8 @@ class ZenohEnd(ZenohSession, Bus):
         }
 
     def _threads(self) -> list[ThreadPoolExecutor]:
-        sender, self._sender = self._sender, None
-        return super()._threads() + ([] if sender is None else [sender])
+        senders, self._senders = self._senders, {}
+        return [*super()._threads(), *senders.values()]
 
     # ------------------------------------------------------------------ life
 
@@ -197,25 +202,23 @@ class ZenohEnd(ZenohSession, Bus):
         session = self._session
         if session is None:
             return
-        now = self._loop.time()
-        if now - self._calm_since > BURST_PERIOD:
-            self._calm_since, self._said = now, 0
+        begun = self._loop.time()
+        if begun - self._calm_since > BURST_PERIOD:
+            self._calm_since, self._said = begun, 0
         self._said += 1
         # what is said by itself goes out at once, a burst together: there is not room for many
         express = self._said <= MAX_EXPRESS_MESSAGES
         # a router, and a peer, has one to each who listens
         way = "" if self._link.mode == "client" else key
-        if (
-            len(payload) > MAX_DIRECT_BYTES
-            or self._said > MAX_DIRECT_MESSAGES
-            or way in self._behind
-        ):
-            self._hand_over(way, session, key, payload, self._waiting_for_room[express])
+        if len(payload) > MAX_DIRECT_BYTES or self._doubtful or way in self._behind:
+            self._hand_over(way, session, key, payload, express)
             return
         try:
             session.put(key, payload, **self._dropping[express])
         except self._zenoh.ZError as exc:  # it ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
+        if self._loop.time() - begun >= ROOM_TIMEOUT:
+            self._hand_over(way, session, key, payload, express, doubtful=True)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         if self._session is not None:
@@ -234,28 +237,54 @@ class ZenohEnd(ZenohSession, Bus):
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
 
     def _hand_over(
-        self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
+        self,
+        way: str,
+        session: Any,
+        key: str,
+        payload: bytes,
+        express: bool,
+        *,
+        doubtful: bool = False,
     ) -> None:
-        """Have a thread say it, which waits until there is room; what goes the same way, too."""
-        if self._sender is None:
-            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+        """Have a thread say it, which waits until there is room; what goes the same way, too.
+
+        Args:
+            way: key of what is said in order.
+            session: the engine's session.
+            key: key of the message.
+            payload: the message.
+            express: whether the message goes out at once.
+            doubtful: whether it was said before, and took so long that the engine may have dropped
+                it. The engine then drops what follows at once, until it has sent something; so all
+                goes by threads until this one is through. Who hears it twice knows it by its
+                number.
+        """
         size = len(payload)
         if self._sending + size > MAX_WAITING_BYTES:
             logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
             return
+        lane = hash(way) % SENDERS
+        sender = self._senders.get(lane)
+        if sender is None:
+            sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
+        how = self._waiting_for_room[express]
 
         def say() -> None:
-            _put(session, key, payload, how)
-            with self._lock:
-                self._sending -= size
-                self._behind[way] -= 1
-                if not self._behind[way]:
-                    del self._behind[way]
+            try:
+                _put(session, key, payload, how)
+            finally:
+                with self._lock:
+                    self._sending -= size
+                    self._doubtful -= doubtful
+                    self._behind[way] -= 1
+                    if not self._behind[way]:
+                        del self._behind[way]
 
         with self._lock:
             self._sending += size
+            self._doubtful += doubtful
             self._behind[way] += 1
-        self._sender.submit(say)
+        sender.submit(say)
 
     def publisher(
         self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
@@ -318,7 +347,7 @@ class ZenohEnd(ZenohSession, Bus):
         self, ask: Callable[[Any, Any], None], timeout: float
     ) -> list[tuple[str, bytes]]:
         """Return all answers; ``ask`` sends the question, given the session and a callback."""
-        zenoh, session = self._zenoh, self._session
+        session = self._session
         answers: list[tuple[str, bytes]] = []
         done = self._loop.create_future()
 
@@ -337,7 +366,7 @@ class ZenohEnd(ZenohSession, Bus):
         if session is None:
             return answers
         ended = functools.partial(self.in_loop, end, 0)
-        ask(session, zenoh.handlers.Callback(on_reply, ended, indirect=False))
+        ask(session, direct(on_reply, ended))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await done
@@ -382,10 +411,22 @@ class ZenohEnd(ZenohSession, Bus):
 
     # ------------------------------------------------------------------ for what is declared
 
-    def publish(self, publisher: Any, payload: bytes) -> None:
-        """Have a publisher say something."""
-        if publisher is not None:  # else its session is about to be there
-            quietly(publisher.put, payload)
+    def publish(self, publisher: Any, payload: bytes, urgent_key: str | None) -> None:
+        """Have a publisher say something.
+
+        Args:
+            publisher: the engine's; None while its session is about to be there.
+            payload: the message.
+            urgent_key: key of the message if it waits in one line with those of :meth:`put`.
+        """
+        session = self._session
+        if publisher is None or session is None:
+            return
+        begun = self._loop.time()
+        quietly(publisher.put, payload)
+        if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
+            way = "" if self._link.mode == "client" else urgent_key
+            self._hand_over(way, session, urgent_key, payload, False, doubtful=True)
 
 
 class _OnBus(ZenohDeclared, Handle):
@@ -400,6 +441,7 @@ class _ZenohPublisher(Publisher):
         self._end = end
         self._heard = False
         self._told = on_heard
+        self._urgent_key = key if urgent else None
 
         def declare(session: Any) -> Any:
             return session.declare_publisher(
@@ -437,7 +479,7 @@ class _ZenohPublisher(Publisher):
         return self._heard
 
     def put(self, payload: bytes) -> None:
-        self._end.publish(self._publisher, payload)
+        self._end.publish(self._publisher, payload, self._urgent_key)
 
     def close(self) -> None:
         self._declared.close()
@@ -462,7 +504,7 @@ class _ZenohQuestion(BusQuestion):
 
 
 def place_of(said: str) -> tuple[str, int] | None:
-    """Return the address and the port that the engine writes; None where there are none."""
+    """Return the address and the port that the engine writes; None if there are none."""
     there = LINK.match(said)
     return None if there is None else (plain_host(there["host"]), int(there["port"]))
 

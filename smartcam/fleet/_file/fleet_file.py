@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 MAX_CAMERAS_PER_AGENT = 10_000
-"""Cameras of one agent; each emulated one has a port of its own."""
+"""Largest number of cameras of one agent; each emulated one has a port of its own."""
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 _PATTERN = "/**"
@@ -187,7 +187,7 @@ class FramesEntry(Fields):
         return frames.open(url, camera_info=self.lens(folder), stall=self.stall, linger=self.linger)
 
     def lens(self, folder: Path) -> CameraModel | None:
-        """Return the lens, None where the file names none.
+        """Return the lens, None if the file names none.
 
         Raises:
             CalibrationError: the file is no lens.
@@ -204,7 +204,7 @@ class FramesEntry(Fields):
         return read_cameras(path, "camera_info").cameras[0]
 
     def camera_info_url(self, folder: Path) -> str:
-        """Return the URL of ROS' ``camera_info``; empty where that is none of ROS' files."""
+        """Return the URL of ROS' ``camera_info``; empty if that is none of ROS' files."""
         if self.camera_info is None:
             return ""
         path = (folder / self.camera_info).absolute()

@@ -86,7 +86,7 @@ class RosCamera(Fields):
     )
 
     def load_calibration(self, folder: Path) -> AnyCalibration | None:
-        """Return the calibration, None where the file names none.
+        """Return the calibration, None if the file names none.
 
         Args:
             folder: folder that the fleet file is in.
@@ -102,7 +102,7 @@ class RosCamera(Fields):
         return load_calibration(folder / self.calibration)
 
     def load_hand_eye(self, folder: Path) -> HandEyeCalibration | None:
-        """Return the hand-eye calibration, None where none is named; as ``load_calibration``."""
+        """Return the hand-eye calibration, None if none is named; as ``load_calibration``."""
         if self.hand_eye is None:
             return None
         from smartcam.calibration import HandEyeCalibration
@@ -110,7 +110,7 @@ class RosCamera(Fields):
         return HandEyeCalibration.load(folder / self.hand_eye)
 
     def robot_pose(self) -> Transform | None:
-        """Return the pose of ``calibrated_at``, None where the file names none.
+        """Return the pose of ``calibrated_at``, None if the file names none.
 
         Raises:
             CalibrationError: the numbers are no pose.

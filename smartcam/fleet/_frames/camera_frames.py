@@ -1,9 +1,9 @@
-"""A camera's frames at its agent: one source, for all programs that look.
+"""Share a camera's frames at its agent: one source for all programs.
 
 A program that wants a stream asks for one frame after the other: the next request is here before
-the next frame is, so nothing is late, and a program that asks no more gets no more. Between two
-requests the agent keeps a reader for it, which skips and counts as any other. That one ends with
-its program, or when nothing was asked for a while; with the last one the device stops.
+the next frame, so nothing is late, and a program that stops asking gets nothing. Between two
+requests the agent keeps a reader for the program, which skips and counts like any other. It ends
+with its program, or after a while without a request; with the last reader the device stops.
 """
 
 from __future__ import annotations
@@ -41,19 +41,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_STREAMS_PER_ROLE = 256
-"""Streams of one camera that the programs of one role may have."""
+"""Largest number of streams of one camera that the programs of one role may have."""
 
 MAX_STREAMS_PER_PROGRAM = 16
-"""Streams of one camera that one program may have."""
+"""Largest number of streams of one camera that one program may have."""
 
 MAX_FRAME_CALLS_PER_PROGRAM = 16
-"""Calls for frames of one camera that one program may have under way: each may keep a frame."""
+"""Largest number of calls for frames of one camera that one program may have pending: each may keep
+a frame."""
 
 MAX_ENCODINGS = 16
-"""Ways of encoding whose last frame is kept, for viewers that want the same."""
+"""Number of encodings whose last frame is kept, for viewers that want the same."""
 
 MAX_VIDEO_SETTINGS = 4
-"""Settings of H.264 that are encoded at one time."""
+"""Largest number of settings of H.264 that are encoded at one time."""
 
 MAX_LENSES = 16
 
@@ -62,10 +63,10 @@ class FramesOf(NamedTuple):
     """The source of a camera's frames.
 
     Attributes:
-        make: returns the source; None: there is none.
+        make: function that returns the source; None: there is none.
         url: address of the source, without a password; for people.
-        teller: observer of the camera's sessions that tells the others which picture each result
-            is made of; None: nobody knows it.
+        teller: observer of the camera's sessions that tells the others the picture of each result;
+            None: there is none.
     """
 
     make: Callable[[], FrameSource] | None
@@ -77,7 +78,7 @@ NO_FRAMES = FramesOf(None, None)
 
 
 class _Encoded(NamedTuple):
-    """The last frame that was encoded in one way."""
+    """The last frame in one encoding."""
 
     frame: Frame
     task: asyncio.Task[Frame]
@@ -118,7 +119,7 @@ class SharedFrames:
     # ------------------------------------------------------------------ life
 
     async def close(self) -> None:
-        """End all streams, and give the device back. Idempotent."""
+        """End all streams, and release the device. Idempotent."""
         self._closed = True
         for viewer in self._viewers.values():
             viewer.close()
@@ -137,7 +138,7 @@ class SharedFrames:
 
     @property
     def closed(self) -> bool:
-        """True once the device is given back for good."""
+        """True once the device is released for good."""
         return self._closed
 
     @property
@@ -147,7 +148,7 @@ class SharedFrames:
 
     @property
     def statistics(self) -> SourceStatistics | None:
-        """Statistics of the source; None where it is not open."""
+        """Statistics of the source; None if it is not open."""
         return None if self._source is None else self._source.statistics()
 
     def forget(self, program: str) -> None:
@@ -156,13 +157,13 @@ class SharedFrames:
             self._viewers.pop(key).close()
 
     async def source(self) -> FrameSource:
-        """Return the source, opened where it is not.
+        """Return the source, opened if it is not open.
 
         Raises:
             UnsupportedError: the camera has none.
             FrameSourceError: the source cannot be opened; the next one tries again.
 
-        Cancellation: it is opened all the same, for the next viewer.
+        Cancellation: it is opened nevertheless, for the next viewer.
         """
         if self._source is not None:
             return self._source
@@ -185,7 +186,7 @@ class SharedFrames:
     # ------------------------------------------------------------------ calls
 
     async def about(self, timeout: float) -> dict[str, Any]:
-        """Return the format of the camera's frames, as the device tells it."""
+        """Return the format of the camera's frames, as the device reports it."""
         with self._within(timeout, "the device"):
             async with asyncio.timeout(timeout):
                 made = (await self.source()).format
@@ -211,10 +212,10 @@ class SharedFrames:
         """Return one frame, and the seconds that it took to encode it.
 
         Args:
-            order: the asking program, and the form in which the frame is to come.
-            max_age: seconds since the frame was captured, at most; None for any.
-            after: time of the agent's clock after which the frame is to be exposed.
-            fresh: whether the frame is to be exposed after this request came.
+            order: the asking program, and the form of the frame.
+            max_age: largest age of the frame, seconds since it was captured; None for any.
+            after: time of the agent's clock after which the frame must be exposed.
+            fresh: whether the frame must be exposed after this request.
         """
         now = time.monotonic() + self.sender.ahead
         with self._counted(order), self._within(order.timeout, "a frame"):
@@ -273,13 +274,13 @@ class SharedFrames:
         await (await self._soon(timeout)).features[name].execute(timeout=timeout)
 
     async def _soon(self, timeout: float) -> FrameSource:
-        """Return the source, opened where it is not."""
+        """Return the source, opened if it is not open."""
         with self._within(timeout, "the device"):
             async with asyncio.timeout(timeout):
                 return await self.source()
 
     async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
-        """Send what a stream has not had; say that there is none after a while."""
+        """Send the new frames of a stream; after a while without any, send that there are none."""
         came = asyncio.get_running_loop().time()
         key = order.program, stream
         with self._counted(order):
@@ -362,7 +363,7 @@ class SharedFrames:
         ending.add_done_callback(self._done)
 
     def leave(self, program: str, stream: int) -> None:
-        """End a stream; does nothing where it is not known."""
+        """End a stream; does nothing if it is not known."""
         viewer = self._viewers.get((program, stream))
         if viewer is not None:
             self._leave((program, stream), viewer)
@@ -375,7 +376,7 @@ class SharedFrames:
             self._encoded.clear()
 
     def lens(self, number: int) -> dict[str, Any]:
-        """Return a lens that frames have named by its number, and where they name another."""
+        """Return the lens with a number from a frame; None if it is not known."""
         found = self._lenses.get(number)
         return {"lens": None if found is None else found.to_data()}
 
@@ -385,7 +386,7 @@ class SharedFrames:
         """Send the bytes of frames.
 
         Raises:
-            FrameFormatError: there are more of them than a frame may have.
+            FrameFormatError: the frame is larger than a frame may be.
         """
         size = sum(len(frame.data) for frame in frames)
         if size > MAX_FRAME_BYTES:
@@ -408,7 +409,7 @@ class SharedFrames:
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
-        """Return a frame encoded, once for all that want the same, and the seconds it took."""
+        """Return a frame encoded, once for all equal requests, and the seconds that it took."""
         if encoding.name == "raw":
             return frame, 0.0
         last = self._encoded.pop(encoding, None)
@@ -424,7 +425,7 @@ class SharedFrames:
         return made, 0.0 if made is frame else time.perf_counter() - began
 
     def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
-        """Have something done for whoever waits for it; it ends with the agent."""
+        """Start work for tasks that wait for it; it ends with the agent."""
         task = asyncio.get_running_loop().create_task(
             work, name=f"smartcam.fleet.{self.name}.{what}"
         )
@@ -435,7 +436,7 @@ class SharedFrames:
     def _done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
-            task.exception()  # it was told to who waited, if anybody did
+            task.exception()  # tasks that waited got the error
 
     def _lens_number(self, lens: CameraModel | None) -> int:
         if lens is None:
@@ -451,7 +452,7 @@ class SharedFrames:
 
     @contextlib.contextmanager
     def _counted(self, order: FrameOrder) -> Iterator[None]:
-        """Count the calls of a program that are under way."""
+        """Count the pending calls of a program."""
         under_way = self._asking.get(order.program, 0)
         if under_way >= MAX_FRAME_CALLS_PER_PROGRAM:
             raise LocalProtocolError(
@@ -469,7 +470,7 @@ class SharedFrames:
 
     @contextlib.contextmanager
     def _within(self, seconds: float, what: str) -> Iterator[None]:
-        """Have a timeout say what it waited for."""
+        """Make a timeout name what it waited for."""
         try:
             yield
         except TimeoutError as exc:

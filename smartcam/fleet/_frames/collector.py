@@ -66,7 +66,7 @@ class Incoming:
         return self._total is not None and len(self._data) == self._total
 
     async def whole(self, size: int) -> Data | None:
-        """Return the frame's bytes; None where some were lost on the way, or do not come in time.
+        """Return the frame's bytes; None if some were lost on the way, or do not come in time.
 
         Args:
             size: number of bytes that the frame is to have.

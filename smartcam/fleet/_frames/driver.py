@@ -1,4 +1,4 @@
-"""The scheme ``fleet://`` of frame sources: the frames of a camera that an agent shares."""
+"""Define the scheme ``fleet://`` of frame sources: the frames of a camera that an agent shares."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
 class FleetFrameDriver(SharedFrameDriver):
     """Frames of a fleet's camera: ``fleet://HOST/CAMERA?encoding=jpeg&quality=15``.
 
-    ``bitrate`` and ``latency`` are as :meth:`smartcam.Camera.frames` has them. The other parameters
+    ``bitrate`` and ``latency`` are those of :meth:`smartcam.Camera.frames`. The other parameters
     are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
     """
 
@@ -50,8 +50,8 @@ class FleetFrameDriver(SharedFrameDriver):
         return fleet_camera(self._url, {}, ())
 
     async def open(self) -> StreamFormat:
-        """Come to the agent, and have it open the device."""
-        if self._camera.ended:  # it was closed before
+        """Connect to the agent, which opens the device."""
+        if self._camera.ended:  # the driver was closed before
             self._camera = self._make()
             self._frames = self._camera.frame_caller
         try:
@@ -61,7 +61,7 @@ class FleetFrameDriver(SharedFrameDriver):
         return await super().open()
 
     async def close(self) -> None:
-        """Leave the agent."""
+        """Close the connection to the agent."""
         await super().close()
         await self._camera.close()
 

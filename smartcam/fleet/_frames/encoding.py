@@ -38,8 +38,8 @@ class FrameEncoder:
         """Return an encoder of one stream, in the same threads.
 
         Args:
-            fps: frames a second, as far as is known.
-            bitrate: bits a second; None: of even quality.
+            fps: frames per second, as far as is known.
+            bitrate: bits per second; None: of even quality.
 
         Raises:
             MissingExtraError: the codec is not installed.

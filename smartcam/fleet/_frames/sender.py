@@ -28,11 +28,12 @@ WINDOW_BYTES = 3 * PART_BYTES
 what does not fit; behind a router two programs share that queue."""
 
 MAX_UNCOUNTED_BYTES = 1 << 16
-"""Bytes of a frame that is one packet, and not counted: nobody says that it has come."""
+"""Largest number of bytes of a frame that is one packet, and not counted: nobody says that it has
+come."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of frames that may wait for one program; the oldest of which no part is under way are given
-up."""
+"""Largest number of bytes of frames that may wait for one program; the oldest of which no part is
+under way are given up."""
 
 STALE_AFTER = 10.0
 """Seconds after which a frame of which nothing came there is given up."""

@@ -20,7 +20,7 @@ IDLE_TIMEOUT = 3.0
 """Seconds without a request after which a stream has ended."""
 
 HOLD_TIMEOUT = 1.0
-"""Seconds that a request waits for a frame at most; then it is answered that there is none."""
+"""Seconds that a request may wait for a frame; then the answer is that there is none."""
 
 
 class FrameOrder(NamedTuple):

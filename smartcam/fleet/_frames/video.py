@@ -1,8 +1,8 @@
-"""H.264 of a camera's frames at its agent: one encoder per setting, for all programs that look.
+"""Encode a camera's frames as H.264 at its agent: one encoder per setting for all programs.
 
-A frame of H.264 is nothing without those before it. So the last few are kept, and who asks gets all
-that came since those it has; who is too late for that gets nothing until the next key frame, which
-is made for it, though not more often than every so often.
+A frame of H.264 needs those before it. So the last few are kept, and a program that asks gets all
+since the last one that it has; one that is too late gets nothing until the next key frame, which is
+made for it, but not more often than every :data:`KEY_EVERY` seconds.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ LATE_SECONDS = 0.3
 MAX_UNITS_KEPT = 64
 
 KEY_EVERY = 1.0
-"""Seconds from one key frame to the next at least."""
+"""Seconds that must pass from one key frame to the next."""
 
 
 class VideoUnit(NamedTuple):
     """An encoded frame.
 
     Attributes:
-        number: number of the unit, one more than of the unit before.
+        number: number of the unit, one more than that of the unit before.
         frame: the encoded frame.
         took: seconds to encode it.
         key: whether the unit can be decoded without the units before it.
@@ -83,15 +83,15 @@ class SharedVideo:
 
     @property
     def over(self) -> bool:
-        """True once nothing more comes."""
+        """True once no more frames come."""
         return self._over is not None
 
     async def close(self) -> None:
-        """Encode nothing more; who waits is told. Idempotent."""
+        """Stop encoding, and wake waiting readers. Idempotent."""
         await asyncio.wait([self.end()])
 
     def end(self) -> asyncio.Task[None]:
-        """Begin to close; return the task that ends then."""
+        """Begin to close; return the task, which then ends."""
         if self._over is None:
             self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
         self._reader.close()
@@ -100,13 +100,13 @@ class SharedVideo:
         return self._task
 
     async def after(self, have: int) -> list[VideoUnit]:
-        """Return encoded frames that follow one, or that begin anew, as soon as there are some.
+        """Wait for encoded frames that follow one, or begin with a key frame; return them.
 
         Args:
-            have: number of the last one that is there; 0: none is.
+            have: number of the last frame that the reader has; 0: none.
 
         Raises:
-            FrameSourceError: the source ended with it.
+            FrameSourceError: the source ended with this error.
             FrameFormatError: its frames cannot become video.
             StopAsyncIteration: the video ended.
         """
@@ -128,7 +128,7 @@ class SharedVideo:
         found: list[VideoUnit] = []
         for unit in reversed(kept):
             if unit.made < fresh and found:
-                break  # too late for all of these
+                break  # the reader is too late for all of these
             found.append(unit)
             if unit.key or unit.number == have + 1:
                 return found[::-1]

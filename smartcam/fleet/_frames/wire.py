@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 MAX_FRAME_BYTES = 1 << 28
-"""Bytes of a frame at most: 14,000 x 10,000 pixels of 16 bits."""
+"""Largest number of bytes of a frame: 14,000 x 10,000 pixels of 16 bits."""
 
 ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 """Encodings of frames; raw is as the camera gave them."""
@@ -40,7 +40,7 @@ class FrameForm(NamedTuple):
     Attributes:
         name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
         quality: quality of JPEG, 1 to 100; None for the codec's own.
-        bitrate: bit rate of H.264, bits a second; None for even quality.
+        bitrate: bit rate of H.264, bits per second; None for even quality.
     """
 
     name: str = "raw"
@@ -63,7 +63,7 @@ class FrameForm(NamedTuple):
             name: the encoding.
             quality: quality of a JPEG; None: not given.
             who: name of the asker, for error texts.
-            bitrate: bits a second; None: not given.
+            bitrate: bits per second; None: not given.
             stream: whether the order is for a stream, which video can be.
 
         Raises:

@@ -109,7 +109,7 @@ class JsonCalibrationFace:
 
     @property
     def calibrations(self) -> ThesisCalibration | None:
-        """The calibrations of the camera; None where there is no folder for them."""
+        """The calibrations of the camera; None if there is no folder for them."""
         desks = self._work.calibrations
         return None if desks is None else desks.of(self.name)
 

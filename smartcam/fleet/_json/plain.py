@@ -51,20 +51,20 @@ THESIS = {**CAMERA_SERVICES, **CALIBRATIONS}
 """The services of the thesis' interface by name."""
 
 MAX_REQUEST_BYTES = 1 << 18
-"""Bytes of a request at most."""
+"""Largest number of bytes of a request."""
 
 MAX_CONCURRENT_CALLS = 256
-"""Commands to one camera that may be under way at a time, and questions."""
+"""Largest number of commands to one camera that may be under way at a time, and questions."""
 
 MAX_WAITING_REPEATS = 16
-"""Questions that wait for the answer of one call at most."""
+"""Largest number of questions that wait for the answer of one call."""
 
 MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
 """Answers of commands with an id that are remembered, and their bytes; the oldest are forgotten.
 So it is with questions, for themselves: whoever may only ask pushes no command's answer out."""
 
 MAX_CAMERAS_ADDED = 100
-"""Cameras that Setup adds at most."""
+"""Largest number of cameras that Setup adds."""
 
 GRACE = 0.5
 """Seconds beyond a service's timeout after which it is given up, whatever it does."""
@@ -83,8 +83,8 @@ class _Order(NamedTuple):
         camera: name of the camera whose service is asked for.
         name: name of the service.
         service: the service.
-        fields: fields of the request; None where they cannot be read.
-        error: what is wrong with the request; None where nothing is.
+        fields: fields of the request; None if they cannot be read.
+        error: what is wrong with the request; None if nothing is.
         waited: seconds that the request may have waited before the agent heard it.
     """
 
@@ -173,7 +173,7 @@ class Plain:
         agent: the agent.
         keys: keys of the fleet.
         bus: the agent's end of the bus.
-        calibrations: calibrations of the agent's cameras; None where there is no folder for them.
+        calibrations: calibrations of the agent's cameras; None if there is no folder for them.
 
     Attributes:
         topics: topics of the agent's cameras in JSON.
@@ -189,10 +189,10 @@ class Plain:
         self._declared: list[Handle] = []
         self._program = agent.next_program()
         self._numbers = 0
-        # by camera, and whether only operators may ask for them
+        # running calls by camera, and whether only operators may make them
         self._under_way: collections.Counter[tuple[str, bool]] = collections.Counter()
         self._known = {operates: _KnownAnswers() for operates in (True, False)}
-        self._added: dict[str, PlainRequest] = {}  # by Setup, and by which
+        self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
 
     def open(self) -> None:
         """Answer from now on."""

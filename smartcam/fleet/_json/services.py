@@ -1,4 +1,4 @@
-"""Services for programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
+"""Serve programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from smartcam.exceptions import FrameFormatError, UnsupportedError
 from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, outcomes
 from smartcam.fleet._agent.shared import Carrier
 from smartcam.fleet._bus.keys import COMMANDS
-from smartcam.fleet._bus.wire import decode_runs, encode_runs
+from smartcam.fleet._bus.wire import decode_own_run
 from smartcam.fleet._frames.stream import FrameOrder
 from smartcam.fleet._frames.wire import FrameForm, to_fields
 from smartcam.fleet._program.reading import result_fields, singles
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MAX_RESULTS = 1000
-"""Results that one answer brings at most."""
+"""Largest number of results in one answer."""
 
 MAX_INPUT_BYTES = 1 << 16
 MAX_PICTURE_BYTES = 1 << 20
-"""Bytes of a frame in an answer at most."""
+"""Largest number of bytes of a frame in an answer."""
 
 MAX_ID_CHARACTERS = 200
 
@@ -151,15 +151,15 @@ class _PlainSetFeature(PlainRequest):
 
 
 class Work(NamedTuple):
-    """A service under way.
+    """A running service.
 
     Attributes:
         host: the camera.
         topics: topics of the camera in JSON.
-        request: the request, of the service's own kind.
+        request: request of the service's kind.
         timeout: seconds that the service may take.
-        owner: owner of the results that the service's trigger brings.
-        calibrations: calibrations of the agent's cameras; None where there is no folder for them.
+        owner: owner of the results of the service's trigger.
+        calibrations: calibrations of the agent's cameras; None if there is no folder for them.
     """
 
     host: Host
@@ -175,9 +175,9 @@ class Service(NamedTuple):
 
     Attributes:
         request: kind of the requests.
-        do: function that does the service and returns the fields of its answer, but ``error``.
+        do: function that does the service and returns the fields of its answer except ``error``.
         command: whether the service waits while another program has the camera reserved.
-        timeout: seconds, where the request says none.
+        timeout: seconds, if the request has none.
         nothing: fields of the answer beside an error.
     """
 
@@ -197,7 +197,7 @@ async def triggered(
     wanted: int = 1,
     wait: bool = True,
 ) -> list[ResultRun]:
-    """Trigger; return its containers, each a run of its own.
+    """Trigger; return the containers, each as its own run.
 
     Raises:
         SmartCamError: as :meth:`smartcam.Camera.trigger`.
@@ -205,8 +205,7 @@ async def triggered(
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
     runs = await outcomes(work.host, work.owner, request, application, work.timeout)
-    batch = decode_runs(encode_runs(0, 0, runs), "results")
-    return [one for run in batch.runs for one in singles(run)]
+    return [one for run in runs for one in singles(decode_own_run(run))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
@@ -238,7 +237,7 @@ async def _status(work: Work) -> dict[str, Any]:
 
 
 def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
-    """Return the function of a service that does the same as a call of smartcam's programs."""
+    """Return the function of a service that does the same as a call by smartcam's own programs."""
 
     async def service(work: Work) -> dict[str, Any]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
@@ -256,8 +255,8 @@ async def _results(work: Work) -> dict[str, Any]:
     kept, most = work.host.results, work.request.most
     first = max(1, kept.following - most) if work.request.first is None else work.request.first
     part = kept.part(first, MAX_REPLY_BYTES)
-    batch = decode_runs(encode_runs(0, 0, part.data), "results that are kept")
-    found = (one for run in batch.runs for one in singles(run) if one.number >= part.first)
+    runs = map(decode_own_run, part.data)
+    found = (one for run in runs for one in singles(run) if one.number >= part.first)
     results = [work.topics.result(one) for one in itertools.islice(found, most)]
     return {"first": part.first, "next_result": part.following, "results": results}
 
@@ -290,7 +289,7 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
         )
     said = to_fields(frame, 0.0, took, 0)
     own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
-    if "trigger" in own:  # the time of it is by a clock of the agent's own
+    if "trigger" in own:  # its time is that of the agent's clock
         own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
     return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
 
@@ -300,7 +299,7 @@ async def _unknown(work: Work) -> dict[str, Any]:
 
 
 UNKNOWN = Service(PlainRequest, _unknown)
-"""Service that answers in place of one that is not there."""
+"""Service that answers in place of an unknown one."""
 
 _OF_ALL = {*PlainRequest.model_fields}
 

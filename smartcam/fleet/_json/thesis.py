@@ -85,7 +85,7 @@ class JsonThesisFace:
 
     @property
     def application(self) -> int | None:
-        """The id of the active application; None where that is not known."""
+        """The id of the active application; None if that is not known."""
         return self._host.camera.active_application
 
     @property
@@ -94,7 +94,7 @@ class JsonThesisFace:
         return self._topics.interpretation
 
     def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError where results cannot be read by ``spec``."""
+        """Raise ConfigurationError if results cannot be read by ``spec``."""
         self._topics.reading(spec)
 
     def read_as(self, spec: str | None) -> None:
@@ -106,7 +106,7 @@ class JsonThesisFace:
         return False
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError where there can be no such topic."""
+        """Raise ConfigurationError if there can be no such topic."""
         _topic(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:

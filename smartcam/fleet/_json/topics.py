@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from smartcam.models import CameraEvent
 
 MAX_QUEUED_BYTES = 1 << 24
-"""Bytes of containers that wait for a topic with a delay; the oldest beyond are dropped."""
+"""Largest number of bytes of containers that wait for a topic with a delay; the oldest beyond are
+dropped."""
 
 Kind = Literal["results", "status", "events"]
 
@@ -71,7 +72,7 @@ class Topics:
             handle.close()
 
     def heard(self, kind: Kind, camera: str) -> Publisher | None:
-        """Return the publisher of one kind of a camera's messages; None where nobody hears."""
+        """Return the publisher of one kind of a camera's messages; None if nobody hears."""
         everyone = self._any.get(kind)
         if everyone is None or not everyone.heard:
             return None
@@ -144,8 +145,8 @@ class CameraTopics:
 
     Attributes:
         interpret_as: contents of the camera's containers, for values in JSON.
-        interpretation: reader of the containers; None where nobody knows their contents.
-        trouble: why there is no session; empty where there is one.
+        interpretation: reader of the containers; None if nobody knows their contents.
+        trouble: why there is no session; empty if there is one.
         stopped: whether the thesis' SmartcameraStop has closed the camera for its services.
         statuses, events: numbers of the next status and of the next event.
         status_out: publisher of the status under a further topic of somebody's choice.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
 
 MAX_LINES_PER_TURN = 80
-"""Lines that are made at a time."""
+"""Largest number of lines that are made at a time."""
 
 _SUMS = {
     "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),

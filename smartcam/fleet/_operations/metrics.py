@@ -52,7 +52,7 @@ class AgentNumbers(NamedTuple):
 
 
 async def read_numbers(server: FleetServer) -> AgentNumbers | None:
-    """Read an agent in its event loop, a few cameras at a time; None where it does not run."""
+    """Read an agent in its event loop, a few cameras at a time; None if it does not run."""
     agent = server.agent
     if agent is None:
         return None

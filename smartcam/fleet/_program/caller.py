@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import Counters
 
 MAX_DRIFT_RATIO = 1e-4
-"""Seconds in a second by which two clocks go apart at most."""
+"""Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
 """Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
@@ -56,7 +56,7 @@ ASK_ANEW = 5.0
 lost, and a camera that nobody triggers says nothing more."""
 
 MAX_AGENTS_REMEMBERED = 16
-"""Agents of a camera that are remembered."""
+"""Largest number of agents of a camera that are remembered."""
 
 INSIST_AFTER = 1.0
 """Seconds until something is said again that the agent has to know: it may have been lost."""
@@ -145,7 +145,7 @@ class Caller:
         self.end: LinkError | None = None
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
-        self._epochs: dict[str, int] = {}  # of agents that were met
+        self._epochs: dict[str, int] = {}  # epochs of agents that were met
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
         self._stirred = asyncio.Event()
@@ -413,7 +413,7 @@ class Caller:
                 self.lease(number)
 
     def _fence(self, do: str) -> int | None:
-        """Return the reservation in whose block a call is, the oldest; None where there is none.
+        """Return the reservation in whose block a call is, the oldest; None if there is none.
 
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
@@ -646,7 +646,7 @@ class Caller:
             )
 
     def _perhaps(self, do: str) -> str:
-        """Return a text on another reason for silence; empty where there is none."""
+        """Return a text on another reason for silence; empty if there is none."""
         identity = self.program.bus.identity
         if identity is None:
             return ""

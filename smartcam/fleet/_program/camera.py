@@ -117,11 +117,11 @@ class FleetCamera(Camera[ValueT]):
         shared: bool = False,
         observers: Iterable[Observer] = (),
     ) -> None:
-        self._agents_layout: Any = None  # how to read results where this program does not say
+        self._agents_layout: Any = None  # layout for results if this program gives none
         self._unreadable: ConfigurationError | None = None  # why that cannot be used
         self._met = False
         super().__init__(settings, observers=observers)
-        self._camera_name, self._program, self._shared = camera, program, shared
+        self._program, self._shared = program, shared
         self._wire = Counters()
         self._caller = Caller(
             settings.name,
@@ -151,7 +151,7 @@ class FleetCamera(Camera[ValueT]):
         self._trying = True  # the agent's first try to connect is not over
         self._status: Status | None = None
         self._active: int | None = None
-        self._about: dict[str, Any] = {}  # what the agent said of the camera
+        self._about: dict[str, Any] = {}  # facts about the camera from its agent
         self._trouble: LinkError | None = None
         self._closed: LinkError | None = None
         self._watching: set[asyncio.Queue[Status | LinkError]] = set()

@@ -32,7 +32,7 @@ ASK_AGAIN = 0.5
 """Seconds for the answer to where an agent's numbers stand; then it is asked again."""
 
 MAX_AGENTS_NUMBERED = 1000
-"""Agents whose bundles are known by their numbers."""
+"""Largest number of agents whose bundles are known by their numbers."""
 
 
 class _BusPlace(Handle):
@@ -63,11 +63,13 @@ class Exchange(Bus):
     def __init__(self, bus: Bus, keys: Callable[[], Keys]) -> None:
         self._bus, self._keys = bus, keys
         self.local = bus.local
-        self._places: dict[str, dict[str, list[_BusPlace]]] = {}  # of a kind, by their keys
+        self._places: dict[str, dict[str, list[_BusPlace]]] = {}  # places of a kind, by their keys
         self._covers: dict[str, Handle] = {}
         self._present: dict[str, set[str]] = {}  # presences that are there, by the camera's name
-        self._bundles: dict[str, tuple[int, int]] = {}  # of agents: epoch, the number to come next
-        self._seers: list[Callable[[str, bool], None]] = []  # of all cameras' presences
+        # epoch and next expected number of each agent
+        self._bundles: dict[str, tuple[int, int]] = {}
+        # functions that take the presences of all cameras
+        self._seers: list[Callable[[str, bool], None]] = []
         self._lacking: set[str] = set()  # agents of whose bundles something is missing
         self._asking: dict[str, asyncio.Task[None]] = {}
 

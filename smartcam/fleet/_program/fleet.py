@@ -58,13 +58,15 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Cameras of a fleet that are met when it is opened; of a larger one each when it is used."""
+"""Largest number of cameras of a fleet that are met when it is opened; of a larger one each when it
+is used."""
 
 AT_ONCE = 100
 """Cameras that are met, or left, at a time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
-"""Cameras whose results are heard one by one; of more, and most of the fleet, all together."""
+"""Largest number of cameras whose results are heard one by one; of more, and most of the fleet, all
+together."""
 
 STATUS_TIMEOUT = 5.0
 """Seconds for the answers of all agents."""
@@ -144,9 +146,10 @@ class FleetResults(Generic[ValueT]):
         self, subscribe: Callable[[FleetCamera[Any]], Subscription[Result[ValueT]]]
     ) -> None:
         self._subscribe = subscribe
-        # of each camera one; those before it have ended, with a camera that was given up
+        # the subscription of each camera; earlier ones in the list ended with a camera that was
+        # given up
         self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
-        # those that have something
+        # subscriptions that have results
         self._line: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
         self._in_line: set[Subscription[Result[ValueT]]] = set()
         self._ready = asyncio.Event()
@@ -247,7 +250,7 @@ class Fleet:
 
     Args:
         bus: end of the bus, for this fleet alone.
-        address: address of the fleet; None where it is in this process.
+        address: address of the fleet; None if it is in this process.
         fleet: name of the fleet; None for the only one that is there.
         around: context that is entered while the fleet is open.
         timeout: seconds in which the fleet has to be reached.
@@ -274,7 +277,7 @@ class Fleet:
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
         self._present: set[str] = set()  # agents
-        self._agents: dict[str, set[str]] = {}  # of a camera, those that share it
+        self._agents: dict[str, set[str]] = {}  # agents that share each camera
         self._handles: list[Handle] = []
         self._opening: dict[str, asyncio.Task[None]] = {}
         self._events: Subscribers[FleetEvent] = Subscribers()

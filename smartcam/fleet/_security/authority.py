@@ -178,7 +178,7 @@ class _Authority:
         return found
 
     def make(self, role: str, name: str, hosts: list[str], lifetime: timedelta) -> MadeCertificate:
-        """Return the certificate of a name; it is made, or renewed, if need be."""
+        """Return the certificate of a name; it is made, or renewed, if needed."""
         place = self._folder / name
         old = self._old(place)
         done = "kept"

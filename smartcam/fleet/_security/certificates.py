@@ -22,7 +22,7 @@ VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "route
 """Roles that a certificate's common name may be."""
 
 MAX_BYTES = 1 << 20
-"""Bytes of a file with certificates or a key; each certificate has about 1 kB."""
+"""Largest number of bytes of a file with certificates or a key; each certificate has about 1 kB."""
 
 WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 """Times before its end at which a certificate is warned of."""
@@ -68,7 +68,7 @@ class Identity(NamedTuple):
     Attributes:
         folder: folder of the certificate.
         role: common name in the certificate.
-        name: organisational unit in the certificate; empty where there is none.
+        name: organisational unit in the certificate; empty if there is none.
         ends: when the certificate ends, UTC.
         authority_ends: when the certificate of its authority ends, UTC.
         digest: digest of all three files.
@@ -86,7 +86,7 @@ class Identity(NamedTuple):
 
     @property
     def expired(self) -> str:
-        """Say that it has expired; empty where it has not."""
+        """Say that it has expired; empty if it has not."""
         now = datetime.now(UTC)
         for what, ends in self._endings:
             if now >= ends:
@@ -95,7 +95,7 @@ class Identity(NamedTuple):
 
     @property
     def warning(self) -> str:
-        """Say that it ends soon, or has; empty where it does not."""
+        """Say that it ends soon, or has; empty if it does not."""
         return self.expired or ends_soon(*min(self._endings, key=lambda one: one[1]))
 
     @property
@@ -121,7 +121,7 @@ class Identity(NamedTuple):
 
 
 def ends_soon(what: str, ends: datetime | None) -> str:
-    """Say that something ends soon; empty where it does not."""
+    """Say that something ends soon; empty if it does not."""
     if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""
     return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
@@ -173,7 +173,7 @@ def read_identity(folder: Path) -> Identity:
         authorities = x509.load_pem_x509_certificates(bodies[0])
     except ValueError as exc:
         raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
-    try:  # whether they belong together
+    try:  # whether certificate and key belong together
         context(folder)
     except (ssl.SSLError, OSError) as exc:
         raise ConfigurationError(
@@ -212,8 +212,8 @@ class Handshake(NamedTuple):
     """The outcome of a handshake.
 
     Attributes:
-        trouble: why the last reading failed; empty where it did not.
-        ends: when the other side's certificate ends, UTC; None where it showed none.
+        trouble: why the last reading failed; empty if it did not.
+        ends: when the other side's certificate ends, UTC; None if it showed none.
     """
 
     trouble: str

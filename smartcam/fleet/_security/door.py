@@ -59,7 +59,8 @@ RESERVED_DESCRIPTORS: Final = 256
 """Descriptors that the port leaves to cameras and health; a quarter of all where those are few."""
 
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
-"""Connections of one address that may be on their way in; it gets no further one meanwhile."""
+"""Largest number of connections of one address that may be on their way in; it gets no further one
+meanwhile."""
 
 FEW_HALF_OPEN: Final = 4
 """Half-open connections at which an address gets a further one again."""
@@ -145,8 +146,8 @@ class Door:
 
     Args:
         ports: ports at which the engine listens.
-        links: function for the addresses of links that have come in, such as
-            ``("10.1.0.5", 40123)``; it gives None where they are not known.
+        links: function for the addresses of links that have come in, such as ``("10.1.0.5",
+            40123)``; it gives None if they are not known.
 
     Attributes:
         shut: whether the door takes nobody in.

@@ -1,4 +1,4 @@
-"""Bitmap files, as smart cameras send their pictures."""
+"""Read bitmap files, in which smart cameras send their pictures."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ if TYPE_CHECKING:
 FILE: Final = struct.Struct("<2sIHHI")
 INFO: Final = struct.Struct("<IiiHHIIiiII")
 MAX_PIXEL_BYTES: Final = 1 << 28
-"""Bytes of pixels; no camera has more."""
+"""A bitmap has at most this many bytes of pixels; no camera has more."""
 
 
 def read_bitmap(data: bytes) -> NDArray[np.uint8]:
-    """Return the pixels of a BMP file: (H, W) where it is grey, else (H, W, 3), red first.
+    """Return the pixels of a BMP file: (H, W) if it is grey, else (H, W, 3), red first.
 
-    Read are 8 bits with a palette and 24 or 32 bits, uncompressed, either row first.
+    The file may have 8 bits with a palette, or 24 or 32 bits, uncompressed, with the upper or the
+    lower row first.
 
     Raises:
-        FrameFormatError: the file is cut off, compressed, of other bits, or no bitmap.
+        FrameFormatError: the file is cut off, compressed, has other numbers of bits, or is no
+            bitmap.
     """
     if len(data) < FILE.size + INFO.size or data[:2] != b"BM":
         raise FrameFormatError(
@@ -55,7 +57,7 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
 
 
 def _looked_up(pixels: NDArray[Any], palette: bytes) -> NDArray[np.uint8]:
-    """Return the colours of a palette's indices; an index beyond the palette is black."""
+    """Return the colours of indices into a palette; an index beyond its end is black."""
     colours = np.zeros((256, 4), np.uint8)
     given = np.frombuffer(palette[: len(palette) // 4 * 4], np.uint8).reshape(-1, 4)[:256]
     colours[: len(given)] = given

@@ -1,4 +1,4 @@
-"""H.264 by x264 and FFmpeg, without a frame of delay."""
+"""Encode and decode H.264 by x264 and FFmpeg, without a frame of delay."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_HELD_FRAMES: Final = 32
-"""Encoded frames whose data a decoder remembers until their pictures come out."""
+"""A decoder keeps the data of at most this many encoded frames until their pictures come out."""
 
 
 class Runs(Protocol):
-    """A function that runs work in a thread, such as that of ``Codecs``."""
+    """A function that runs work, in a thread or at once, such as that of ``Codecs``."""
 
     def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
-        """Run the work, in a thread or right here, and return its result."""
+        """Run the work, in a thread or at once, and return its result."""
         ...
 
 
 class H264Encoder:
     """One stream of H.264; made by :meth:`Codecs.h264_encoder`.
 
-    Each frame gives its own bytes at once. Instead of key frames, which are large, a column of each
-    frame is sent whole (intra refresh); the parameter sets are repeated, so one can join late.
-    Another size or format begins the stream anew, with a key frame, and so does a cancelled call,
-    whose bytes nobody has.
+    Each frame is encoded at once into its own bytes. Instead of large key frames, a column of each
+    frame is encoded without reference to earlier ones (intra refresh). The parameter sets are
+    repeated, so a viewer can join late. Another size or format restarts the stream with a key
+    frame, and so does a cancelled call, whose bytes were never returned.
 
-    U and V are shared by four pixels. Y goes in as the camera sent it, with its range told; only
-    RGB is converted, to BT.601 of limited range. A JPEG is decoded to RGB before.
+    Four pixels share U and V. Y is encoded as the camera sent it, and the stream says its range;
+    only RGB is converted, to BT.601 with limited range. A JPEG is decoded to RGB first.
     """
 
     def __init__(
@@ -72,25 +72,25 @@ class H264Encoder:
             self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
         self._bitrate = bitrate
         self._turn = asyncio.Lock()
-        self._one = threading.Lock()  # a cancelled call's thread may still be at it
+        self._one = threading.Lock()  # the thread of a cancelled call may still be using it
         self._codec: Any = None
-        self._grey: Any = None  # frame of the last grey picture, which x264 has copied
+        self._grey: Any = None  # frame of the last grey picture, of which x264 has made a copy
         self._kind: tuple[object, ...] = ()
-        self._broken = 0  # calls whose bytes nobody has
+        self._broken = 0  # number of calls whose bytes were never returned
         self._count = 0
 
     def begin_anew(self) -> None:
-        """Have the next frame be a key frame, for a viewer that joins or has lost something."""
+        """Make the next frame a key frame, for a viewer that joins or has lost data."""
         self._broken += 1
 
     async def encode(self, frame: Frame) -> Frame:
-        """Return a frame of format ``H264`` with all that was known of the one given.
+        """Return a frame of format ``H264`` with all other attributes of the given one.
 
         Raises:
-            FrameFormatError: the frame cannot become video: see the error for what can.
+            FrameFormatError: the frame cannot be encoded; the error says which formats can.
             LocalProtocolError: the codecs are closed.
 
-        Cancellation: safe; the stream begins anew with the next frame.
+        Cancellation: safe; the stream restarts with the next frame.
         """
         async with self._turn:
             try:
@@ -131,20 +131,20 @@ class H264Encoder:
 class H264Decoder:
     """One stream of H.264; made by :meth:`Codecs.h264_decoder`.
 
-    Its pictures are whole: it begins at a key frame, or where a refresh is complete that began when
-    it had decoded something before (FFmpeg alone can take one for complete whose first frame it had
-    no reference for). That takes up to three times the encoder's ``keyint`` in the midst of a
-    stream, two after a loss, and none after :meth:`H264Encoder.begin_anew`.
+    It returns only whole pictures. It begins at a key frame, or at the end of a refresh that began
+    after it had decoded something (FFmpeg alone may take a refresh for complete although its first
+    frame had no reference). In the middle of a stream that takes up to three times the encoder's
+    ``keyint``, after a loss two times, and no time after :meth:`H264Encoder.begin_anew`.
 
     Args:
-        run: runs the work.
-        reorders: whether pictures come in another order than they are shown in, so that some have
-            to wait for others.
-        to: pixel format of FFmpeg that pictures are converted to; "": as they are.
+        run: function that runs the work.
+        reorders: whether pictures are sent in another order than they are shown in, so that some
+            have to wait for others.
+        to: pixel format of FFmpeg that pictures are converted to; "": no conversion.
     """
 
     CODEC: ClassVar = "h264"
-    """The codec's name, as FFmpeg has it."""
+    """The codec's name in FFmpeg."""
     NAME: ClassVar = "H264"
     """The codec's name in texts."""
 
@@ -156,38 +156,40 @@ class H264Decoder:
         self._codec: Any = None
         self._size = (0, 0)
         self._losses = self._losses_seen = 0
-        self._missing: int | None = None  # frames until the picture is whole; None: unknown
-        self._begun = False  # something was decoded that a refresh can refer to
+        # number of frames until the picture is whole; None: unknown
+        self._missing: int | None = None
+        self._begun = False  # whether something was decoded that a refresh can refer to
         self._held: dict[int, Frame] = {}
         self._count = 0
 
     @property
     def whole(self) -> bool:
-        """True if pictures come: the stream is whole since its beginning or the last loss."""
+        """True if pictures come: the stream is whole since its start or its last loss."""
         return self._missing == 0 and self._losses == self._losses_seen
 
     def lost(self) -> None:
         """Report that bytes of the stream are missing: no picture comes until it is whole again.
 
-        A decoder cannot see what is missing, and would go on with a broken picture.
+        A decoder cannot notice that itself, and would go on with a broken picture.
         """
         self._losses += 1
 
     async def decode(self, frame: Frame) -> Frame | None:
-        """Return the next picture, with all that was known of its encoded frame.
+        """Return the next picture, with all other attributes of its encoded frame.
 
         Args:
             frame: frame of format ``H264``; one encoded frame, whole.
 
         Returns:
-            None as long as there is no whole picture: at the start in the midst of a stream, and
-            after a loss.
+            None as long as there is no whole picture: at the start in the middle of a stream, and
+                after a loss.
 
         Raises:
-            FrameFormatError: damaged, or of another size than the frame says; it counts as a loss.
+            FrameFormatError: the frame is damaged, or has another size than it says; that counts as
+                a loss.
             LocalProtocolError: the codecs are closed.
 
-        Cancellation: safe; it counts as a loss.
+        Cancellation: safe; a cancelled call counts as a loss.
         """
         async with self._turn:
             try:
@@ -223,7 +225,7 @@ class H264Decoder:
         room = (frame.width + 64) * (frame.height + 64)
         codec.options = {
             "max_pixels": str(room),
-            "err_detect": "explode",  # refuse half a picture
+            "err_detect": "explode",  # half a picture must be refused
         } | ({} if self._reorders else {"flags": "low_delay"})
         self._held.clear()
         self._missing, self._begun = None, False
@@ -255,7 +257,8 @@ class H264Decoder:
 
     def _made(self, picture: Any) -> Frame:
         frame = self._held.pop(picture.pts)
-        pixels = from_video(picture.reformat(format=self._to) if self._to else picture)
+        picture = picture.reformat(format=self._to) if self._to else picture
+        pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
@@ -269,13 +272,13 @@ class H264Decoder:
 
 
 SLICES, KEY, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
-"""Kinds of units (ITU-T H.264, table 7-1), and a kind of message in one (annex D)."""
+"""Types of NAL units (ITU-T H.264, table 7-1), and one type of message in an SEI unit (annex D)."""
 
 
 def entry_point(data: bytes) -> tuple[bool, int | None]:
-    """Return True for a key frame, and the number of frames until a refresh is over.
+    """Return True for a key frame, and the number of frames until a refresh is complete.
 
-    The number is None where no refresh begins with the frame.
+    The number is None if no refresh begins with the frame.
     """
     refresh = None
     place = data.find(b"\0\0\1")
@@ -292,11 +295,11 @@ def entry_point(data: bytes) -> tuple[bool, int | None]:
 
 
 def _recovery(messages: bytes) -> int | None:
-    """Return recovery_frame_cnt of a unit's messages."""
+    """Return recovery_frame_cnt from the messages of an SEI unit."""
     place = 0
     while place + 2 <= len(messages) and messages[place] != 0x80:
         numbers = []
-        for _ in range(2):  # the kind and the size, each of bytes 255 and a last one
+        for _ in range(2):  # type and size: each is a sum of bytes of 255 and a last smaller one
             number = 0
             while place < len(messages) and messages[place] == 0xFF:
                 number, place = number + 0xFF, place + 1

@@ -1,4 +1,4 @@
-"""JPEG by libjpeg-turbo."""
+"""Decode JPEG by libjpeg-turbo."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ DAMAGE: Final = (
     "inconsistent progression",
     "too many scanlines",
 )
-"""Parts of libjpeg's warnings (``jerror.h``) behind which a part of the picture is grey or wrong.
-The others are of a whole picture: bytes that belong to nothing, a revision or a profile that is not
-known. Common webcams send such pictures, and other decoders show them."""
+"""Texts in libjpeg's warnings (``jerror.h``) that mean that a part of the picture is grey or wrong.
+Other warnings concern whole pictures: surplus bytes, an unknown revision or profile. Common webcams
+send such pictures, and other decoders show them."""
 
 _JFIF: Final = (b"JFIF\0\x01", b"JFXX\0\x10", b"JFXX\0\x11", b"JFXX\0\x13")
 
@@ -35,7 +35,7 @@ class DecodedJpeg(NamedTuple):
 
     Attributes:
         pixels: samples, (H, W, C).
-        remark: remark of the decoder on a picture that is whole all the same; mostly empty.
+        remark: warning of the decoder about a picture that is whole nevertheless; mostly empty.
     """
 
     pixels: NDArray[np.uint8]
@@ -43,7 +43,7 @@ class DecodedJpeg(NamedTuple):
 
 
 def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, int, bool]:
-    """Return width and height, and whether there are colours; nothing is decoded.
+    """Return width and height, and whether the JPEG has colours, without decoding it.
 
     Raises:
         FrameFormatError: the picture is no JPEG.
@@ -52,7 +52,7 @@ def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, i
     simplejpeg = load("simplejpeg")
     try:
         height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except (ValueError, KeyError) as exc:  # the second of what has no known kind of colours
+    except (ValueError, KeyError) as exc:  # the second value is for unknown kinds of colours
         raise _wrong(what, data, exc) from exc
     return width, height, colours != "Gray"
 
@@ -60,16 +60,16 @@ def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, i
 def decode_jpeg(
     data: bytes | bytearray | memoryview, colours: str, size: tuple[int, int], what: str
 ) -> DecodedJpeg:
-    """Return the pixels, and a remark on what the decoder read past.
+    """Return the pixels, and a remark on faults that the decoder skipped.
 
     Args:
         data: a JPEG; also without Huffman tables, as cameras on USB send it.
-        colours: ``GRAY`` for its luma as it stands, or ``RGB``.
-        size: width and height that it is expected to have; another costs no memory.
+        colours: ``GRAY`` for the luma as it is in the file, or ``RGB``.
+        size: expected width and height; no memory is allocated for a picture of another size.
         what: name of the picture for errors.
 
     Raises:
-        FrameFormatError: the picture is cut off, damaged, of another size, or none.
+        FrameFormatError: the picture is cut off, damaged, of another size, or no JPEG.
         MissingExtraError: simplejpeg is not installed.
     """
     width, height, _ = jpeg_header(data, what)
@@ -96,17 +96,17 @@ def _read_past(decode: Any, data: bytes | bytearray | memoryview, colours: str, 
 
 
 def _joined_segments(data: bytes) -> bytes:
-    """Return a JPEG without the bytes between the segments before its first scan.
+    """Return a JPEG without surplus bytes between the segments before its first scan.
 
-    simplejpeg 1.9 refuses these even where it is not strict, and a JFIF segment of a revision that
-    it does not know, which says nothing on the pixels.
+    Even in its tolerant mode simplejpeg 1.9 refuses such bytes, and a JFIF segment of an unknown
+    revision, which does not affect the pixels.
     """
     kept, place = [data[:2]], 2
     while place + 4 <= len(data):
         begin = data.find(b"\xff", place)
         if begin < 0 or data[begin + 1 : begin + 2] in (b"", b"\xda"):
             break
-        if data[begin + 1] in (0, 0xFF):  # a byte that belongs to nothing, or one that fills
+        if data[begin + 1] in (0, 0xFF):  # a surplus byte, or a fill byte
             place = begin + 1
             continue
         place = begin + 2 + int.from_bytes(data[begin + 2 : begin + 4], "big")
@@ -117,10 +117,10 @@ def _joined_segments(data: bytes) -> bytes:
 
 
 def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Exception) -> None:
-    """See that no restart mark is missing: libjpeg tells its last warning, not those before it.
+    """Raise if a restart marker is missing: libjpeg reports only its last warning.
 
     Raises:
-        FrameFormatError: the marks do not follow each other, or the end mark is not there.
+        FrameFormatError: the markers are not in sequence, or the end marker is missing.
     """
     whole = bytes(data)
     scan = whole.rfind(b"\xff\xda")

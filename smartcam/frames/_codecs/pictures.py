@@ -1,4 +1,4 @@
-"""Pictures to JPEG, PNG and JPEG XL and back: functions of a frame that block."""
+"""Convert frames to JPEG, PNG and JPEG XL and back, by functions that block."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def with_pixels(frame: Frame, pixels: NDArray[Any], name: str) -> Frame:
-    """Return the frame with other pixels; all that is known of it stays."""
+    """Return the frame with other pixels and the same other attributes."""
     height, width = pixels.shape[:2]
     kept = np.ascontiguousarray(pixels)
     return replace(
@@ -43,7 +43,7 @@ def _with_bytes(frame: Frame, data: bytes, name: str) -> Frame:
 
 
 def converted(frame: Frame, name: str) -> Frame:
-    """Return the frame as grey or in colours: ``Mono8``, ``Mono16``, ``RGB8`` or ``RGB16``."""
+    """Return the frame in grey or in colours: ``Mono8``, ``Mono16``, ``RGB8`` or ``RGB16``."""
     pixels = frame.rgb() if name.startswith("RGB") else frame.grey()
     wanted = find_format(name)
     if pixels.dtype.itemsize * 8 != wanted.depth:
@@ -90,7 +90,7 @@ def _samples_to_jpeg(pixels: NDArray[np.uint8], colours: str, quality: int) -> b
 
 
 def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
-    """Encode from Y, U and V, which JPEG wants in full range and of BT.601."""
+    """Encode Y, U and V, which JPEG requires in full range of BT.601."""
     if not matrix.startswith("601"):
         return _samples_to_jpeg(frame.rgb(), "RGB", quality)
     planes = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
@@ -106,7 +106,7 @@ def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
 
 @lru_cache(maxsize=1)
 def _wideners() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return full range for each value of limited Y, and of limited U and V."""
+    """Return the full-range value for each limited-range value of Y, and of U and V."""
     value = np.arange(256.0)
     wide = ((value - 16) * 255 / 219, (value - 128) * 255 / 224 + 128)
     y, chroma = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in wide)
@@ -130,12 +130,12 @@ def to_jpegxl(frame: Frame) -> Frame:
 
 
 def _lossless(frame: Frame, to: str) -> NDArray[Any]:
-    """Return the samples that are written."""
+    """Return the samples that are written to the file."""
     if not isinstance(frame.format.layout, SampleLayout):
         raise _no_way(frame, to, "converted")
     name, pixels = frame.format.name, frame.array()
     if name.endswith("_limited"):
-        pixels = frame.rgb()  # files have no word for that range
+        pixels = frame.rgb()  # the file formats have no entry for that range
     elif name.startswith("BGR"):
         pixels = pixels[..., [2, 1, 0, *range(3, pixels.shape[2])]]
     return np.ascontiguousarray(pixels)
@@ -148,11 +148,11 @@ def _no_way(frame: Frame, to: str, instead: str) -> FrameFormatError:
     )
 
 
-# back
+# decoding
 
 
 def decoded(frame: Frame, name: str) -> Frame:
-    """Return a JPEG, PNG or JPEG XL as pixels of a format; "": what is in it."""
+    """Decode a JPEG, PNG or JPEG XL to pixels of a format; "": the format of its contents."""
     if frame.format.name not in _DECODERS:
         readable = ", ".join(_DECODERS)
         raise FrameFormatError(
@@ -184,18 +184,18 @@ def _from_png(frame: Frame, name: str) -> Frame:
 
 
 def _from_jpegxl(frame: Frame, name: str) -> Frame:
-    return _lossless_back(frame, name, _jpegxl_size(frame), "jpegxl_decode")
+    return _lossless_back(frame, name, jpegxl_size(frame), "jpegxl_decode")
 
 
 def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
-    """Decode what is of the size that it is said to have: another costs no memory."""
+    """Decode a picture if it has the stated size; no memory is allocated for another size."""
     if size != (frame.width, frame.height):
         raise _unfit(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
     try:
         pixels: NDArray[Any] = getattr(load("imagecodecs"), decoder)(frame.data)
     except (ValueError, RuntimeError) as exc:
         raise _unfit(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
-    if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha, which we have with colours
+    if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha is returned with colours
         pixels = pixels[..., [0, 0, 0, 1]]
     wanted = _samples_named(name, pixels)
     if wanted is None:
@@ -204,7 +204,7 @@ def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str)
 
 
 def _samples_named(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
-    """Return the format of that name, or the usual one, if such pixels can be of it."""
+    """Return the format of a name, or the usual one, if pixels with these samples can have it."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     wanted = find_format(name or _USUAL.get((channels, pixels.dtype.itemsize), "RGB8"))
     layout = wanted.layout
@@ -222,11 +222,15 @@ _USUAL: Final = {
     (4, 1): "RGBa8",
     (4, 2): "RGBa16",
 }
-"""Formats by samples of a pixel and their bytes."""
+"""Formats by the number of samples per pixel, and the bytes of a sample."""
 
 
-def _jpegxl_size(frame: Frame) -> tuple[int, int]:
-    """Return the width and height that a JPEG XL begins with (ISO/IEC 18181-1, SizeHeader)."""
+def jpegxl_size(frame: Frame) -> tuple[int, int]:
+    """Return the width and height that a JPEG XL begins with (ISO/IEC 18181-1, SizeHeader).
+
+    Raises:
+        FrameFormatError: the bytes do not begin as a JPEG XL.
+    """
     stream = _jpegxl_stream(bytes(frame.data[:4096]))
     if stream[:2] != b"\xff\x0a":
         raise _unfit(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
@@ -254,7 +258,7 @@ _JPEGXL_RATIOS: Final = ((0, 0), (1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 
 
 
 def _jpegxl_stream(data: bytes) -> bytes:
-    """Return the code behind the boxes of a file (ISO/IEC 18181-2), or the bytes as they are."""
+    """Return the codestream in the boxes of a file (ISO/IEC 18181-2), or the bytes unchanged."""
     place = 0 if data[4:8] == b"JXL " else len(data)
     while place + 8 <= len(data):
         size, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]

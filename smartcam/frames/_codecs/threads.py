@@ -1,4 +1,4 @@
-"""Codecs in threads of their own: the event loop goes on while pictures are made small."""
+"""Run codecs in threads, so that the event loop is not blocked while pictures are compressed."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ T = TypeVar("T")
 
 MAX_LOOP_TIME: Final = 0.002
 """Seconds of CPU time that one picture of a stream may take in the event loop. A thread costs two
-wake-ups for each picture, which take longer than a small picture does."""
+wake-ups per picture, which take longer than a small picture."""
 
 DECAY: Final = 0.8
-"""Factor by which the longest time of a stream's pictures counts less with each further picture."""
+"""With each further picture, the longest time of a stream's pictures so far is multiplied by
+this."""
 
 
 def _checked(frame: Frame) -> Frame:
@@ -41,23 +42,22 @@ class Codecs:
         async with smartcam.frames.Codecs(threads=2) as codecs:
             small = await codecs.jpeg(frame, quality=85)
 
-    What comes back is a frame of the compressed format with everything that was known of the one
-    that was given: when it was captured, its number, its source, its lens. A frame is encoded as
-    its camera sent it: one that the codec has no form for is refused, and :meth:`converted` makes
-    it one.
+    The result is a frame of the compressed format with all other attributes of the given one: time
+    of capture, number, source, lens. A frame is encoded as its camera sent it. A format that the
+    codec does not support is refused; :meth:`converted` converts it to one that it does.
 
-    As many pictures as there are threads are under way at a time; further calls wait, first
-    come first served. A loop that reads a source and encodes its frames therefore skips
-    frames when this machine is too slow, and never lags.
+    At most one picture per thread is processed at a time; further calls wait in the order in which
+    they came. So a loop that reads a source and encodes its frames skips frames when the machine is
+    too slow, and never lags.
 
     Args:
-        threads: 1 to 64.
+        threads: number of threads, 1 to 64.
 
-    Cancellation: all coroutines here are safe; a picture that a thread works on is finished and
-    thrown away, and keeps its thread until then.
+    Cancellation: all coroutines are safe; a picture that a thread is working on is finished and
+    thrown away, and occupies its thread until then.
 
     Raises:
-        ConfigurationError: another number of threads.
+        ConfigurationError: the number of threads is out of range.
     """
 
     def __init__(self, threads: int = 2) -> None:
@@ -68,7 +68,7 @@ class Codecs:
         self._running: set[asyncio.Future[Any]] = set()
 
     async def __aenter__(self) -> Self:
-        """Make the threads; each begins with the first picture for it.
+        """Create the threads; each starts with its first picture.
 
         Raises:
             LocalProtocolError: the object was entered before.
@@ -77,7 +77,7 @@ class Codecs:
         return self
 
     def begin(self) -> None:
-        """Make the threads; the caller ends them by :meth:`close`.
+        """Create the threads; the caller ends them by :meth:`close`.
 
         Raises:
             LocalProtocolError: the object was entered before.
@@ -90,11 +90,11 @@ class Codecs:
         await self.close()
 
     async def close(self) -> None:
-        """Finish pictures under way, and end the threads; waiting calls get an error.
+        """Finish the pictures in progress, and end the threads; waiting calls get an error.
 
         Idempotent.
 
-        Cancellation: the threads end all the same, when they have finished their pictures.
+        Cancellation: the threads end nevertheless, when they have finished their pictures.
         """
         self._closed = True
         pool, self._pool = self._pool, None
@@ -107,17 +107,18 @@ class Codecs:
     async def jpeg(self, frame: Frame, *, quality: int = 85) -> Frame:
         """Return a frame as a JPEG, format ``MJPEG``.
 
-        Grey stays grey. Y, U and V go in as they are, only widened to the full range that JPEG
-        has; those of BT.709 by way of RGB. A JPEG is encoded anew. Colours share U and V of four
-        pixels (4:2:0), of YUV formats as many as they did.
+        Grey stays grey. Y, U and V are encoded as they are, only widened to JPEG's full range;
+        those of BT.709 are converted through RGB. A JPEG is encoded again. Four pixels of a
+        coloured frame share U and V (4:2:0); YUV formats keep their own subsampling.
 
         Args:
-            frame: frame of 8 bits; Mono8, RGB8, BGR8, MJPEG, or any YUV.
-            quality: 1 to 100.
+            frame: frame with 8 bits per sample: Mono8, RGB8, BGR8, MJPEG, or any YUV.
+            quality: JPEG quality, 1 to 100.
 
         Raises:
-            ConfigurationError: another quality.
-            FrameFormatError: of more than 8 bits, a Bayer pattern, or its bytes are wrong.
+            ConfigurationError: the quality is out of range.
+            FrameFormatError: the frame has more than 8 bits or a Bayer pattern, or its bytes are
+                wrong.
             LocalProtocolError: these codecs are closed.
             MissingExtraError: the extra ``frames`` is not installed.
         """
@@ -125,7 +126,7 @@ class Codecs:
         return await self._run(partial(_pictures.to_jpeg, _checked(frame), quality))
 
     async def png(self, frame: Frame) -> Frame:
-        """Return a frame as a PNG, without loss: grey, RGB, a Bayer pattern or depth as it is.
+        """Return a frame as a PNG, without loss: grey, RGB, a Bayer pattern or depth unchanged.
 
         Raises:
             FrameFormatError: the frame is compressed or YUV, or its bytes are wrong.
@@ -135,7 +136,7 @@ class Codecs:
         return await self._run(partial(_pictures.to_png, _checked(frame)))
 
     async def jpegxl(self, frame: Frame) -> Frame:
-        """Return a frame as a JPEG XL, without loss; otherwise as :meth:`png` does.
+        """Return a frame as a JPEG XL, without loss; all else is as for :meth:`png`.
 
         For 16-bit depth it takes about a tenth of PNG's time.
         """
@@ -145,12 +146,12 @@ class Codecs:
         """Return the pixels of a JPEG, PNG or JPEG XL.
 
         Args:
-            frame: compressed; its width and height are believed only if the bytes say the same.
-            format: format of the pixels returned: ``Mono8`` of a JPEG is its luma, ``Coord3D_C16``
-                of a PNG its 16 bits; "": Mono8, RGB8 or Mono16, as the picture has.
+            frame: compressed frame; its width and height must be those in the bytes.
+            format: format of the returned pixels: ``Mono8`` of a JPEG is its luma, ``Coord3D_C16``
+                of a PNG are its 16 bits; "": Mono8, RGB8 or Mono16, as in the picture.
 
         Raises:
-            FrameFormatError: damaged, cut off, of another size, or without such pixels.
+            FrameFormatError: the frame is damaged, cut off, of another size, or has no such pixels.
             LocalProtocolError: these codecs are closed.
             MissingExtraError: the extra ``frames`` is not installed.
         """
@@ -161,14 +162,14 @@ class Codecs:
     async def converted(
         self, frame: Frame, format: Literal["Mono8", "Mono16", "RGB8"] = "RGB8"
     ) -> Frame:
-        """Return a frame as grey or in colours, as :meth:`Frame.grey` and :meth:`Frame.rgb` do.
+        """Return a frame in grey or in colours, as :meth:`Frame.grey` and :meth:`Frame.rgb` do.
 
-        Mono8 and RGB8 of more than 8 bits are the 8 highest of those that mean something.
+        Samples of more than 8 bits become Mono8 or RGB8 by their 8 highest significant bits.
 
         Raises:
             FrameFormatError: the frame has no brightness or colours, or its bytes are wrong.
             LocalProtocolError: these codecs are closed.
-            MissingExtraError: what reads its format is not installed.
+            MissingExtraError: the decoder of its format is not installed.
         """
         return await self._run(
             partial(_pictures.converted, _checked(frame), check_text(format, "format", "frame"))
@@ -180,14 +181,14 @@ class Codecs:
         """Return an encoder for one stream of frames.
 
         Args:
-            fps: frames a second, for the bit rate.
-            keyint: frames in which every part of the picture is sent anew: 2 to 600. None of them
-                is larger than the others.
+            fps: frames per second, for the bit rate.
+            keyint: number of frames, 2 to 600, within which every part of the picture is refreshed.
+                All frames have about the same size.
             crf: quality, 0 (best) to 51.
-            bitrate: bits a second that it keeps to instead of a quality.
+            bitrate: bits per second to keep to, instead of a quality.
 
         Raises:
-            ConfigurationError: a number out of its range.
+            ConfigurationError: a number is out of range.
             MissingExtraError: the extra ``video`` is not installed.
         """
         return H264Encoder(self._run, fps=fps, keyint=keyint, crf=crf, bitrate=bitrate)
@@ -201,7 +202,7 @@ class Codecs:
         return H264Decoder(self._run)
 
     async def _run(self, work: Callable[[], T]) -> T:
-        """Have a thread do something as soon as one is free."""
+        """Run work in a thread as soon as one is free."""
         self._open_pool()
         await self._free.acquire()
         try:
@@ -224,14 +225,14 @@ class Codecs:
         self._running.discard(under_way)
         self._free.release()
         if not under_way.cancelled():
-            under_way.exception()  # nobody may be there for it any longer
+            under_way.exception()  # the caller may have gone
 
 
 class StreamRuns:
-    """Runs the work of one stream in the event loop while its pictures are small, else in a thread.
+    """Runs the work of one stream in the event loop if its pictures are small, else in a thread.
 
-    It begins in a thread, where the first picture tells how long the others may take, and goes back
-    to it as soon as one takes longer than :data:`MAX_LOOP_TIME`.
+    It begins in a thread, where the first picture shows how long others may take, and returns to
+    the thread as soon as one takes longer than :data:`MAX_LOOP_TIME`.
 
     Args:
         codecs: threads for the work, not closed while it is used.
@@ -239,11 +240,11 @@ class StreamRuns:
 
     def __init__(self, codecs: Codecs) -> None:
         self._codecs = codecs
-        self._longest: float | None = None  # seconds of CPU time, the last pictures counting most
+        self._longest: float | None = None  # seconds of CPU time, mostly those of the last pictures
 
     @property
     def short(self) -> bool:
-        """True if what is run next is run at once, in the event loop."""
+        """True if the next work runs at once, in the event loop."""
         return self._longest is not None and self._longest <= MAX_LOOP_TIME
 
     async def __call__(self, work: Callable[[], T]) -> T:
@@ -263,7 +264,7 @@ class StreamRuns:
 
 
 def at_once(work: Coroutine[Any, Any, T]) -> T:
-    """Return the result of a coroutine that never waits.
+    """Run a coroutine that never waits, and return its result.
 
     Raises:
         RuntimeError: the coroutine waits.

@@ -7,5 +7,6 @@ With them: :mod:`_control`, :mod:`_discovery`, :mod:`_stream`, :mod:`_event_chan
 :mod:`driver`.
 
 Source: GigE Vision 2.0 (packets, bootstrap registers), GenICam GenApi 2.0 (description), SFNC
-(names of features), PFNC (pixel formats); what a real peer says is aravis' fake camera, 0.8.26.
+(names of features), PFNC (pixel formats); the behaviour of a real peer is that of Aravis' fake
+camera, 0.8.26.
 """

@@ -1,15 +1,16 @@
-"""Packets of a stream become frames: each one complete or counted as lost, never mixed.
+"""Assemble packets of a stream into frames, each of which is complete or counted as lost.
 
-No socket and no clock: packets go in with the time, pictures come out in the order of their blocks,
-and what the camera is to send once more. At most :data:`MAX_OPEN_BLOCKS` blocks are kept.
+There is no socket and no clock here: packets go in with their time; pictures come out in the order
+of their blocks, together with the packets that the camera should send again. At most
+:data:`MAX_OPEN_BLOCKS` blocks are kept.
 
 A block whose packets are missing waits for them while the camera is asked, and blocks behind it
-wait for it. It is lost when the camera says that it has them no longer, has not sent them after
-:data:`MAX_REQUESTS` requests, or more is missing than is worth asking for.
+wait for it. It is lost when the camera says that it no longer has them, when it has not sent them
+after :data:`MAX_REQUESTS` requests, or when too many are missing to ask for.
 
-Ids that begin anew are told from late packets by the camera's clock: a late leader's time lies
-before that of the newest block, a new one's behind it; and by a second of silence where the camera
-has no clock.
+The camera's clock distinguishes ids that begin anew from late packets: the time of a late leader is
+before that of the newest block, that of a new one after it. Without a clock, a second of silence
+means that the ids begin anew.
 """
 
 from __future__ import annotations
@@ -29,35 +30,37 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.gvsp import ImpliedPicture, PacketHeader
 
 MAX_OPEN_BLOCKS: Final = 4
-"""Blocks that wait for packets or for an earlier block: at 100 frames/s 40 ms."""
+"""At most this many blocks wait for packets or for an earlier block: at 100 frames/s that is 40
+ms."""
 
 REORDER_GRACE: Final = 0.003
-"""Seconds that a packet may come behind its successors before it is asked for."""
+"""Seconds that a packet may come after its successors before it is requested."""
 
 SILENCE_TIMEOUT: Final = 0.05
 """Seconds without a packet in the middle of a block after which the rest counts as missing."""
 
 RESEND_INTERVAL: Final = 0.03
-"""Seconds until what did not come is asked for once more."""
+"""Seconds until missing packets are requested again."""
 
 MAX_REQUESTS: Final = 4
-"""Requests for the packets of one block."""
+"""The packets of one block are requested at most this many times."""
 
 MAX_MISSING_PACKETS: Final = 64
-"""Packets of a block that are always asked for; more where they are less than a quarter."""
+"""Up to this many missing packets of a block are always requested; more only if they are less than
+a quarter."""
 
 MAX_GAPS_PER_BLOCK: Final = 1000
-"""Gaps between the packets of a block that are asked for, each with a request of its own: a block
-with more is lost."""
+"""A block with more gaps than this is lost, since each gap takes a request of its own."""
 
 LEADER_TIMEOUT: Final = 10.0
 """Seconds that a leader waits for its pixels: some cameras send it before a long exposure."""
 
 RESTART_TIMEOUT: Final = 1.0
-"""Seconds without a packet of use after which a leader with an old id is that of a new count."""
+"""Seconds without a useful packet after which a leader with an old id begins a new count."""
 
 FASTEST: Final = 2000.0
-"""Highest frame rate: ids that go ahead faster show a new count, and no gap."""
+"""Highest plausible frame rate, frames per second: ids that advance faster show a new count, and no
+gap."""
 
 SHORT_IDS: Final = 65535
 """Block ids of 16 bits: 1 to 65535."""
@@ -81,16 +84,16 @@ class Resend(NamedTuple):
 
 @dataclass(slots=True)
 class PacketCounts:
-    """Counts of the packets that came, and of what became of them.
+    """Counts of packets and frames by what happened to them.
 
     Attributes:
         pictures: complete pictures.
-        lost: frames of which packets are missing.
-        late: packets of blocks that were done with.
-        doubled: packets that were there already.
+        lost: frames that are lost, since packets are missing.
+        late: packets of blocks that were already finished.
+        doubled: packets that came a second time.
         malformed: datagrams that are no packets, or packets that do not fit their block.
         refused: packets that the camera sent as an error code only.
-        requested: packets that were asked for once more.
+        requested: packets that were requested again.
         restarts: times that the ids began anew.
     """
 
@@ -108,11 +111,11 @@ class Assembler:
     """The packets of one stream.
 
     Args:
-        payload_size: bytes of a frame at most, as the camera's ``PayloadSize`` says.
+        payload_size: largest number of bytes of a frame, the camera's ``PayloadSize``.
         datagram: bytes of a full packet with its GVSP header, without IP and UDP.
-        resend: whether the camera is asked for what is missing.
-        begins_low: whether a stream whose first block has a low id may have lost those before; else
-            they belong to an earlier stream, of which the camera would send them again.
+        resend: whether missing packets are requested from the camera.
+        begins_low: whether blocks before the first one, if its id is low, count as lost; otherwise
+            they belong to an earlier stream, and must not be requested.
         implied: picture of blocks that do not say its size; None: such blocks are an error.
     """
 
@@ -132,7 +135,7 @@ class Assembler:
         self._most, self._datagram, self._resend = payload_size, datagram, resend
         self._implied = implied
         self._blocks: dict[int, Block] = {}
-        self._current: Block | None = None  # that of the last packet
+        self._current: Block | None = None  # block of the last packet
         self._newest = self._closed = 0
         self._offset = 0  # a number's distance from its id
         self._begun, self._begins_low = False, begins_low
@@ -148,7 +151,7 @@ class Assembler:
             data: buffer of at least ``size`` bytes.
             size: size of the packet.
             now: present time, seconds, on the clock of the deadlines.
-            arrived: time of arrival, which a picture takes from its first packet.
+            arrived: time of arrival; that of its first packet becomes the picture's.
         """
         current = self._current
         if current is not None and size == self._datagram:
@@ -187,11 +190,11 @@ class Assembler:
         return lost
 
     def next_deadline(self) -> float | None:
-        """Return when :meth:`handle_timeout` is to be called; None: only after a new packet."""
+        """Return the time to call :meth:`handle_timeout`; None: only after a new packet."""
         return min(map(self._deadline, self._open_blocks()), default=None)
 
     def handle_timeout(self, now: float) -> list[Resend]:
-        """Give up what does not come any more; return what is to be asked for."""
+        """Give up packets that will not come any more; return the requests to send."""
         wanted: list[Resend] = []
         for block in self._open_blocks():
             if self._deadline(block) <= now:
@@ -218,7 +221,7 @@ class Assembler:
                 block.dead = True
                 return
         holes = block.holes(MAX_GAPS_PER_BLOCK + 1)
-        if not holes:  # what was missing came; the rest of the block is still to come
+        if not holes:  # the missing packets came; the rest of the block is still to come
             block.evident = math.inf
             return
         if not self._resend:
@@ -234,7 +237,8 @@ class Assembler:
             block.dead = True
             return
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
-        block.tries += past  # what is asked for while more comes is asked for again
+        # packets that are requested while others come are requested again later
+        block.tries += past
         block.asked = now
         wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
 
@@ -243,13 +247,13 @@ class Assembler:
     def _block_of(
         self, header: PacketHeader, data: memoryview, size: int, now: float
     ) -> Block | None:
-        """Return the block that a packet belongs to; None: it belongs to none any longer."""
+        """Return the block that a packet belongs to; None: its block is finished."""
         extended = header.size != HEADER
         if not self._begun:
             self._begun = True
             if (
                 not self._begins_low or header.block > MAX_OPEN_BLOCKS
-            ):  # else those before it were lost, or come later
+            ):  # otherwise the blocks before it were lost, or come later
                 self._newest = self._closed = header.block - 1
         number = self._number(header.block, extended)
         ahead = number - self._newest
@@ -297,7 +301,7 @@ class Assembler:
         return block is not None and block.leader is not None and block.leader.ticks != ticks
 
     def _restart(self, block_id: int) -> int:
-        """Begin to count anew; what was open is lost. Return the block's number."""
+        """Begin to count anew, and return the block's number; open blocks are lost."""
         self.counts.restarts += 1
         self._lose(self._newest - self._closed)
         self._blocks.clear()
@@ -308,7 +312,7 @@ class Assembler:
         return block_id + self._offset
 
     def _open(self, number: int, extended: bool, now: float) -> Block:
-        """Make a block, and those before it of which nothing came yet."""
+        """Open a block, and those before it of which no packet came yet."""
         for one in self._blocks.values():
             if one.number < number and not one.over:
                 one.over = True
@@ -338,7 +342,7 @@ class Assembler:
         return block
 
     def _put(self, block: Block, header: PacketHeader, payload: memoryview, now: float) -> None:
-        """Put a packet where it belongs."""
+        """Put a packet into its block."""
         packet = header.packet
         if block.dead or block.complete:
             self.counts.late += 1
@@ -381,7 +385,7 @@ class Assembler:
     # blocks
 
     def _settle(self) -> None:
-        """Close what is done, from the oldest on."""
+        """Close finished blocks, from the oldest on."""
         while self._closed < self._newest:
             number = self._closed + 1
             head = self._blocks.get(number)

@@ -1,4 +1,4 @@
-"""One frame on its way: which of its packets came, and where their bytes lie."""
+"""Collect the packets of one frame."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.gvsp import ImpliedPicture, Leader, Trailer
 
 PAYLOAD: Final = 0x03000000
-"""Kind of a payload packet, above its id: the second word of its header."""
+"""Kind of a payload packet in the second word of its header, above the id."""
 
 PACKET: Final = 0xFFFFFF
-"""The id in that word."""
+"""Bits of the packet's id in that word."""
 
 
 class WholePicture(NamedTuple):
-    """A frame all of whose packets came.
+    """A frame whose packets have all come.
 
     Attributes:
-        number: number of the block, counted on where the ids begin anew.
+        number: number of the block, which counts on when the ids begin anew.
         lost: frames lost before this one that no earlier picture counts.
         leader: contents of the first packet.
         rows: number of rows that the camera sent.
-        stride: bytes of a row.
+        stride: number of bytes of a row.
         data: ``stride * rows`` bytes, which nobody else holds.
         arrived: time that the caller gave with the first packet.
-        payload: all bytes of a picture that chunk data follows; else None.
+        payload: all bytes of the block if chunk data follows the picture; else None.
         block_id: id of the block on the wire.
     """
 
@@ -62,16 +62,16 @@ def picture_bytes(leader: Leader, rows: int) -> int:
 
 
 class Block:
-    """The packets that came of one block. Memory is taken with its first packet.
+    """The packets that came of one block. Memory is allocated with the first packet.
 
     Args:
         number: number of the block, counted on past the ids' wrap.
         block_id: number of the block on the wire.
         extended: whether the ids have 64 bits.
         datagram: bytes of a full packet with its header.
-        most: bytes of the largest payload.
-        now: seconds.
-        implied: picture of a leader that does not say its size.
+        most: largest number of bytes of the payload.
+        now: present time, seconds.
+        implied: picture for a leader without a size.
     """
 
     __slots__ = (
@@ -120,24 +120,24 @@ class Block:
         self.buffer: memoryview | None = None
         self.seen = bytearray(self.packets + 2)
         self.got = self.highest = 0
-        self.expected = PAYLOAD | 1  # the header's word that the next packet in order has
+        self.expected = PAYLOAD | 1  # second word of the header of the packet that is next in order
         self.leader: Leader | None = None
         self.implied = implied
         self.trailer: int | None = None
-        self.said: Trailer | None = None  # what stands in it
+        self.said: Trailer | None = None  # contents of the trailer
         self.short: int | None = None
         self.last_size = self.full
         self.arrived: float | None = None
         self.progress = now
-        self.evident = math.inf  # since when it is seen that packets are missing
+        self.evident = math.inf  # time since when packets are known to be missing
         self.asked, self.tries = -math.inf, 0
-        self.over = False  # the camera is past it, or silent in the middle of it
+        self.over = False  # whether the camera is past the block, or silent in the middle of it
         self.complete = self.dead = False
 
     def take_next(self, packet: int, data: memoryview, now: float) -> bool:
-        """Take the packet that is next in order, full and not the last one; whether it is that.
+        """Take a full packet that is next in order and not the last; return whether it is one.
 
-        It is what nearly all packets are, so it is short; :meth:`take_payload` does it for all.
+        Nearly all packets are such, so this is a short path; :meth:`take_payload` takes any packet.
         """
         buffer = self.buffer
         if (
@@ -157,7 +157,7 @@ class Block:
         return True
 
     def take_payload(self, packet: int, data: memoryview) -> bool:
-        """Take a payload packet's bytes; whether they fit where they belong."""
+        """Take the bytes of a payload packet; return whether they fit into the block."""
         size = len(data)
         past = self.trailer if self.trailer is not None else self.packets + 1
         if not (0 < packet < past and 0 < size <= self.full):
@@ -170,7 +170,7 @@ class Block:
         elif self.short is not None and packet > self.short:
             return False
         if self.buffer is None:
-            # of memory that is taken as it is written: one packet does not cost a whole frame
+            # memory is allocated as it is written, so one packet does not cost a whole frame
             self.buffer = np.empty(self.packets * self.full, np.uint8).data
         begin = (packet - 1) * self.full
         self.buffer[begin : begin + size] = data
@@ -181,7 +181,7 @@ class Block:
         """Take the leader.
 
         Raises:
-            MessageError: the leader is not that of a picture, or tells a larger one than it may.
+            MessageError: the leader is not that of a picture, or the picture is too large.
         """
         leader = decode_leader(payload, self.implied)
         need = picture_bytes(leader, leader.height)
@@ -194,7 +194,7 @@ class Block:
         self.leader = leader
 
     def take_trailer(self, packet: int, payload: bytes) -> bool:
-        """Take the trailer; whether it stands behind all that came."""
+        """Take the trailer; return whether its id is after all packets that came."""
         if not self.highest < packet <= self.packets + 1:
             return False
         if self.short is not None and packet != self.short + 1:
@@ -204,7 +204,7 @@ class Block:
         return True
 
     def mark(self, packet: int) -> None:
-        """Note that a packet is there."""
+        """Note that a packet has come."""
         self.seen[packet] = 1
         if packet == self.expected & PACKET or (packet == 0 and self.highest == 0):
             following = self.seen.find(0, packet + 1 if packet else 1)
@@ -214,7 +214,7 @@ class Block:
         )
 
     def holes(self, most: int) -> list[tuple[int, int]]:
-        """Return the packets that should be there and are not, as (first, last), ``most`` such."""
+        """Return the missing packets as ranges (first, last), at most ``most`` of these."""
         end = self.highest
         if self.trailer is not None:
             end = self.trailer
@@ -238,7 +238,7 @@ class Block:
         return max(self.highest, min(self.packets, -(-need // self.full)))
 
     def picture(self, lost: int) -> WholePicture | None:
-        """Return the frame, once it is complete; None where its bytes are too few for it."""
+        """Return the complete frame; None if its bytes are too few."""
         leader, said = self.leader, self.said
         if leader is None or self.trailer is None or said is None:
             return None
@@ -251,7 +251,9 @@ class Block:
         if not rows or not leader.width or self.buffer is None:
             return None
         if need > there and leader.payload_type != PayloadType.CHUNK:
-            return None  # of chunk data the features said the size: that is told, not lost
+            # for chunk data the features gave the size: such a fault is reported, not counted as
+            # lost
+            return None
         stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x
         data = self.buffer[: min(need, there)]
         arrived = self.arrived if self.arrived is not None else 0.0

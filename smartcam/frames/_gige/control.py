@@ -1,7 +1,7 @@
-"""The control channel of one camera: requests and their answers, and the heartbeat.
+"""Run the control channel of one camera: requests with their answers, and the heartbeat.
 
-One request is under way at a time. One without an answer is sent again with the same id, by which
-the camera knows it; an answer that comes late, or of another id, is dropped.
+Only one request is pending at a time. A request without an answer is sent again with the same id,
+so that the camera recognizes it; an answer that comes late, or has another id, is dropped.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ ANSWER_TIMEOUT: Final = 0.3
 TRIES: Final = 3
 
 IP_MTU: Final = 14
-"""linux/in.h: what the system knows of the way that a connected socket's packets go."""
+"""Socket option for the MTU of the path of a connected socket, from linux/in.h."""
 
 MAX_PENDING_TIME: Final = 30.0
-"""Seconds that a camera may put a request off altogether."""
+"""Seconds for which a camera may put off a request in all."""
 
 
 class ControlChannel(asyncio.DatagramProtocol):
@@ -59,10 +59,10 @@ class ControlChannel(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._lock = asyncio.Lock()
         self._id = 0
-        self._expected = 0  # id of the request that is under way; 0: none is
+        self._expected = 0  # id of the pending request; 0: none
         self._answers: asyncio.Queue[Ack | OSError] = asyncio.Queue(maxsize=16)
         self.dropped = 0
-        """Datagrams that answered nothing."""
+        """Number of datagrams that answered no request."""
 
     @classmethod
     async def connect(cls, host: str, port: int, source: str) -> ControlChannel:
@@ -77,7 +77,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                 _, channel = await loop.create_datagram_endpoint(
                     lambda: cls(source), remote_addr=(host, port), family=socket.AF_INET
                 )
-        except OSError as exc:  # of which TimeoutError is one
+        except OSError as exc:  # TimeoutError is one
             raise FrameSourceError(
                 f"{source}: no way to {host}:{port}: {exc or 'the name has no answer'}",
                 source=source,
@@ -86,17 +86,17 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @property
     def local_address(self) -> str:
-        """The address by which the camera reaches us."""
+        """Address of this host that the camera sends to."""
         return str(self._name("sockname")[0])
 
     @property
     def camera_address(self) -> str:
-        """The camera's."""
+        """Address of the camera."""
         return str(self._name("peername")[0])
 
     @property
     def path_mtu(self) -> int:
-        """Bytes of the largest IP packet on the way, as far as the system knows; 1500: unknown."""
+        """Bytes of the largest IP packet on the path, as far as the system knows; else 1500."""
         if self._transport is None or sys.platform != "linux":
             return 1500
         inside = self._transport.get_extra_info("socket")
@@ -120,12 +120,12 @@ class ControlChannel(asyncio.DatagramProtocol):
         return int.from_bytes(payload[:4], "big")
 
     async def write_register(self, address: int, value: int) -> None:
-        """Write a register; the errors are the same."""
+        """Write a register; the errors are those of :meth:`read_register`."""
         what = f"{address:#06x} = {value:#x}"
         await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, what)
 
     async def read(self, address: int, length: int) -> bytes:
-        """Return bytes of the camera's memory; the errors are the same."""
+        """Return bytes of the camera's memory; the errors are those of :meth:`read_register`."""
         if length == 4 and address % 4 == 0:
             return (await self.read_register(address)).to_bytes(4, "big")
         begin = address & ~3
@@ -140,7 +140,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         return b"".join(parts)[address - begin :][:length]
 
     async def write(self, address: int, data: bytes) -> None:
-        """Write into the camera's memory; the errors are the same."""
+        """Write into the camera's memory; the errors are those of :meth:`read_register`."""
         if len(data) == 4 and address % 4 == 0:
             await self.write_register(address, int.from_bytes(data, "big"))
             return
@@ -156,7 +156,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             )
 
     def resend(self, wanted: Resend) -> None:
-        """Ask for packets once more; nothing answers that but the packets."""
+        """Request packets again; the only answer to that are the packets."""
         if self._transport is not None and not self._transport.is_closing():
             data = encode_resend(
                 self._next_id(), wanted.block, wanted.first, wanted.last, extended=wanted.extended
@@ -169,11 +169,11 @@ class ControlChannel(asyncio.DatagramProtocol):
         Args:
             command: command of the request.
             payload: payload of the request.
-            least: bytes that the payload of the answer has at least.
+            least: least number of bytes of the answer's payload.
             what: subject of the request, for errors.
 
         Raises:
-            FrameSourceError: the camera refuses, answers too briefly, or the channel is closed.
+            FrameSourceError: the camera refuses, its answer is too short, or the channel is closed.
             FrameTimeoutError: the camera does not answer.
 
         Cancellation: safe; the camera may have carried out the request, its answer is dropped.
@@ -196,7 +196,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         )
 
     async def _tried(self, datagram: bytes, command: GvcpCommand, what: str) -> Ack | None:
-        """Send a request; return its answer, None where none comes in time."""
+        """Send a request; return its answer, or None if none comes in time."""
         if self._transport is None or self._transport.is_closing():
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
         loop = asyncio.get_running_loop()
@@ -261,7 +261,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
-        """Take an answer, where it is one to what was asked."""
+        """Take a datagram if it answers the pending request."""
         try:
             ack = decode_ack(data)
         except MessageError:
@@ -273,7 +273,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             self.dropped += 1
 
     def error_received(self, exc: Exception) -> None:
-        """Note that nothing listens at the address."""
+        """Note that no process listens at the address."""
         if isinstance(exc, OSError):
             self._take(exc)
 
@@ -295,13 +295,13 @@ class RequestRefusedError(FrameSourceError):
 async def heartbeat(
     control: ControlChannel, timeout: float, source: str, lost: Callable[[FrameSourceError], None]
 ) -> None:
-    """Keep the control of a camera until it is lost, then call ``lost``.
+    """Keep control of a camera until it is lost, then call ``lost``.
 
     Args:
         control: control channel of the camera.
-        timeout: seconds after which the camera gives up an application that is silent.
+        timeout: seconds without a request after which the camera gives up control.
         source: name of the camera, for errors.
-        lost: called once with the error, as the last thing.
+        lost: function that is called once, at the end, with the error.
     """
     loop = asyncio.get_running_loop()
     heard = loop.time()

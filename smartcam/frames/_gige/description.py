@@ -1,7 +1,7 @@
-"""The GenICam description of a camera: where it lies, unpacked, and read into elements.
+"""Locate, unpack and parse the GenICam description of a camera.
 
-It comes over the wire: sizes and depth are bounded, and a document type, without which there are no
-entities, is refused.
+It comes over the network, so its sizes and depth are bounded, and a document type, which could
+define entities, is refused.
 
 Source: GigE Vision 2.0, chapter 12.1 (URLs, ZIP); GenApi 2.0, chapter 2.8 (XML).
 """
@@ -18,26 +18,27 @@ from xml.parsers import expat
 from smartcam.exceptions import MessageError
 
 MAX_PLAIN_BYTES: Final = 16 << 20
-"""Bytes of a description that is not packed; those of large cameras have 2 MB."""
+"""An unpacked description has at most this many bytes; those of large cameras have 2 MB."""
 
-LARGEST_PACKED: Final = 4 << 20
-"""Bytes of a description's ZIP archive: 2 MB of XML have 0.2 MB. Each 46 bytes can be one more file
-in it, which takes 8 us."""
+MAX_PACKED_BYTES: Final = 4 << 20
+"""The ZIP archive of a description has at most this many bytes: 2 MB of XML take 0.2 MB. Every 46
+bytes can be one more file in it, which takes 8 us."""
 
 MAX_LEVELS: Final = 32
-"""Levels of its elements."""
+"""Elements of a description are nested at most this deep."""
 
 MAX_ELEMENTS: Final = 400_000
-"""Elements of a description; an element of a ``StructReg`` counts once more for each entry."""
+"""A description has at most this many elements; those of a ``StructReg`` count again for each
+entry."""
 
 
 class Location(NamedTuple):
     """The place of a description in the camera's memory.
 
     Attributes:
-        name: name of the file, which ends in ``.zip`` where the file is packed.
+        name: name of the file, with the suffix ``.zip`` if the file is packed.
         address: address of the first byte.
-        length: bytes.
+        length: number of bytes.
     """
 
     name: str
@@ -52,8 +53,8 @@ class Element:
         kind: tag of the element.
         name: value of the attribute ``Name``, or "".
         attributes: all attributes by name.
-        children: elements inside, in document order.
-        text: text inside, without blanks at its ends.
+        children: elements inside of this one, in document order.
+        text: text inside of the element, without blanks at its ends.
     """
 
     __slots__ = ("attributes", "children", "kind", "name", "text")
@@ -79,10 +80,10 @@ class Element:
 
 
 def locate(url: str) -> Location:
-    """Read a URL as a camera has it: ``Local:name.zip;ADDRESS;LENGTH``, both hexadecimal.
+    """Parse the URL of a description: ``Local:name.zip;ADDRESS;LENGTH``, both hexadecimal.
 
     Raises:
-        MessageError: the URL is another one, or has impossible numbers.
+        MessageError: the URL has another form, or impossible numbers.
     """
     found = re.fullmatch(
         r"local:/*([^;]*);\s*(?:0x)?([0-9a-f]{1,8});\s*(?:0x)?([0-9a-f]{1,8})(?:\?.*)?",
@@ -100,17 +101,17 @@ def locate(url: str) -> Location:
 
 
 def unpack(data: bytes) -> bytes:
-    """Return a description's text; ZIP archives are unpacked, of several files the first XML.
+    """Return a description's text; from a ZIP archive the first XML file is unpacked.
 
     Raises:
-        MessageError: the archive cannot be unpacked, or to more than :data:`MAX_PLAIN_BYTES`; or it
-            is packed in another way than by DEFLATE, of which a few bytes may stand for gigabytes.
+        MessageError: the archive cannot be unpacked, has more than :data:`MAX_PLAIN_BYTES`, or uses
+            another compression than DEFLATE, with which a few bytes could stand for gigabytes.
     """
     if not data.startswith(b"PK"):
         return data.rstrip(b"\0")
-    if len(data) > LARGEST_PACKED:
+    if len(data) > MAX_PACKED_BYTES:
         raise MessageError(
-            f"the description's ZIP archive: expected at most {LARGEST_PACKED} bytes, got "
+            f"the description's ZIP archive: expected at most {MAX_PACKED_BYTES} bytes, got "
             f"{len(data)}"
         )
     try:
@@ -145,7 +146,7 @@ def parse(text: bytes) -> dict[str, Element]:
     """Return a description's nodes by their names.
 
     Raises:
-        MessageError: the text is no XML, has a document type, or is larger than any.
+        MessageError: the text is no XML, has a document type, or exceeds a bound.
     """
     reader = _XmlReader()
     parser = expat.ParserCreate()
@@ -169,7 +170,7 @@ class _XmlReader:
     def __init__(self) -> None:
         self.root = Element("", {})
         self._open: list[Element] = []
-        self._texts: list[list[str]] = []  # the pieces of each open element's text
+        self._texts: list[list[str]] = []  # pieces of the text of each open element
         self._count = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:

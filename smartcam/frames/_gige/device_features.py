@@ -1,4 +1,4 @@
-"""The features of a GigE Vision camera, for users: of the session that is open."""
+"""Offer the features of a GigE Vision camera to users, through its open session."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.features import GenicamFeatures
 
 DONE_INTERVAL: Final = 0.02
-"""Seconds between two questions whether a command is done."""
+"""Seconds between two polls whether a command is done."""
 
 
 class GigEFeatures(DeviceFeatures):
@@ -22,7 +22,7 @@ class GigEFeatures(DeviceFeatures):
     Args:
         present: coroutine function that returns the features of the session that is open.
         changed: coroutine function that is called after a feature was set.
-        lock: lock of what sets several features that belong together.
+        lock: lock held while several related features are set.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class GigEFeatures(DeviceFeatures):
         return (await self._present()).names()
 
     async def describe(self, name: str) -> Feature:
-        """Return a feature with its value and range as they are now."""
+        """Return a feature with its present value and range."""
         return await (await self._present()).describe(name)
 
     async def get(self, name: str) -> FeatureValue:
@@ -46,7 +46,7 @@ class GigEFeatures(DeviceFeatures):
         return await (await self._present()).get(name)
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the camera has then."""
+        """Set a feature; return the value that the camera has afterwards."""
         async with self._lock:
             features = await self._present()
             features.check_command(name, expected=False)

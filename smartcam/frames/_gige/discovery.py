@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 ANSWER_WAIT: Final = 0.5
-"""Seconds for answers; the standard has cameras answer within 200 ms."""
+"""Seconds to wait for answers; the standard requires them within 200 ms."""
 
 MAX_CAMERAS: Final = 256
 
 MAX_ANSWERS_OF_ONE_ADDRESS: Final = 16
-"""Answers that are taken from one address, so that one cannot stand for all."""
+"""At most this many answers are taken from one address, so that one host cannot fill the list."""
 
 _REQUEST_ID: Final = 1
 _SIOCGIFADDR: Final = 0x8915
@@ -44,7 +44,7 @@ class Network(NamedTuple):
 
     Attributes:
         address: this machine's address in the network.
-        targets: addresses that the question is sent to.
+        targets: addresses that the search is sent to.
         network: range of addresses; None: not known.
     """
 
@@ -57,9 +57,9 @@ class AnsweringCamera(NamedTuple):
     """A camera that answered.
 
     Attributes:
-        info: what it says of itself.
-        address: where the answer came from.
-        reachable: whether its address is one of the network that the answer came by.
+        info: the camera's description of itself.
+        address: address that the answer came from.
+        reachable: whether its address belongs to the network that the answer came through.
     """
 
     info: DeviceInfo
@@ -68,7 +68,7 @@ class AnsweringCamera(NamedTuple):
 
 
 def networks() -> list[Network]:
-    """Return this machine's IPv4 networks; where they cannot be listed, the one that leads out."""
+    """Return this machine's IPv4 networks, or the default one if they cannot be listed."""
     try:
         import fcntl
     except ImportError:
@@ -92,10 +92,10 @@ def networks() -> list[Network]:
 async def find(
     places: Iterable[Network], *, port: int = PORT, wait: float = ANSWER_WAIT
 ) -> list[AnsweringCamera]:
-    """Ask for cameras.
+    """Search for cameras.
 
     Args:
-        places: networks to ask in; a target may be a camera's own address.
+        places: networks to search; a target may be a camera's own address.
         port: UDP port that cameras listen at.
         wait: seconds to wait for answers.
 
@@ -132,7 +132,7 @@ class _Asking(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
         self.found: list[AnsweringCamera] = []
-        self._answers = Counter[str]()  # by the address that they come from
+        self._answers = Counter[str]()  # by the address that the answers come from
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         try:
@@ -153,4 +153,4 @@ class _Asking(asyncio.DatagramProtocol):
             self.found.append(AnsweringCamera(info, addr[0], reachable))
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore that nobody listens at one of the targets."""
+        """Ignore that no process listens at one of the targets."""

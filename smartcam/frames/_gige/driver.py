@@ -1,4 +1,4 @@
-"""GigE Vision cameras as a source of frames."""
+"""Use GigE Vision cameras as sources of frames."""
 
 from __future__ import annotations
 
@@ -60,28 +60,28 @@ if TYPE_CHECKING:
     from smartcam.frames._trigger import AwaitedTrigger
 
 MAX_SETTLING_TIME: Final = 30.0
-"""Seconds for which the picture of a trigger that failed is waited for, at most, before the stream
-begins anew: exposure and readout, as the camera tells them."""
+"""After a failed trigger, the stream waits at most this many seconds for its picture (exposure and
+readout, as the camera states them) before it is restarted."""
 
 
 class GigEDriver(FrameDriver):
     """A camera that speaks GigE Vision: ``gige://192.168.0.10?format=Mono8&fps=25``.
 
-    The camera is ours from opening to closing; a heartbeat keeps it so, a register that is read
-    three times in the camera's own timeout, also while nobody reads frames.
+    The driver controls the camera from opening to closing. A heartbeat keeps control: a register is
+    read three times within the camera's own timeout, even while nobody reads frames.
 
-    A frame's ``captured`` is when its first packet was read, and ``moment`` says so: ``ARRIVAL``.
-    Its ``duration`` is the exposure time and one frame time for the readout, as far as the camera
-    tells them; where the camera chooses the exposure time, the one that came with the frame
-    (``ChunkExposureTime``), else the longest that it has. ``device_time`` is the camera's own
-    clock.
+    A frame's ``captured`` is the time at which its first packet was read, so ``moment`` is
+    ``ARRIVAL``. Its ``duration`` is the exposure time plus one frame time for the readout, as far
+    as the camera states them. If the camera chooses the exposure time, it is the one that came with
+    the frame (``ChunkExposureTime``), or else the longest possible one. ``device_time`` is the
+    camera's own clock.
 
     The URL's parameters are carried out in their order:
 
-    - ``format``: one of the camera's, by its name there, in PFNC or in V4L2.
+    - ``format``: a pixel format of the camera, by its name there, in PFNC or in V4L2.
     - ``size``: ``WIDTHxHEIGHT``.
-    - ``fps``: frames a second, by ``AcquisitionFrameRate``.
-    - ``feature.NAME``: the value of any feature, as GenICam names both.
+    - ``fps``: frames per second, by ``AcquisitionFrameRate``.
+    - ``feature.NAME``: the value of any feature, both as in GenICam.
 
     and, at any place:
 
@@ -104,19 +104,20 @@ class GigEDriver(FrameDriver):
         self._shape: StreamShape | None = None
         self._stream: Stream | None = None
         self._sink: FrameSink | None = None
-        self._packet_size = 0  # that was found to come through
-        self._setting = asyncio.Lock()  # of features that belong together
+        self._packet_size = 0  # packet size that was found to come through
+        self._setting = asyncio.Lock()  # held while related features are set
         self._opening = asyncio.Lock()
         self._features = GigEFeatures(self._present, self._feature_changed, self._setting)
         self._triggers: list[TriggerSetting] = []
         self._armed: ArmedTrigger | None = None
         self._busy_until = 0.0  # on the clock of time.monotonic()
-        self._is_wanted = False  # it was opened, and not closed since
-        self._is_changed = False  # a feature was set while it streamed
-        # of frames that may have been under way when a feature was set, and until when they come
+        self._is_wanted = False  # whether it was opened, and not closed since
+        self._is_changed = False  # whether a feature was set while it streamed
+        # duration of frames that may have been in progress when a feature was set, and the time
+        # until which they may come
         self._before = 0.0, 0.0
         self.counts: PacketCounts | None = None
-        """Counts of the packets of the stream that is under way, or was the last."""
+        """Packet counts of the running stream, or of the last one."""
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
@@ -125,7 +126,7 @@ class GigEDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """Name that the camera was given, or its model and serial number; closed: the URL."""
+        """User-defined name of the camera, or model and serial number; the URL if closed."""
         return self.address.shown if self._session is None else self._session.label
 
     async def open(self) -> StreamFormat:
@@ -134,7 +135,7 @@ class GigEDriver(FrameDriver):
         return (await self._opened())[1].format
 
     async def _opened(self) -> tuple[GigESession, StreamShape]:
-        """Return the session that is open; one that was lost is opened anew.
+        """Return the open session; open a new one if it was lost.
 
         Raises:
             FrameSourceError: the session cannot be opened, or was closed meanwhile.
@@ -158,14 +159,14 @@ class GigEDriver(FrameDriver):
             return self._session, self._shape
 
     async def start(self, sink: FrameSink) -> None:
-        """Start the stream, and open the camera where that is not done."""
+        """Start the stream, and open the camera if it is not open."""
         self._is_wanted = True
         session, shape = await self._opened()
         self._sink = sink
         try:
             if self._is_changed:
                 shape = await self._read_shape(session)
-            # a picture that a trigger of before still causes is not to come into this stream
+            # the picture of an earlier trigger must not come into this stream
             await asyncio.sleep(max(0.0, self._busy_until - time.monotonic()))
             self._stream = await self._listen(session, shape)
             session.on_lost = self._end
@@ -185,7 +186,7 @@ class GigEDriver(FrameDriver):
             await session.features.execute("AcquisitionStop")
             await lock(session.features, False)
             await session.control.write_register(Register.STREAM_PORT, 0)
-        except FrameSourceError as exc:  # it is gone; the next start opens it anew
+        except FrameSourceError as exc:  # the camera is gone; the next start opens it anew
             session.lost = exc
 
     async def close(self) -> None:
@@ -227,7 +228,7 @@ class GigEDriver(FrameDriver):
             await self._read_shape(session)
 
     def _longest(self, shape: StreamShape, arrived: float) -> float:
-        """Return the longest time that a frame which arrives then may have taken, in seconds."""
+        """Return the longest time, seconds, that a frame arriving at a time may have taken."""
         before, until = self._before
         return max(shape.exposure.duration, before if arrived < until else 0.0)
 
@@ -283,7 +284,7 @@ class GigEDriver(FrameDriver):
             raise CameraBusyError(f"{self.name}: it takes no trigger now: {exc}") from exc
 
     def disarm(self) -> None:
-        """Take no picture for that of the last trigger any longer."""
+        """Assign no more pictures to the last trigger."""
         armed, self._armed = self._armed, None
         if armed is not None and armed.pending.fired is not None and self._shape is not None:
             longest = self._longest(self._shape, time.monotonic())
@@ -293,7 +294,7 @@ class GigEDriver(FrameDriver):
     def _trigger_of(
         self, picture: WholePicture, session: GigESession
     ) -> FrameTrigger | SmartCamError | None:
-        """Return the trigger that caused a picture; an error where that cannot be known."""
+        """Return the trigger that caused a picture, or an error if that is not certain."""
         armed = self._armed
         if armed is None or armed.is_older(picture):
             return None
@@ -312,7 +313,7 @@ class GigEDriver(FrameDriver):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the camera tell events through its message channel."""
+        """Have the camera report events through its message channel."""
         async with self._setting:
             session, _ = await self._opened()
             end = await session.events.watch(names, take, ended)
@@ -324,13 +325,13 @@ class GigEDriver(FrameDriver):
         return stop
 
     async def _watch_exposures(self, session: GigESession) -> None:
-        """Have the camera tell what becomes of triggers, as far as it can."""
+        """Have the camera report the events about triggers that it supports."""
         if session.watches_exposures:
             return
         session.watches_exposures = True
         names = [name for name in await session.events.names() if name in (EXPOSED, MISSED)]
         if names:
-            with contextlib.suppress(FrameSourceError):  # it works without
+            with contextlib.suppress(FrameSourceError):  # triggering works without these events
                 await session.events.watch(names, self._take_event, lambda _: None)
 
     def _take_event(self, event: FrameEvent) -> None:
@@ -346,7 +347,7 @@ class GigEDriver(FrameDriver):
             )
 
     async def _listen(self, session: GigESession, shape: StreamShape) -> Stream:
-        """Have the stream come to a socket of ours."""
+        """Have the camera send its stream to a new socket."""
         try:
             where = StreamSocket(session.control.local_address, session.control.camera_address)
         except OSError as exc:
@@ -372,7 +373,7 @@ class GigEDriver(FrameDriver):
             raise
 
     def _quiet(self) -> None:
-        """Listen no longer; what was lost is told."""
+        """Stop listening; report lost frames."""
         self.disarm()
         stream, self._stream = self._stream, None
         sink, self._sink = self._sink, None
@@ -390,7 +391,7 @@ class GigEDriver(FrameDriver):
             sink.ended(error)
 
     def _take(self, pictures: list[WholePicture]) -> None:
-        """Take what the stream has; it may be closed by whoever takes a frame."""
+        """Take the stream's pictures; a receiver of a frame may close the stream."""
         stream = self._stream
         sink = None if pictures or self._armed is None else self._sink
         if sink is not None and stream is not None and (lost := stream.assembler.take_lost()):

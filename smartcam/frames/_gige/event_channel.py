@@ -1,7 +1,7 @@
-"""The message channel of a GigE Vision camera: its events, each acknowledged and taken once.
+"""Receive the events of a GigE Vision camera by its message channel, each exactly once.
 
-An event's data are the bytes of its item as EMVA's GenApi gives them to the description's event
-port: address 0 is the item's size, 2 its number, and its own data follow the timestamp.
+The data of an event are the bytes of its item, as EMVA's GenApi passes them to the description's
+event port: address 0 is the item's size, 2 its number, and its own data follow the timestamp.
 
 Source: GigE Vision 2.0, chapters 17 (EVENT, EVENTDATA) and 28 (message channel's registers); SFNC
 2.7, chapter 12 (``EventSelector``, ``EventNotification``).
@@ -30,12 +30,13 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.session import GigESession
 
 KEPT_REQUESTS: Final = 256
-"""Ids of requests that are remembered: an event that is sent again is taken once."""
+"""Number of request ids that are remembered, so that an event that is sent again is taken only
+once."""
 
 MAX_EVENTS_IN_MESSAGE: Final = 100
 
 RESEND_TIMEOUT_MS: Final = 300
-"""Milliseconds after which the camera sends an event again that was not acknowledged."""
+"""Milliseconds after which the camera repeats an event that was not acknowledged."""
 
 RETRIES: Final = 3
 
@@ -44,7 +45,8 @@ _ITEM: Final = struct.Struct(">HHHHQ")
 _LONG_ITEM: Final = struct.Struct(">HHHHQQ")
 _KEY: Final = 0x42
 _ON: Final = ("On", "GigEVisionEvent", "GenICamEvent")
-"""Entries of EventNotification that switch an event on: of today's SFNC, then of its first ones."""
+"""Entries of EventNotification that switch an event on: that of today's SFNC, then those of its
+first versions."""
 
 
 class EventItem(NamedTuple):
@@ -52,9 +54,9 @@ class EventItem(NamedTuple):
 
     Attributes:
         number: number of the event.
-        block: id of the block that the event belongs to; 0: of none.
+        block: id of the block that the event belongs to; 0: no block.
         ticks: reading of the camera's clock.
-        data: the item, as the description's event port shows it.
+        data: bytes of the item for the description's event port.
     """
 
     number: int
@@ -68,7 +70,7 @@ class EventRequest(NamedTuple):
 
     Attributes:
         command: EVENT or EVENTDATA.
-        request_id: id that its acknowledgement has, too.
+        request_id: id to repeat in the acknowledgement.
         wants_ack: whether the camera waits for an acknowledgement.
         items: the events.
     """
@@ -155,10 +157,10 @@ class EventChannel(asyncio.DatagramProtocol):
         self._messages: MessageFeatures | None = None
         self._taken: collections.deque[int] = collections.deque(maxlen=KEPT_REQUESTS)
         self.dropped = 0
-        """Datagrams that were no events, or came from others."""
+        """Number of datagrams that were no events, or came from other hosts."""
 
     async def names(self) -> list[str]:
-        """Return the names of the events that the camera can tell."""
+        """Return the names of the events that the camera can report."""
         features = self._session.features
         if "EventSelector" not in features or "EventNotification" not in features:
             return []
@@ -170,10 +172,10 @@ class EventChannel(asyncio.DatagramProtocol):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have events told; return the coroutine function that ends it.
+        """Have events reported; return the coroutine function that stops that.
 
         Raises:
-            UnsupportedError: the camera tells no events.
+            UnsupportedError: the camera reports no events.
             FrameSourceError: the camera has no such event.
         """
         known = await self.names()
@@ -217,7 +219,7 @@ class EventChannel(asyncio.DatagramProtocol):
                             await self._switch(name, on=False)
 
     async def _open(self) -> None:
-        """Have the camera's message channel send to a socket of ours."""
+        """Have the camera's message channel send to a new socket."""
         if self._transport is not None:
             return
         control = self._session.control
@@ -250,7 +252,7 @@ class EventChannel(asyncio.DatagramProtocol):
         self._transport = transport
 
     async def _number(self, name: str) -> None:
-        """Find the number of an event: that of its port, or the value of its feature."""
+        """Return the number of an event: that of its port, or the value of its feature."""
         if self._messages is None or name in self._numbers:
             return
         number: float | None = self._messages.number_of(f"Event{name}")
@@ -279,7 +281,7 @@ class EventChannel(asyncio.DatagramProtocol):
             watcher.ended(error)
 
     async def close(self) -> None:
-        """Have no socket any more. Idempotent."""
+        """Close the socket. Idempotent."""
         transport, self._transport = self._transport, None
         self.end(None)
         if transport is not None:
@@ -291,7 +293,7 @@ class EventChannel(asyncio.DatagramProtocol):
     # asyncio calls these
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the transport: acknowledgements may be wanted before it is known otherwise."""
+        """Take the transport here, since acknowledgements may be needed at once."""
         self._acks = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:

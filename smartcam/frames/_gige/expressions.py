@@ -1,7 +1,7 @@
-"""Formulas of GenICam descriptions: read into a tree, and worked out with numbers only.
+"""Parse formulas of GenICam descriptions, and evaluate them with numbers only.
 
-A description comes from the camera, so its formulas are bounded in length and depth, nothing of
-Python's is reached by them, and whole numbers stay within 64 bits.
+A description comes from the camera, so its formulas are bounded in length and depth, cannot reach
+anything of Python, and their integers stay within 64 bits.
 
 Source: GenApi 2.0, section 2.8.13 (SwissKnife: operators and functions).
 """
@@ -23,13 +23,13 @@ Number: TypeAlias = "int | float"
 Tree: TypeAlias = "tuple[str, tuple[Tree, ...]] | int | float | str"
 
 MAX_FORMULA_CHARACTERS: Final = 8192
-"""Characters of a formula."""
+"""A formula has at most this many characters."""
 
 MAX_NAMES_SHOWN: Final = 20
-"""Names of variables that an error shows."""
+"""An error shows at most this many names of variables."""
 
 MAX_LEVELS: Final = 150
-"""Levels of a formula's tree."""
+"""The tree of a formula has at most this many levels."""
 
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<hex>0[xX][0-9a-fA-F]+)"
@@ -50,7 +50,7 @@ _LEVELS_OF_C: Final = (
     ("+", "-"),
     ("*", "/", "%"),
 )
-"""Operators of two operands, the loosest first, as C has them; ``**`` is tighter than all."""
+"""Binary operators by C's precedence, the lowest first; ``**`` binds tighter than all."""
 
 _LEVELS_OF_EMVA: Final = (
     ("||", "&&", "=", "<>", "!=", "<", ">", "<=", ">="),
@@ -60,12 +60,12 @@ _LEVELS_OF_EMVA: Final = (
     ("<<", ">>"),
     ("&", "|", "^"),
 )
-"""Operators of two operands, the loosest first, as EMVA's own GenApi has them: found out by its
-values (genicam 1.6.0)."""
+"""Binary operators by the precedence of EMVA's own GenApi, the lowest first, which was found out by
+its results (genicam 1.6.0)."""
 
 
 _TIGHTER_THAN_NOT: Final = frozenset({"&", "|", "^", "<<", ">>", "**"})
-"""Operators behind which EMVA's GenApi misreads ``~``."""
+"""Operators after which EMVA's GenApi misreads ``~``."""
 
 
 def _strength(levels: tuple[tuple[str, ...], ...]) -> dict[str, int]:
@@ -76,13 +76,14 @@ _OF_C, _OF_EMVA = _strength(_LEVELS_OF_C), _strength(_LEVELS_OF_EMVA)
 
 
 def _wrapped(value: Number) -> int:
-    """Return a whole number of 64 bits with a sign."""
+    """Return an integer wrapped to 64 bits with a sign."""
     whole = int(value) & 0xFFFFFFFFFFFFFFFF
     return whole - (1 << 64) if whole >> 63 else whole
 
 
 def _divided(left: Number, right: Number) -> Number:
-    if isinstance(left, int) and isinstance(right, int):  # whole numbers: towards zero, as in C
+    # integers are divided towards zero, as in C
+    if isinstance(left, int) and isinstance(right, int):
         quotient = abs(left) // abs(right)
         return quotient if (left < 0) == (right < 0) else -quotient
     return left / right
@@ -158,26 +159,26 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
     "TAN": (1, math.tan),
     "TRUNC": (1, math.trunc),
 }
-"""Functions of formulas by name: the most arguments of each, and its body."""
+"""Functions of formulas by name: the largest number of arguments, and the Python function."""
 
 _CONSTANTS: Final = {"E": math.e, "PI": math.pi}
 
 
 def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> Number:
-    """Work a formula out.
+    """Evaluate a formula.
 
-    EMVA's GenApi, by which makers test their descriptions, reads operators without parentheses in
-    another order than C; other programs read them as C does. Where the two have different values
-    nobody knows which one the maker means.
+    EMVA's GenApi, with which makers test their descriptions, gives operators another precedence
+    than C; other programs use that of C. If the two readings give different values, nobody knows
+    which one the maker means.
 
     Args:
-        formula: formula as the description has it.
+        formula: text of the formula in the description.
         variables: value of each name in it.
-        whole: whether all is whole numbers, as in an ``IntSwissKnife``.
+        whole: whether all numbers are integers, as in an ``IntSwissKnife``.
 
     Raises:
-        MessageError: the formula is not valid, has a name that is not known, or no value: a
-            division by zero, a number past its bounds, or two values by two readings.
+        MessageError: the formula is not valid, has an unknown name, or has no value: it divides by
+            zero, a number exceeds its bounds, or the two readings give different values.
     """
     tree, other = _parsed(formula)
     value = _worked_out(formula, tree, variables, whole)
@@ -234,7 +235,7 @@ def _bounded(value: Number, whole: bool) -> Number:
 
 @functools.lru_cache(maxsize=1024)
 def _parsed(formula: str) -> tuple[Tree, Tree]:
-    """Return a formula as C reads it, and as EMVA's GenApi does."""
+    """Return the tree of a formula by C's precedence, and that by EMVA's GenApi."""
     try:
         return _FormulaParser(formula).parsed(), _EmvaParser(formula).parsed()
     except RecursionError as exc:
@@ -242,7 +243,7 @@ def _parsed(formula: str) -> tuple[Tree, Tree]:
 
 
 class _FormulaParser:
-    """Reads a formula in C's order of operators."""
+    """Parses a formula by C's precedence."""
 
     strength = _OF_C
 
@@ -278,7 +279,7 @@ class _FormulaParser:
         return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {got}")
 
     def _next(self, *signs: str) -> str | None:
-        """Step over one of these operators, where one is next."""
+        """Consume one of these operators if it is next."""
         if self._at < len(self._tokens):
             kind, sign = self._tokens[self._at]
             if kind == "operator" and sign in signs:
@@ -362,11 +363,11 @@ class _FormulaParser:
 
 
 class _EmvaParser(_FormulaParser):
-    """Reads a formula as EMVA's GenApi does.
+    """Parses a formula as EMVA's GenApi does.
 
-    A sign before a name or a number is tighter than any operator. A minus before a parenthesis or a
-    function stands for all that follows, and is misread elsewhere than at the start. Of several
-    choices the first one's value decides.
+    A sign before a name or a number binds tighter than any operator. A minus before a parenthesis
+    or a function applies to everything after it, and is misread except at the start. In nested
+    choices the first condition decides.
     """
 
     strength = _OF_EMVA

@@ -1,4 +1,4 @@
-"""A camera's features by their names, as its GenICam description tells how to reach them.
+"""Read and set a camera's features by name, as its GenICam description defines them.
 
 Source: GenApi 2.0, chapter 2.8 (kinds of nodes and what their elements mean); SFNC (names).
 """
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.description import Element
 
 MAX_LINKED_NODES: Final = 64
-"""Nodes that lead to each other: beyond that it is a circle."""
+"""Nodes may refer to each other in a chain of at most this length: a longer one is a circle."""
 
 MAX_NODES_VISITED: Final = 5000
-"""Nodes that are looked at for one value."""
+"""At most this many nodes are visited for one value."""
 
 MAX_ELEMENTS_VISITED: Final = 500_000
-"""Elements of nodes and characters of formulas that are looked at for one value: about a second. A
-node may be asked for again and again, and each time all of it is looked at."""
+"""At most this many elements of nodes and characters of formulas are examined for one value, which
+takes about a second. A node may be needed again and again, and counts each time."""
 
 MAX_REGISTER_BYTES: Final = 4096
-"""Bytes of a register."""
+"""A register has at most this many bytes."""
 
 _REGISTERS: Final = ("IntReg", "MaskedIntReg", "StructEntry")
 _KNIVES: Final = ("SwissKnife", "IntSwissKnife")
@@ -51,34 +51,34 @@ _KINDS: Final[Mapping[str, FeatureKind]] = {
     "Enumeration": "enumeration",
     "Command": "command",
 }
-"""The kind of feature that a node is to users."""
+"""Kinds of features, for users, by the kind of node."""
 
 LONGEST_TEXT: Final = 1000
-"""Characters of a feature's description that are kept."""
+"""Number of characters of a feature's description that are kept."""
 
 T = TypeVar("T")
 
 
 class NoLimitError(MessageError):
-    """The description says neither of a node nor of its value's node how large it may be."""
+    """The description gives no limit for a node, nor for the node that holds its value."""
 
 
 class DeviceMemory(Protocol):
     """The camera's memory."""
 
     async def read(self, address: int, length: int) -> bytes:
-        """Return ``length`` bytes from an address on."""
+        """Return ``length`` bytes, beginning at an address."""
         ...
 
     async def write(self, address: int, data: bytes) -> None:
-        """Write bytes from an address on."""
+        """Write bytes, beginning at an address."""
         ...
 
 
 class GenicamFeatures:
-    """The features of a camera that can be read, and set.
+    """The features of a camera, to read and to set.
 
-    Nothing is kept between two calls but what the description itself holds.
+    Between two calls nothing is kept except values that the description itself holds.
 
     Args:
         nodes: named elements of the camera's description.
@@ -88,16 +88,16 @@ class GenicamFeatures:
 
     def __init__(self, nodes: Mapping[str, Element], port: DeviceMemory, source: str) -> None:
         self._nodes, self._port, self._source = nodes, port, source
-        self._held: dict[str, FeatureValue] = {}  # what nodes with a <Value> were set to
+        self._held: dict[str, FeatureValue] = {}  # values that nodes with a <Value> were set to
         self._read: dict[tuple[str, int, int], bytes] = {}
         self._steps = self._work = 0
         self._writing: Callable[[], None] | None = None
-        self._lock = asyncio.Lock()  # of the fields that one call fills
+        self._lock = asyncio.Lock()  # caches that one call fills
         self._spellings = {spelled(name): name for name in nodes}
         self._selectors: dict[str, tuple[str, ...]] | None = None
 
     def share(self, other: GenicamFeatures) -> None:
-        """Have the same description as another one, and what was set in that."""
+        """Use the same description as another object, with the values that were set there."""
         GenicamFeatures.__init__(self, other._nodes, other._port, other._source)
         self._held = other._held
 
@@ -106,7 +106,7 @@ class GenicamFeatures:
         return name in self._nodes
 
     def names(self) -> list[str]:
-        """Return the features, as the description's categories list them."""
+        """Return the names of the features in the description's categories."""
         listed = [
             one.text
             for node in self._nodes.values()
@@ -116,11 +116,11 @@ class GenicamFeatures:
         return sorted({name for name in listed if self._kind(name) not in ("", "Category")})
 
     def find(self, name: str) -> str:
-        """Return the description's spelling of a name; an unknown name as it is."""
+        """Return the description's spelling of a name; an unknown name is returned unchanged."""
         return name if name in self._nodes else self._spellings.get(spelled(name), name)
 
     async def get(self, name: str) -> FeatureValue:
-        """Return a feature's value: of an enumeration the entry's name.
+        """Return a feature's value; for an enumeration, the entry's name.
 
         Raises:
             FrameFeatureError: there is no feature of that name, it is not available now, or has no
@@ -134,7 +134,7 @@ class GenicamFeatures:
                 raise self._wrong(name, str(exc)) from exc
 
     async def number(self, name: str) -> float | None:
-        """Return a feature's number; None: it has none, or it is not to be had now."""
+        """Return a feature's number; None if it has none, or is not available now."""
         if name not in self._nodes:
             return None
         async with self._lock:
@@ -145,7 +145,7 @@ class GenicamFeatures:
         return None if isinstance(value, str) else value
 
     async def entries(self, name: str) -> dict[str, int]:
-        """Return the entries of an enumeration that the camera has now, by name.
+        """Return the entries of an enumeration that are available now, by name.
 
         Raises:
             FrameFeatureError: there is no such enumeration.
@@ -165,7 +165,7 @@ class GenicamFeatures:
         Args:
             name: name of the feature.
             value: value of the feature, or its text: an entry's name, ``true``, a number.
-            writing: called right before the camera's register is written.
+            writing: function that is called right before the camera's register is written.
 
         Raises:
             FrameFeatureError: there is no such feature, or it cannot be set, or not to that value.
@@ -183,11 +183,11 @@ class GenicamFeatures:
                 self._writing = None
 
     async def execute(self, name: str, *, writing: Callable[[], None] | None = None) -> None:
-        """Execute a command; the camera may still be at it afterwards.
+        """Start a command; the camera may still be executing it afterwards.
 
         Args:
             name: name of the command.
-            writing: called right before the camera's register is written.
+            writing: function that is called right before the camera's register is written.
 
         Raises:
             FrameFeatureError: there is no command of that name, or the camera refuses.
@@ -195,7 +195,7 @@ class GenicamFeatures:
         await self.set(name, 1, writing=writing)
 
     def check_command(self, name: str, *, expected: bool = True) -> None:
-        """Raise unless a name is that of a command; with ``expected`` False, if it is.
+        """Raise unless a name is that of a command, or with ``expected`` False, if it is one.
 
         Raises:
             FrameSourceError: the name is not that of a command, or there is no feature of that
@@ -209,7 +209,7 @@ class GenicamFeatures:
     async def is_done(self, name: str) -> bool:
         """Return True if a command is done: its register no longer has the command's value.
 
-        Of one that cannot be read the camera's answer to the write was its end.
+        A command whose register cannot be read was done when the camera answered the write.
 
         Raises:
             FrameSourceError: the camera does not answer.
@@ -223,7 +223,7 @@ class GenicamFeatures:
                 return True
 
     async def describe(self, name: str) -> Feature:
-        """Return a feature with its value, range and access as they are now.
+        """Return a feature with its present value, range and access.
 
         Raises:
             FrameFeatureError: there is no feature of that name, or the camera does not answer.
@@ -283,7 +283,7 @@ class GenicamFeatures:
         }
 
     async def _shown(self, node: Element) -> FeatureValue:
-        """Return a node's value as users have it."""
+        """Return a node's value in the form for users."""
         value = await self._get(node, 0)
         if node.kind == "Enumeration":
             return next((name for name, one in _entries(node).items() if one == value), value)
@@ -292,7 +292,7 @@ class GenicamFeatures:
         return value
 
     async def _meant(self, node: Element, value: FeatureValue) -> FeatureValue:
-        """Return the node's own form of a given value, after checking that the node can have it."""
+        """Check that a node can have a value, and return the node's own form of it."""
         if node.kind == "Command":
             return int(await self._field(node, "CommandValue", 0, 1))
         if node.kind in _TEXTS:
@@ -346,7 +346,7 @@ class GenicamFeatures:
     async def _field(
         self, node: Element, kind: str, depth: int, default: float | None = None
     ) -> int | float:
-        """Return the number of ``<kind>``, or of the node that ``<pkind>`` names."""
+        """Return the number in ``<kind>``, or that of the node that ``<pKind>`` names."""
         for one in node.children:
             if one.kind == kind:
                 return _number(one.text)
@@ -357,14 +357,14 @@ class GenicamFeatures:
         return default
 
     def _step(self, node: Element, depth: int) -> None:
-        """Count a node that is looked at; MessageError: it is too deep, or one too many."""
+        """Count a visited node; raise MessageError if it is too deep or one too many."""
         self._steps += 1
         if depth > MAX_LINKED_NODES or self._steps > MAX_NODES_VISITED:
             raise MessageError(f"node {node.name}: its description goes in a circle")
         self._spend(node, len(node.children))
 
     def _spend(self, node: Element, work: int) -> None:
-        """Count elements or characters that are looked at; MessageError: too many."""
+        """Count examined elements or characters; raise MessageError if they are too many."""
         self._work += work
         if self._work > MAX_ELEMENTS_VISITED:
             raise MessageError(
@@ -413,7 +413,7 @@ class GenicamFeatures:
         return value
 
     async def _indexed(self, node: Element, depth: int) -> int | float:
-        """Return the number that stands in the description for the value of an index."""
+        """Return the number in the description for the value of an index."""
         wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
         for one in node.all("ValueIndexed"):
             if _number(one.attributes.get("Index", "-1")) == wanted:
@@ -421,7 +421,7 @@ class GenicamFeatures:
         return await self._field(node, "ValueDefault", depth)
 
     async def _target(self, node: Element, depth: int) -> Element | None:
-        """Return the node that has a node's value; None: it has it itself."""
+        """Return the node that holds a node's value; None: the node holds it itself."""
         found = node.first("pValue")
         index = node.first("pIndex")
         if index is not None and node.kind in ("Integer", "Float"):
@@ -445,7 +445,7 @@ class GenicamFeatures:
     async def _worked_out(
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
-        """Return the value of a formula with the node's variables."""
+        """Evaluate a formula with the node's variables."""
         whole = node.kind.startswith("Int")
         self._spend(node, len(formula))
         for one in node.children:
@@ -459,7 +459,7 @@ class GenicamFeatures:
         return evaluate(formula, variables, whole=whole)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
-        """Return the value of a formula's variable: that of its node, or of the part ``.NAME``."""
+        """Return the value of a formula's variable: that of its node, or of its part ``.NAME``."""
         _, _, what = variable.name.partition(".")
         if what in ("", "Value"):
             return await self._numbered(variable.text, depth + 1)
@@ -483,10 +483,10 @@ class GenicamFeatures:
         )
 
     async def _limit(self, node: Element, what: str, depth: int) -> int | float:
-        """Return the least or the most that a node can have, or its step.
+        """Return the smallest or largest value of a node, or its step.
 
-        A node that says nothing has those of the node that holds its value; one of the last kind
-        those of its bits (GenApi 2.0, 2.8.4 and 2.8.6).
+        A node without limits has those of the node that holds its value; if that has none, they
+        follow from its bits (GenApi 2.0, 2.8.4 and 2.8.6).
         """
         self._step(node, depth)
         if node.first(what, "p" + what) is not None:
@@ -573,7 +573,7 @@ class GenicamFeatures:
         return replace(basis, **parts, problem="; ".join(dict.fromkeys(problems)))
 
     async def _told(self, work: Coroutine[Any, Any, T], problems: list[str]) -> T | None:
-        """Return the value of some work; None: it failed, and the reason is noted."""
+        """Return the result of some work; None if it fails, and the reason is noted."""
         self._steps = self._work = 0
         try:
             return await work
@@ -586,7 +586,7 @@ class GenicamFeatures:
             return None
 
     async def _access_now(self, node: Element) -> Literal["rw", "ro", "wo", ""]:
-        """Return the access to a feature as it is now."""
+        """Return the present access to a feature."""
         if not await self._there(node, 0):
             return ""
         readable, writable = True, not await self._condition(node, "pIsLocked", False, 0)
@@ -618,7 +618,7 @@ class GenicamFeatures:
         return ""
 
     def _selected_by(self, name: str) -> tuple[str, ...]:
-        """Return the features that choose which one a feature is."""
+        """Return the features that select the instance of a feature."""
         if self._selectors is None:
             found: dict[str, list[str]] = {}
             for node in self._nodes.values():
@@ -668,7 +668,7 @@ class GenicamFeatures:
         return self._port
 
     async def _bytes(self, node: Element, address: int, length: int) -> bytes:
-        """Read a register, once for each call from outside."""
+        """Read a register, at most once per call from outside."""
         key = node.text_of("pPort"), address, length
         if key not in self._read:
             self._read[key] = await self._memory(node).read(address, length)
@@ -755,7 +755,7 @@ def _order(node: Element) -> Literal["big", "little"]:
 
 
 def _span(node: Element, length: int) -> tuple[int, int]:
-    """Return the place of the lowest bit of a node, and the number of its bits."""
+    """Return the position of the lowest bit of a node, and the number of its bits."""
     if node.kind == "IntReg":
         return 0, 8 * length
     bit = node.text_of("Bit")
@@ -763,7 +763,7 @@ def _span(node: Element, length: int) -> tuple[int, int]:
     low, high = min(ends), max(ends)
     if not 0 <= low <= high < 8 * length:
         raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")
-    if _order(node) == "big":  # where bit 0 is the highest one
+    if _order(node) == "big":  # descriptions whose bit 0 is the highest one
         low = 8 * length - 1 - high
     return low, abs(ends[1] - ends[0]) + 1
 

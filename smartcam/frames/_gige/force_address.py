@@ -1,7 +1,7 @@
 """Give a GigE Vision camera another IP address until it is switched off, by its hardware address.
 
-A camera whose address fits no network of this machine can be found and given one, but not opened.
-The camera carries it out only while nobody controls it.
+A camera whose address fits no network of this machine can be found and given another one, but not
+opened. The camera accepts that only while nobody controls it.
 
 Source: GigE Vision 2.0, chapter 14.2 (FORCEIP).
 """
@@ -60,17 +60,17 @@ async def force_address(
     places: Sequence[Network] | None = None,
     port: int = PORT,
 ) -> FoundSource:
-    """Give a camera an IP address until it is switched off; return it as a search finds it then.
+    """Give a camera an IP address until it is switched off; return the camera as found afterwards.
 
     Args:
         mac: hardware address of the camera, ``00:11:22:33:44:55``.
         address: IP address with the length of its network's prefix, ``192.168.0.20/24``.
         gateway: default gateway of the camera; ``0.0.0.0``: none.
-        places: networks to look in; None: all of this machine.
+        places: networks to search; None: all networks of this machine.
         port: UDP port that cameras listen at.
 
     Raises:
-        ConfigurationError: an address that is not valid, or that another camera has.
+        ConfigurationError: the address is not valid, or another camera has it.
         FrameSourceError: there is no such camera, it refuses, or does not answer by its new
             address.
 
@@ -99,7 +99,7 @@ async def force_address(
 
 
 def checked_mac(mac: str) -> str:
-    """Return a hardware address with small letters and colons.
+    """Return a hardware address in lower case with colons.
 
     Raises:
         ConfigurationError: the address is not valid.
@@ -154,7 +154,7 @@ def _of_mac(there: list[AnsweringCamera], mac: str) -> AnsweringCamera:
 async def _sent(
     payload: bytes, places: Sequence[Network], port: int, camera: AnsweringCamera
 ) -> None:
-    """Send the request in all networks, until it is answered.
+    """Send the request into all networks until it is answered.
 
     Raises:
         FrameSourceError: the request is refused.
@@ -220,4 +220,4 @@ class _ForceAnswers(asyncio.DatagramProtocol):
             self._answered.set_result(ack.status)
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore that nobody listens at one of the targets."""
+        """Ignore that no process listens at one of the targets."""

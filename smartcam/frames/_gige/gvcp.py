@@ -1,4 +1,4 @@
-"""GVCP, the control protocol of GigE Vision: its packets, registers and status codes.
+"""Encode and decode GVCP, the control protocol of GigE Vision: packets, registers, status codes.
 
 A request has an eight-byte header (key 0x42, flags, command, length, request id), an answer one of
 status, command, length, and the id of its request. All numbers are big-endian.
@@ -18,7 +18,8 @@ PORT: Final = 3956
 """UDP port that cameras listen at."""
 
 MAX_BYTES_PER_REQUEST: Final = 512
-"""Bytes that one READMEM or WRITEMEM asks for: 536 is the standard's limit; a multiple of four."""
+"""Number of bytes, a multiple of four, that one READMEM or WRITEMEM transfers; the standard's limit
+is 536."""
 
 ACK_REQUIRED: Final = 0x01
 BROADCAST_ACK: Final = 0x10
@@ -33,7 +34,7 @@ _WORD: Final = struct.Struct(">I")
 
 
 class GvcpCommand(IntEnum):
-    """The kind of a packet; answers are one above their requests."""
+    """The command of a packet; that of an answer is one above its request's."""
 
     DISCOVERY = 0x0002
     FORCEIP = 0x0004
@@ -78,20 +79,20 @@ class GvcpStatus(IntEnum):
 
 
 class Register(IntEnum):
-    """Addresses of bootstrap registers, which every camera has."""
+    """Addresses of the bootstrap registers, which every camera has."""
 
     VERSION = 0x0000
     MANUFACTURER_NAME = 0x0048
-    """Text, 32 bytes; behind it model (32), version (32), information (48), serial number (16)
-    and the user's name for it (16)."""
+    """Text of 32 bytes, followed by model (32), version (32), information (48), serial number (16)
+    and the user-defined name (16)."""
     FIRST_URL = 0x0200
-    """Place of the description, text, 512 bytes; behind it a second URL."""
+    """URL of the description, a text of 512 bytes, followed by a second URL."""
     HEARTBEAT_TIMEOUT = 0x0938
-    """Register of the time without a heartbeat after which control ends, milliseconds."""
+    """Time without a heartbeat after which control ends, milliseconds."""
     TICK_FREQUENCY_HIGH = 0x093C
     TICK_FREQUENCY_LOW = 0x0940
     TIMESTAMP_CONTROL = 0x0944
-    """Register whose bit :data:`LATCH` has the camera keep what its clock says."""
+    """Register whose bit :data:`LATCH` makes the camera store the time of its clock."""
     LATCHED_TIMESTAMP_HIGH = 0x0948
     LATCHED_TIMESTAMP_LOW = 0x094C
     CONTROL_PRIVILEGE = 0x0A00
@@ -99,7 +100,7 @@ class Register(IntEnum):
     MESSAGE_PORT = 0x0B00
     MESSAGE_DESTINATION = 0x0B10
     MESSAGE_TIMEOUT = 0x0B14
-    """Register of the time after which an event is sent again, milliseconds; 0: never."""
+    """Time after which an event is sent again, milliseconds; 0: never."""
     MESSAGE_RETRIES = 0x0B18
     STREAM_PORT = 0x0D00
     STREAM_PACKET_SIZE = 0x0D04
@@ -108,7 +109,7 @@ class Register(IntEnum):
 
 EXCLUSIVE: Final = 0x1
 CONTROL: Final = 0x2
-"""Bits of CONTROL_PRIVILEGE."""
+"""Bit of CONTROL_PRIVILEGE that takes control."""
 
 LATCH: Final = 0x2
 """Bit of TIMESTAMP_CONTROL."""
@@ -120,13 +121,13 @@ PACKET_SIZE_MASK: Final = 0xFFFF
 
 
 class Ack(NamedTuple):
-    """An answer.
+    """The acknowledgement of a request.
 
     Attributes:
         status: member of :class:`GvcpStatus`, or a maker's own.
         command: member of :class:`GvcpCommand`, plus one; or PENDING_ACK.
         request_id: id of the request that it answers.
-        payload: what stands behind the header.
+        payload: bytes after the header.
     """
 
     status: int
@@ -158,7 +159,7 @@ class DeviceInfo(NamedTuple):
 
     @property
     def label(self) -> str:
-        """For people."""
+        """Name of the device for people."""
         names = (f'"{self.user_name}"' if self.user_name else "", self.manufacturer, self.model)
         serial = f"({self.serial})" if self.serial else ""
         return " ".join(part for part in (*names, serial) if part)
@@ -187,13 +188,13 @@ class DeviceInfo(NamedTuple):
 
 
 def text(data: bytes) -> str:
-    """Return a register's text: up to its first zero, what cannot be shown replaced."""
+    """Return a register's text up to its first zero, with unprintable bytes replaced."""
     shown = data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
     return "".join(one if one.isprintable() else "?" for one in shown)
 
 
 def status_text(status: int) -> str:
-    """Return a status code for people."""
+    """Return the text of a status code for people."""
     try:
         return f"{GvcpStatus(status).name} ({status:#06x})"
     except ValueError:
@@ -225,7 +226,7 @@ def decode_ack(datagram: bytes) -> Ack:
 
 
 def read_registers(*addresses: int) -> bytes:
-    """Return the payload of a READREG."""
+    """Return the payload of a READREG of some addresses."""
     return b"".join(_WORD.pack(address) for address in addresses)
 
 

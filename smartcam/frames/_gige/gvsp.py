@@ -1,11 +1,12 @@
-"""GVSP, the stream protocol of GigE Vision: packet headers, leader and trailer.
+"""Decode GVSP, the stream protocol of GigE Vision: packet headers, leader and trailer.
 
 A frame is a *block*: a leader, the payload cut into packets of one size, the last one shorter, and
-a trailer. Packet ids count from 0, the leader's. Block ids have 16 bits, go from 1 to 65535 and
-then on at 1; or 64 bits where the camera sends extended ids, which a bit of each header says.
+a trailer. Packet ids count from 0, that of the leader. Block ids have 16 bits, go from 1 to 65535
+and continue at 1; or they have 64 bits if the camera sends extended ids, as a bit of each header
+says.
 
-Chunk data of the standard's first version (payload type 4) has a leader without the picture's size:
-that is what the camera's features say. A chunk of the picture's own length begins the payload.
+Chunk data of the standard's first version (payload type 4) has a leader without the picture's size,
+which only the camera's features give. The payload begins with a chunk of the picture's length.
 
 Source: GigE Vision 2.0, chapters 23 to 25.
 """
@@ -19,14 +20,14 @@ from typing import Final, NamedTuple
 from smartcam.exceptions import MessageError
 
 IP_UDP: Final = 28
-"""Bytes of the IP and UDP headers, which a camera's packet size counts."""
+"""Bytes of the IP and UDP headers, which a camera's packet size includes."""
 
 HEADER: Final = 8
 EXTENDED_HEADER: Final = 20
-"""Bytes."""
+"""Bytes of the header of a packet with extended ids."""
 
 EXTENDED: Final = 0x80
-"""Bit in the byte of the packet's kind: ids have 64 and 32 bits."""
+"""Bit in the byte of the packet's kind: block ids have 64 bits, packet ids 32."""
 
 _SHORT: Final = struct.Struct(">HHI")
 _LONG: Final = struct.Struct(">HHIQI")
@@ -37,7 +38,7 @@ _CHUNK_TRAILER: Final = struct.Struct(">HHII")
 
 
 def bits_of(pixel_format: int) -> int:
-    """Return the bits of a pixel, which stand in PFNC's number."""
+    """Return the number of bits of a pixel, which is part of PFNC's number."""
     return pixel_format >> 16 & 0xFF
 
 
@@ -50,7 +51,7 @@ class PacketKind(IntEnum):
 
 
 class PayloadType(IntEnum):
-    """The kind of data that a block has."""
+    """The kind of data in a block."""
 
     IMAGE = 0x0001
     RAW = 0x0002
@@ -71,18 +72,18 @@ PICTURES: Final = (
     PayloadType.CHUNK,
     PayloadType.EXTENDED_CHUNK,
 )
-"""Payload types that hold a picture as it is."""
+"""Payload types that hold an uncompressed picture."""
 
 
 class PacketHeader(NamedTuple):
-    """A packet's header.
+    """The header of a packet.
 
     Attributes:
-        status: 0, or the code of what is wrong.
+        status: 0, or an error code.
         block: id of the block.
         kind: one of :class:`PacketKind`, or another number.
         packet: id of the packet in the block.
-        size: bytes of the header.
+        size: number of bytes of the header.
     """
 
     status: int
@@ -99,10 +100,10 @@ class Leader(NamedTuple):
         payload_type: member of :class:`PayloadType`.
         ticks: reading of the camera's clock, ticks.
         pixel_format: PFNC's number.
-        width: pixels.
-        height: pixels.
-        padding_x: bytes behind each row.
-        padding_y: bytes behind the last row.
+        width: width in pixels.
+        height: height in pixels.
+        padding_x: number of padding bytes after each row.
+        padding_y: number of padding bytes after the last row.
     """
 
     payload_type: int
@@ -115,17 +116,17 @@ class Leader(NamedTuple):
 
     @property
     def has_chunks(self) -> bool:
-        """True if chunk data follows the picture, which is a chunk itself."""
+        """True if chunk data follows the picture, which is then a chunk itself."""
         return self.payload_type != PayloadType.IMAGE
 
 
 class ImpliedPicture(NamedTuple):
-    """A picture as the camera's features say it, for leaders that do not.
+    """A picture as the camera's features describe it, for leaders that do not.
 
     Attributes:
         pixel_format: PFNC's number.
-        width: pixels.
-        height: pixels.
+        width: width in pixels.
+        height: height in pixels.
     """
 
     pixel_format: int
@@ -138,8 +139,8 @@ class Trailer(NamedTuple):
 
     Attributes:
         payload_type: a value of :class:`PayloadType`.
-        rows: number of rows that were sent; 0: it does not say.
-        length: bytes of the payload; 0: it does not say.
+        rows: number of rows that were sent; 0: not given.
+        length: number of bytes of the payload; 0: not given.
     """
 
     payload_type: int
@@ -148,7 +149,7 @@ class Trailer(NamedTuple):
 
 
 def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHeader | None:
-    """Read the header of a packet of ``size`` bytes; None where it is too short for one."""
+    """Decode the header of a packet of ``size`` bytes; None if it is too short."""
     if size < HEADER:
         return None
     status, block, word = _SHORT.unpack_from(data)
@@ -162,11 +163,11 @@ def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHead
 
 
 def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Leader:
-    """Read a leader, without its header.
+    """Decode a leader without its packet header.
 
     Args:
         payload: bytes of the leader.
-        implied: picture of a leader that has no size; None: such a leader is an error.
+        implied: picture for a leader without a size; None: such a leader is an error.
 
     Raises:
         MessageError: the leader is too short, or not that of an image.
@@ -200,7 +201,7 @@ def _no_picture(payload: bytes, payload_type: int) -> MessageError:
 
 
 def decode_trailer(payload: bytes) -> Trailer:
-    """Read a trailer, without its header.
+    """Decode a trailer without its packet header.
 
     Raises:
         MessageError: the trailer is too short.

@@ -1,4 +1,4 @@
-"""Values that a camera sends by itself: chunk data behind each picture, and the data of events.
+"""Read values that a camera sends unasked: chunk data after each picture, and data of events.
 
 A description has a port for each chunk and each event; a feature whose registers are read through
 such a port has its value in the bytes of the message. Nothing here asks the camera.
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.features import DeviceMemory
 
 MAX_CHUNKS: Final = 256
-"""Chunks behind one picture."""
+"""A picture has at most this many chunks."""
 
 MAX_MESSAGE_FEATURES: Final = 256
-"""Features that are read from one message."""
+"""At most this many features are read from one message."""
 
 MAX_REFERENCES: Final = 32
-"""Nodes between a feature and the port of its message."""
+"""At most this many nodes lie between a feature and the port of its message."""
 
 _ENDING: Final = struct.Struct(">II")
 _LEADS_TO_VALUE: Final = ("pValue", "pPort", "pVariable")
@@ -65,11 +65,11 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
 
 
 def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
-    """Return why a picture whose leader has no size may be of another one; "" where it is not.
+    """Return the reason why a picture without a size in its leader may have another one, or "".
 
     Args:
-        picture: picture of the size that the camera's features say.
-        chunks: values that came with it.
+        picture: picture with the size by the camera's features.
+        chunks: values that came with the picture.
     """
     leader = picture.leader
     need, size = picture_bytes(leader, picture.rows), f"{leader.width}x{leader.height}"
@@ -105,14 +105,14 @@ class MessageFeatures(GenicamFeatures):
                 self._by_number.setdefault(number, []).append(name)
 
     def number_of(self, beginning: str) -> int | None:
-        """Return the number of the message whose features begin with a name."""
+        """Return the number of the message whose features begin with ``beginning``."""
         for number, names in self._by_number.items():
             if any(name.startswith(beginning) for name in names):
                 return number
         return None
 
     def read(self, parts: Mapping[int, memoryview]) -> tuple[dict[str, FeatureValue], list[str]]:
-        """Return the values in a message by their features, and what could not be read.
+        """Return the values in a message by their features, and the problems in reading them.
 
         Args:
             parts: bytes of the chunks or of the event, by their numbers.
@@ -155,7 +155,7 @@ class MessageFeatures(GenicamFeatures):
 
 
 class _MessageBytes:
-    """The bytes of a message, as registers."""
+    """The bytes of a message, which are read like registers."""
 
     def __init__(self, data: memoryview) -> None:
         self._data = data
@@ -172,7 +172,7 @@ class _MessageBytes:
 
 
 def _port_numbers(nodes: Mapping[str, Element], kind: str) -> dict[str, int]:
-    """Return the number of each port that has one of that kind."""
+    """Return the number of each port that has one of the kind."""
     found: dict[str, int] = {}
     for node in nodes.values():
         text = node.text_of(kind) if node.kind == "Port" else ""

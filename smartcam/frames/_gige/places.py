@@ -1,4 +1,4 @@
-"""Find the camera that a URL names, and read the options of the URL."""
+"""Find the camera that a URL names, and read the URL's options."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def wanted(address: FrameAddress) -> WantedStream:
     """Read a URL's parameters.
 
     Raises:
-        ConfigurationError: one of the parameters is wrong; the text says what is known.
+        ConfigurationError: a parameter is wrong; the text names the known ones.
     """
     names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
     features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]
@@ -81,7 +81,7 @@ async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
 
 
 def found(camera: AnsweringCamera) -> FoundSource:
-    """Return a camera as it is listed."""
+    """Return the entry of a camera in a list of sources."""
     remark = ""
     if not camera.reachable:
         remark = (

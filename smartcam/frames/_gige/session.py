@@ -1,4 +1,4 @@
-"""One camera under our control: its description read, its features set, its heartbeat kept."""
+"""Control one camera: read its description, set its features, keep its heartbeat."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ RESEND_CAPABILITY: Final = 0x4
 """Bit of the register CAPABILITIES: the camera can send packets again."""
 
 MAX_REMARK_LENGTH: Final = 1000
-"""Characters of what a frame says of chunk data that could not be read."""
+"""The remark of a frame about unreadable chunk data has at most this many characters."""
 
 CAPABILITIES: Final = 0x0934
 URL_SIZE: Final = 512
 HEARTBEAT_TIMEOUTS: Final = (0.5, 60.0)
-"""Seconds between which a camera's own heartbeat timeout is taken as it is."""
+"""A camera's own heartbeat timeout is used if it is between these numbers of seconds."""
 
 
 class GigESession:
-    """A camera that is ours until :meth:`close`.
+    """A camera that is controlled until :meth:`close`.
 
     Args:
         control: control channel to the camera, closed with the session.
-        label: name of the camera until it says one itself.
+        label: name of the camera until its own name is known.
     """
 
     def __init__(self, control: ControlChannel, label: str) -> None:
@@ -54,9 +54,9 @@ class GigESession:
         self.ticks_per_second = 0
         self.can_resend = False
         self.streamed = False
-        """Whether it has streamed before."""
+        """Whether the camera has streamed before."""
         self.watches_exposures = False
-        """Whether events were asked for that tell what becomes of triggers."""
+        """Whether events about the outcome of triggers were switched on."""
         self.ids_agree = False
         """Whether an event has named the block of a picture that came."""
         self.events = EventChannel(self)
@@ -71,7 +71,7 @@ class GigESession:
         """Take control of a camera and read its description.
 
         Raises:
-            FrameSourceError: the camera is not there, another application has it, or its
+            FrameSourceError: the camera does not answer, another application controls it, or its
                 description cannot be read.
         """
         control = await ControlChannel.connect(host, port, label)
@@ -99,7 +99,7 @@ class GigESession:
         return self._features
 
     def read_chunks(self, picture: WholePicture) -> tuple[Mapping[str, FeatureValue], str]:
-        """Return the values that came with a picture, and what could not be read of them."""
+        """Return the values that came with a picture, and the problems in reading them."""
         if picture.payload is None:
             return {}, ""
         try:
@@ -111,10 +111,10 @@ class GigESession:
         return values, "; ".join(problems)[:MAX_REMARK_LENGTH]
 
     async def close(self) -> None:
-        """Give the camera back. Idempotent.
+        """Give up control of the camera. Idempotent.
 
-        Cancellation: the socket is closed all the same; the camera frees itself after its
-        heartbeat's timeout.
+        Cancellation: the socket is closed nevertheless; control ends after the camera's heartbeat
+        timeout.
         """
         heart, self._heart = self._heart, None
         ours, self._ours = self._ours, False
@@ -152,8 +152,8 @@ class GigESession:
     async def latched_clock(self) -> int | None:
         """Return the reading of the camera's clock now, ticks; None: it cannot be read.
 
-        A reading that does not go on does not count: a camera may keep whatever is
-        written into the register, and latches nothing.
+        A clock that stands still does not count: some cameras only store the written register, and
+        latch nothing.
 
         Raises:
             FrameSourceError: the camera does not answer.
@@ -173,7 +173,7 @@ class GigESession:
         return self._latched if self._latched > before else None
 
     async def _register_or_0(self, address: int) -> int:
-        """Return a register that a camera need not have."""
+        """Return an optional register, 0 if the camera does not have it."""
         try:
             return await self.control.read_register(address)
         except RequestRefusedError:
@@ -213,10 +213,10 @@ class GigESession:
 
 
 async def read_description(control: ControlChannel, label: str) -> dict[str, Element]:
-    """Read a camera's description; the second URL is tried where the first one leads nowhere.
+    """Read a camera's description; try the second URL if the first one leads nowhere.
 
     Raises:
-        FrameSourceError: neither leads to one.
+        FrameSourceError: neither URL leads to a description.
     """
     tried = []
     for address in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
@@ -237,7 +237,7 @@ def _nodes(data: bytes) -> dict[str, Element]:
 
 
 async def _in_thread(work: Callable[[], dict[str, Element]], label: str) -> dict[str, Element]:
-    """Do work beside the loop: 2 MB of XML take a quarter of a second."""
+    """Do work in a thread, since 2 MB of XML take a quarter of a second."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=f"description of {label}")
     try:
         return await asyncio.get_running_loop().run_in_executor(pool, work)

@@ -1,4 +1,4 @@
-"""Set a camera's features to what a URL asks for, and the registers of its stream channel."""
+"""Set a camera's features as its URL says, and the registers of its stream channel."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels.formats import PixelFormat
 
 FEATURE: Final = "feature."
-"""Prefix of the URL's parameters of features."""
+"""Prefix of the URL's parameters that set features."""
 
 PACKETS: Final = (576, 16384)
-"""Bytes of the stream's IP packets: each network carries the first; the second is the most."""
+"""Least and largest number of bytes of the stream's IP packets: each network carries the first."""
 
 TEST_WAIT: Final = 0.1
 """Seconds for a test packet."""
 
-LARGEST_FRAME: Final = 1 << 30
-"""Bytes of the largest frame."""
+MAX_FRAME_BYTES: Final = 1 << 30
+"""A frame has at most this many bytes."""
 
 MAX_NUMBER: Final = 1e12
-"""Frames a second, or microseconds, below which a number is believed."""
+"""Numbers of frames per second, or of microseconds, above this value are not believed."""
 
 _RATES: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _RATE_SWITCHES: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 _EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
-"""Names of the exposure time, microseconds: in the SFNC of today, then in its first editions."""
+"""Names of the exposure time, microseconds: in today's SFNC, then in its first versions."""
 
 
 class WantedStream(NamedTuple):
@@ -53,11 +53,11 @@ class WantedStream(NamedTuple):
 
     Attributes:
         said: parameters of the URL, in their order.
-        size: width and height, pixels; None: as the camera has it.
-        rate: frames a second; None: as the camera has it.
+        size: width and height, pixels; None: the camera's setting.
+        rate: frames per second; None: the camera's setting.
         packet_size: bytes of an IP packet; 0: the largest that comes through.
         resend: whether missing packets are asked for.
-        trigger: source of the triggers, or ``off``; None: as the camera has it.
+        trigger: source of the triggers, or ``off``; None: the camera's setting.
     """
 
     said: Mapping[str, str]
@@ -69,7 +69,7 @@ class WantedStream(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """The longest time that a frame takes, as far as the camera tells it.
+    """The longest time that a frame takes, as far as the camera states it.
 
     Attributes:
         duration: seconds of the longest exposure and of the readout.
@@ -83,12 +83,12 @@ class Exposure(NamedTuple):
 
 
 class StreamShape(NamedTuple):
-    """The properties of a camera's stream once it is set.
+    """The properties of a camera's stream after its setup.
 
     Attributes:
         format: format of the frames.
-        number: PFNC's, of the pixel format.
-        payload: bytes of a frame at most.
+        number: PFNC's number of the pixel format.
+        payload: largest number of bytes of a frame.
         exposure: longest time of a frame.
     """
 
@@ -99,10 +99,10 @@ class StreamShape(NamedTuple):
 
 
 async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
-    """Set a camera, in the order in which the URL says it; return what it streams then.
+    """Set a camera in the order of the URL's parameters; return the resulting stream.
 
     Raises:
-        FrameSourceError: the camera has no such feature or value; the text says what it has.
+        FrameSourceError: the camera has no such feature or value; the text lists those that it has.
     """
     features = session.features
     with contextlib.suppress(FrameSourceError):  # it does not stream, which may be an error
@@ -126,9 +126,9 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
 
 
 async def lock(features: GenicamFeatures, locked: bool) -> None:
-    """Tell the camera that its stream's shape is fixed, or no longer; not all want to know."""
+    """Tell the camera whether its stream's shape is fixed; not all cameras need that."""
     if "TLParamsLocked" in features:
-        with contextlib.suppress(FrameSourceError):  # of some it is read-only
+        with contextlib.suppress(FrameSourceError):  # some cameras have it read-only
             await features.set("TLParamsLocked", int(locked))
 
 
@@ -149,7 +149,7 @@ async def _set_format(session: GigESession, name: str) -> None:
 
 
 async def _set_size(features: GenicamFeatures, size: tuple[int, int]) -> None:
-    for name in ("OffsetX", "OffsetY"):  # a width has only room up to the offset
+    for name in ("OffsetX", "OffsetY"):  # the width is limited by the offset
         if name in features:
             with contextlib.suppress(FrameSourceError):
                 await features.set(name, 0)
@@ -180,10 +180,10 @@ async def _set_rate(session: GigESession, rate: float) -> None:
 
 
 async def read_shape(session: GigESession) -> StreamShape:
-    """Return the shape of the stream as the camera is set now.
+    """Return the shape of the stream with the camera's present settings.
 
     Raises:
-        FrameSourceError: the camera does not tell, or a format that is not known here.
+        FrameSourceError: the camera does not state it, or has an unknown format.
     """
     features = session.features
     entry = await features.get("PixelFormat")
@@ -204,9 +204,9 @@ async def read_shape(session: GigESession) -> StreamShape:
     )
     least = (width * height * bits_of(number) + 7) // 8
     payload = int(await features.number("PayloadSize") or least)
-    if not 0 < least <= payload <= LARGEST_FRAME:
+    if not 0 < least <= payload <= MAX_FRAME_BYTES:
         raise FrameSourceError(
-            f"{session.label}: expected a PayloadSize of {least} to {LARGEST_FRAME} bytes for "
+            f"{session.label}: expected a PayloadSize of {least} to {MAX_FRAME_BYTES} bytes for "
             f"{width}x{height} pixels of {entry}, got {payload}",
             source=session.label,
         )
@@ -216,7 +216,7 @@ async def read_shape(session: GigESession) -> StreamShape:
 
 
 async def read_exposure(features: GenicamFeatures) -> Exposure:
-    """Return the longest time of a frame, as the camera is set now."""
+    """Return the longest time of a frame with the camera's present settings."""
     rate = await _first_number(features, _RATES)
     exposure = await _first_number(features, _EXPOSURES) or 0.0
     is_auto = False
@@ -232,7 +232,7 @@ async def read_exposure(features: GenicamFeatures) -> Exposure:
 
 
 def _known(number: int) -> PixelFormat | None:
-    """Return the format of a number; names differ: cameras have older ones than PFNC's."""
+    """Return the format of PFNC's number; its names differ, since cameras have older ones."""
     with contextlib.suppress(FrameFormatError):
         return find_format(number)
     return None
@@ -254,10 +254,10 @@ async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
     Args:
         session: the camera.
         where: socket that receives the packets.
-        asked: bytes of a packet; 0: the largest that comes through.
+        asked: number of bytes of a packet; 0: the largest that comes through.
 
     Returns:
-        Bytes of an IP packet of the stream.
+        Number of bytes of an IP packet of the stream.
 
     Raises:
         FrameSourceError: the camera refuses to send there, or refuses the packet size.
@@ -289,13 +289,14 @@ async def _given(session: GigESession, asked: int) -> int:
 
 
 async def _tested(session: GigESession, where: StreamSocket) -> int:
-    """Return the largest size of which a test packet came; without any the camera's own."""
+    """Return the largest size of a test packet that came, or the camera's own size if none came."""
     control = session.control
     own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
     way = min(control.path_mtu, 9000)
     for size in sorted({way, min(way, 1500), PACKETS[0]}, reverse=True):
         value = size | DO_NOT_FRAGMENT | FIRE_TEST_PACKET
-        with contextlib.suppress(FrameSourceError):  # it does not send test packets, or not such
+        # the camera does not send test packets, or none of this size
+        with contextlib.suppress(FrameSourceError):
             await control.write_register(Register.STREAM_PACKET_SIZE, value)
             set_to = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
             if set_to <= size and await where.test_packet(set_to, TEST_WAIT):

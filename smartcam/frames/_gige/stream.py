@@ -1,8 +1,7 @@
-"""The stream's socket: packets into the assembler, pictures to whoever takes them.
+"""Pass packets from the stream's socket to the assembler, and pictures to their receiver.
 
-Measured, one packet of 1400 bytes, processor time of the receiver: 29 us with asyncio's datagram
-transport, which makes an object and a call of each; 4 us with a bare socket that is read until it
-is empty.
+Measured CPU time of the receiver per packet of 1400 bytes: 29 us with asyncio's datagram transport,
+which makes an object and a call for each; 4 us with a bare socket that is read until it is empty.
 """
 
 from __future__ import annotations
@@ -23,14 +22,16 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.block import WholePicture
 
 MAX_PACKETS_PER_TURN: Final = 64
-"""Packets that are read before the event loop has its turn: a third of a millisecond."""
+"""At most this many packets are read before the event loop continues: a third of a millisecond."""
 
 BUFFER: Final = 8 << 20
-"""Bytes that the system is asked to keep for us; Linux gives net.core.rmem_max at most, by default
-208 KiB, which a frame of 512x512 fills: what does not fit while the loop is busy is lost."""
+"""Size of the receive buffer that the system is asked for, bytes. Linux gives at most
+net.core.rmem_max, by default 208 KiB, which a frame of 512x512 fills; packets that do not fit while
+the loop is busy are lost."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
-"""asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
+"""Socket option from asm-generic/socket.h that exceeds rmem_max, for processes that may administer
+the network."""
 
 
 class StreamSocket:
@@ -38,10 +39,10 @@ class StreamSocket:
 
     Args:
         local: address of this machine.
-        camera: the camera's; what others send is dropped.
+        camera: address of the camera; packets from others are dropped.
 
     Raises:
-        OSError: there is no such address here.
+        OSError: this machine has no such address.
     """
 
     def __init__(self, local: str, camera: str) -> None:
@@ -50,7 +51,7 @@ class StreamSocket:
         try:
             self.socket.setblocking(False)
             for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
-                with contextlib.suppress(OSError):  # the second one is for the privileged
+                with contextlib.suppress(OSError):  # the second option is for privileged processes
                     self.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
             self.socket.bind((local, 0))
         except BaseException:
@@ -59,11 +60,11 @@ class StreamSocket:
 
     @property
     def port(self) -> int:
-        """Its port."""
+        """Port of the socket."""
         return int(self.socket.getsockname()[1])
 
     async def test_packet(self, packet_size: int, wait: float) -> bool:
-        """Return True if a packet of that size comes in time; drop all others."""
+        """Return True if a packet of the given size comes in time; drop all others."""
         loop = asyncio.get_running_loop()
         buffer = bytearray(65536)
         try:
@@ -81,13 +82,14 @@ class StreamSocket:
 
 
 class Stream:
-    """A stream that is under way, until :meth:`close`.
+    """A running stream, until :meth:`close`.
 
     Args:
         where: socket that receives the packets, closed with the stream.
         assembler: maker of pictures from the packets.
-        done: takes each picture, and what was lost where none follows.
-        resend: takes what the camera is to send once more.
+        done: function that takes each picture, and the number of lost frames that no picture
+            follows.
+        resend: function that takes the packets that the camera should send again.
     """
 
     def __init__(
@@ -106,11 +108,11 @@ class Stream:
         self._timer_at = 0.0
         self._closed = False
         self.foreign = 0
-        """Datagrams that others sent."""
+        """Number of datagrams from other hosts."""
         self._loop.add_reader(where.socket, self._readable)
 
     def close(self) -> None:
-        """Read no longer. Idempotent."""
+        """Stop reading. Idempotent."""
         if not self._closed:
             self._closed = True
             self._loop.remove_reader(self._where.socket)
@@ -127,7 +129,7 @@ class Stream:
                 size, sender = receive(view)
             except BlockingIOError:
                 break
-            except OSError:  # of an earlier datagram of ours; the next packets come
+            except OSError:  # an error of an earlier datagram that we sent; the next packets come
                 continue
             if sender[0] == camera:
                 feed(view, size, now, arrived)
@@ -148,7 +150,7 @@ class Stream:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer_at = deadline  # a timer of uvloop does not tell
+        self._timer_at = deadline  # a timer of uvloop does not say whether it was cancelled
         self._timer = self._loop.call_at(deadline, self._due)
 
     def _due(self) -> None:

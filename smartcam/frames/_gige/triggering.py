@@ -1,9 +1,9 @@
-"""Triggers of a GigE Vision camera: how it is set to be triggered, and which picture is whose.
+"""Trigger a GigE Vision camera, and find the picture that a trigger caused.
 
-A picture belongs to the trigger that waits for it if none of these speaks against it: it was
-exposed before the trigger was sent, by the camera's clock, which is read (latched) right before;
-a picture was lost meanwhile; an event of the camera names another block. Where the camera has no
-clock that can be read, it rests on this stream alone: each picture before it was accounted for.
+A picture belongs to the waiting trigger unless one of these contradicts it: it was exposed before
+the trigger was sent, by the camera's clock, which is read (latched) right before; a picture was
+lost meanwhile; an event of the camera names another block. If the camera's clock cannot be read,
+the decision rests on the stream alone: each earlier picture was accounted for.
 
 Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
 ``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
 EXPOSED: Final = "ExposureEnd"
 MISSED: Final = "FrameTriggerMissed"
-"""Events that tell what became of a trigger."""
+"""Name of the event for a trigger that caused no picture."""
 
 MAX_EXPOSURES: Final = 16
-"""Exposures of one trigger that are remembered."""
+"""At most this many exposures of one trigger are remembered."""
 
 SOFTWARE: Final = "Software"
 FRAME_START: Final = "FrameStart"
 
 
 class TriggerSetting(NamedTuple):
-    """One kind of trigger that is switched on.
+    """A kind of trigger that is switched on.
 
     Attributes:
         selector: entry of TriggerSelector; ``""``: the camera has only one kind.
@@ -48,14 +48,14 @@ class TriggerSetting(NamedTuple):
     source: str
 
     def __str__(self) -> str:
-        """Return the setting as errors show it."""
+        """Return the setting as a text for errors."""
         which = f" for {self.selector}" if self.selector else ""
         source = f", TriggerSource {self.source}" if self.source else ""
         return f"its TriggerMode is On{which}{source}"
 
 
 async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
-    """Return the kinds of triggers that are switched on; TriggerSelector is as before afterwards.
+    """Return the kinds of triggers that are switched on; TriggerSelector is restored.
 
     Raises:
         FrameSourceError: the camera does not answer.
@@ -82,7 +82,7 @@ async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSett
 
 
 async def _said(features: GenicamFeatures, name: str) -> str:
-    """Return a feature's text; "" where it is not to be had now."""
+    """Return a feature's text, or "" if it is not available now."""
     if name not in features:
         return ""
     try:
@@ -94,10 +94,10 @@ async def _said(features: GenicamFeatures, name: str) -> str:
 
 
 async def set_trigger(features: GenicamFeatures, source: str) -> None:
-    """Have each picture wait for a trigger of a source; ``off``: for none.
+    """Have each picture wait for a trigger from a source; ``off``: for none.
 
     Raises:
-        FrameSourceError: the camera has no such source; the text says which.
+        FrameSourceError: the camera has no such source; the text lists those that it has.
     """
     if "TriggerSelector" in features:
         for selector in await features.entries("TriggerSelector"):
@@ -111,17 +111,18 @@ async def set_trigger(features: GenicamFeatures, source: str) -> None:
         return
     sources = await features.entries("TriggerSource")
     meant = {one.lower(): one for one in sources}.get(source.lower(), source)
-    await features.set("TriggerMode", "On")  # some have a source only then
+    # some cameras have a source only while the trigger is switched on
+    await features.set("TriggerMode", "On")
     await features.set("TriggerSource", meant)
 
 
 async def one_setting(
     settings: list[TriggerSetting], features: GenicamFeatures, by_line: bool, name: str
 ) -> TriggerSetting:
-    """Return the trigger that causes exactly one picture, and is fired so.
+    """Return the kind of trigger that causes exactly one picture, and is fired in this way.
 
     Raises:
-        NotRunningError: no trigger is switched on, or one from elsewhere.
+        NotRunningError: no trigger is switched on, or only one from another source.
         UnsupportedError: a trigger causes several pictures, or several triggers are needed for one.
     """
     if not settings:
@@ -151,7 +152,7 @@ async def one_setting(
 
 @contextlib.asynccontextmanager
 async def selected(features: GenicamFeatures, setting: TriggerSetting) -> AsyncIterator[None]:
-    """Have TriggerSelector at a trigger meanwhile; it is as before afterwards.
+    """Set TriggerSelector to a trigger for the block, then restore it.
 
     Raises:
         FrameSourceError: the camera does not answer.
@@ -172,7 +173,7 @@ class ArmedTrigger:
 
     Args:
         pending: the trigger of the source.
-        latched: the camera's clock right before it, ticks; None: it cannot be read.
+        latched: the camera's clock right before the trigger, ticks; None: it cannot be read.
         setting: kind of the trigger.
         delay: seconds from the trigger to its exposure (``TriggerDelay``).
         is_first: whether no picture of the stream has come yet.
@@ -190,7 +191,7 @@ class ArmedTrigger:
         self.pending, self.delay = pending, delay
         self._latched, self._setting, self._is_first = latched, setting, is_first
         self.exposed: list[int] = []
-        """Blocks that the camera's events say it exposed since."""
+        """Blocks that the camera exposed since, by its events."""
 
     def is_older(self, picture: WholePicture) -> bool:
         """Return True if a picture was exposed before the trigger, by the camera's clock."""
@@ -201,7 +202,7 @@ class ArmedTrigger:
         return older
 
     def doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
-        """Return the reason why a picture may not be that of the trigger, or ``""``.
+        """Return the reason why a picture may not be the trigger's, or ``""``.
 
         Args:
             picture: picture that came first.
@@ -214,7 +215,7 @@ class ArmedTrigger:
         return ""
 
     def take_event(self, event: FrameEvent, ticks: float | None) -> bool:
-        """Take an event of the camera; return True if it says that the trigger was missed.
+        """Take an event of the camera; return True if it reports that the trigger was missed.
 
         Args:
             event: event that the camera told.

@@ -1,1 +1,1 @@
-"""Pixel formats: their layouts in bytes and their conversion to colours."""
+"""Define pixel formats: their layouts in bytes and their conversion to colours."""

@@ -1,4 +1,4 @@
-"""From what a camera sends to red, green and blue, and from these to grey."""
+"""Convert a camera's samples to red, green and blue, and these to grey."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     _Conversion = Callable[[NDArray[Any]], NDArray[Any]]
 
 FRACTION_BITS: Final = 16
-"""Bits behind the binary point of the sums below, for samples of 8 bits."""
+"""Number of fractional bits of the fixed-point sums below, for samples of 8 bits."""
 
 DEEP_FRACTION_BITS: Final = 12
-"""Bits behind the binary point of the sums below, for samples of up to 16 bits: the sums have room
-in 32."""
+"""Number of fractional bits of the fixed-point sums below, for samples of up to 16 bits, so that
+the sums fit into 32 bits."""
 
 
 class Matrix(NamedTuple):
-    """The meaning of Y, U and V.
+    """The coefficients that define Y, U and V.
 
     Attributes:
         red: share of red in Y.
@@ -47,20 +47,20 @@ MATRICES: Final = {
     "2020": Matrix(0.2627, 0.0593, full=False),
     "2020 full": Matrix(0.2627, 0.0593, full=True),
 }
-"""The matrices of ITU-R BT.601, as V4L2 takes it for cameras and JPEG has it with full range, of
+"""The matrices of ITU-R BT.601 (the default of V4L2 for cameras, and of JPEG with full range), of
 BT.709 (HD video) and of BT.2020 with non-constant luminance (UHD video)."""
 
 
 class _Weights(NamedTuple):
-    """The shares of Y, U and V in the colours."""
+    """The weights of Y, U and V in the colours."""
 
     luma: float
     red_of_v: float
     green_of_u: float
     green_of_v: float
     blue_of_u: float
-    black: float  # Y of black
-    middle: float  # U and V without colour
+    black: float  # value of Y for black
+    middle: float  # value of U and V without colour
 
 
 def _weights(matrix: Matrix, depth: int) -> _Weights:
@@ -81,7 +81,7 @@ def _weights(matrix: Matrix, depth: int) -> _Weights:
 
 @lru_cache(maxsize=8)
 def _rows(matrix: Matrix, depth: int) -> NDArray[np.float64]:
-    """Return the shares of Y, U, V and 1 in red, green and blue, (3, 4)."""
+    """Return the weights of Y, U, V and 1 in red, green and blue, (3, 4)."""
     one = _weights(matrix, depth)
     shares = np.array(
         [
@@ -95,7 +95,7 @@ def _rows(matrix: Matrix, depth: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=8)
 def _tables(matrix: Matrix, depth: int) -> dict[str, NDArray[np.int32]]:
-    """Return the share of each value of Y, U and V in a colour, as a whole number of fractions."""
+    """Return the contribution of each value of Y, U and V to a colour, as a fixed-point integer."""
     weights = _weights(matrix, depth)
     value = np.arange(2.0**depth)
     chroma = value - weights.middle
@@ -117,16 +117,16 @@ def _fraction_bits(depth: int) -> int:
 def yuv_to_rgb(
     y: NDArray[Any], chroma: Sequence[NDArray[Any]], matrix: Matrix, depth: int = 8
 ) -> NDArray[Any]:
-    """Return the colours, (H, W, 3); each U and V is taken for all the pixels that share it.
+    """Return the colours, (H, W, 3); each U and V holds for all pixels that share it.
 
-    They are the nearest whole numbers, or one beside where OpenCV is installed, which is faster.
+    They are the nearest integers, or with OpenCV, which is faster, at most one level beside them.
 
     Args:
         y: brightness, (H, W), unsigned.
-        chroma: differences of blue and of red, U and V, (h, w) each, with as many or fewer rows
-            and columns; or one array (h, w, 2) with both.
-        matrix: the meaning of the three.
-        depth: bits of a sample, 8 to 16; the colours have as many.
+        chroma: differences of blue and of red, U and V, (h, w) each, with the same or smaller
+            numbers of rows and columns; or one array (h, w, 2) with both.
+        matrix: the matrix that defines Y, U and V.
+        depth: bits of a sample, 8 to 16, and of a colour.
     """
     if opencv() is not None:
         usual = depth == 8 and matrix == MATRICES["601"]
@@ -142,8 +142,8 @@ def _by_tables(
     tables: dict[str, NDArray[np.int32]],
     depth: int,
 ) -> NDArray[Any]:
-    """Return the colours of planes, by NumPy."""
-    # bits above the depth mean nothing: a value beyond a table takes the table's last
+    """Compute the colours of planes by NumPy."""
+    # bits above the depth have no meaning: a value beyond a table takes the table's last entry
     bright = tables["y"].take(y, mode="clip")
     shares = (
         tables["red of v"].take(v, mode="clip"),
@@ -170,8 +170,8 @@ class Colours(NamedTuple):
     """The conversions of a picture's samples to grey and to colours.
 
     Attributes:
-        grey: function that makes the brightness of the samples; None: they have none.
-        rgb: function that makes red, green and blue of the samples; None: they have none.
+        grey: function that computes the brightness; None if the samples have none.
+        rgb: function that computes red, green and blue; None if the samples have none.
         is_grey: True if the samples are the brightness themselves.
     """
 
@@ -197,7 +197,7 @@ def _without_alpha(samples: NDArray[Any]) -> NDArray[Any]:
 
 
 def _to_rgb(order: str, plainly: _Conversion) -> _Conversion:
-    """Return a function that makes colours of samples whose order OpenCV calls so."""
+    """Return a function that computes colours of samples with an order of OpenCV's name."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
@@ -210,11 +210,11 @@ def _to_rgb(order: str, plainly: _Conversion) -> _Conversion:
 
 
 def _to_grey(order: str, plainly: _Conversion) -> _Conversion:
-    """Return a function that makes the brightness of samples whose order OpenCV calls so."""
+    """Return a function that computes the brightness of samples with an order of OpenCV's name."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
-        if cv2 is None or samples.dtype != np.uint8:  # of which OpenCV is off by up to two
+        if cv2 is None or samples.dtype != np.uint8:  # OpenCV's result is off by up to two
             return _brightness(plainly(samples))
         made: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2GRAY"))
         return made
@@ -223,7 +223,7 @@ def _to_grey(order: str, plainly: _Conversion) -> _Conversion:
 
 
 def _widened(samples: NDArray[Any]) -> NDArray[Any]:
-    """Return the full range of samples of 16 to 235."""
+    """Widen samples of 16 to 235 to the full range."""
     return looked_up(_wider(), samples)
 
 
@@ -249,7 +249,7 @@ def _brightness(rgb: NDArray[Any]) -> NDArray[Any]:
 
 
 def _demosaiced(pattern: str, to: str) -> _Conversion:
-    """Return a function that makes grey or colours of a Bayer pattern, named by its first pixels.
+    """Return a function that demosaics a Bayer pattern, named by its first pixels.
 
     OpenCV names a pattern by the second row's second and third pixel, so RG is its BG.
     """

@@ -1,4 +1,4 @@
-"""Conversions by OpenCV where it is installed: at most one level from the exact colours."""
+"""Convert colours by OpenCV if it is installed, to within one level of the exact values."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MIN_LIMITED_Y: Final = 16
-"""Least Y of limited range, black: OpenCV's own conversions take any Y below for it."""
+"""Least Y of limited range, black; OpenCV's own conversions raise any smaller Y to it."""
 
 BAND_BYTES: Final = 1 << 17
-"""Bytes of colours that are made at a time, with what is in between in the processor's cache."""
+"""Number of bytes of colours that are computed at a time, so that intermediate values stay in the
+processor's cache."""
 
 
 @cache
 def opencv() -> Any:
-    """Return OpenCV; None: it is not installed."""
+    """Return OpenCV; None if it is not installed."""
     try:
         return load("cv2")
     except MissingExtraError:
@@ -32,7 +33,7 @@ def opencv() -> Any:
 
 
 def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
-    """Return each sample's value in a table of 256."""
+    """Look up each sample in a table of 256 values."""
     cv2 = opencv()
     found: NDArray[Any]
     found = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
@@ -44,10 +45,10 @@ def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
 
     Args:
         pairs: (H, W, 2): Y, and by turns U and V; W is even.
-        y: place of Y.
+        y: index of Y in a pair.
 
     Returns:
-        None: a Y is below that range, or OpenCV is not installed.
+        The colours; None if a Y is below that range, or OpenCV is not installed.
     """
     cv2 = opencv()
     if cv2 is None or cv2.extractChannel(pairs, y).min() < MIN_LIMITED_Y:
@@ -71,9 +72,9 @@ def planes_to_rgb(
         y: (H, W).
         chroma: U and V, (h, w) each, or one plane (h, w, 2) with both; each value is taken for all
             the pixels that share it.
-        weights: (3, 4), of Y, U, V and 1 in red, green and blue.
+        weights: (3, 4), weights of Y, U, V and 1 in red, green and blue.
         most: largest value of a sample.
-        usual: the planes are of 8 bits, BT.601 and limited range.
+        usual: whether the planes have 8 bits, BT.601 and limited range.
     """
     cv2, (height, width), (rows, columns) = opencv(), y.shape, chroma[0].shape[:2]
     if usual and (height, width) == (2 * rows, 2 * columns) and y.min() >= MIN_LIMITED_Y:
@@ -91,7 +92,7 @@ def planes_to_rgb(
             parts = [cv2.resize(woven, size, interpolation=cv2.INTER_NEAREST)]
         band = slice(top * down, (top + step) * down)
         merged = cv2.merge([y[band], *(one[: height - band.start, :width] for one in parts)])
-        if spare:  # bits above the depth, which mean nothing
+        if spare:  # bits above the depth have no meaning
             cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
         found = cv2.transform(merged, weights)
         colours[band] = cv2.threshold(found, most, 0, cv2.THRESH_TRUNC)[1] if spare else found

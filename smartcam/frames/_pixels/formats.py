@@ -1,4 +1,4 @@
-"""Pixel formats by their names in GenICam's PFNC and in V4L2, and how their bytes become arrays."""
+"""Define pixel formats by their names in GenICam's PFNC and in V4L2."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class PixelFormat:
     """The layout of a frame's pixels in its bytes.
 
     Attributes:
-        name: name in PFNC, as ``Mono8``; where PFNC has none the usual one, as ``NV12`` or
+        name: name in PFNC, such as ``Mono8``, or if it has none the usual one, such as ``NV12`` or
             ``MJPEG``.
-        fourcc: four letters of V4L2, as ``GREY``, or "" where V4L2 has none; without the blanks at
-            its end.
-        bits: bits of a pixel, unused ones included; 0 for a compressed format.
+        fourcc: four letters of V4L2, as ``GREY``, or "" if V4L2 has none; without the blanks at its
+            end.
+        bits: number of bits of a pixel, unused ones included; 0 for a compressed format.
         code: 32 bits of PFNC, as GigE Vision sends it; 0: PFNC has none.
-        depth: bits of a sample that mean something.
-        layout: how its bytes are read.
+        depth: number of significant bits of a sample.
+        layout: layout of its bytes.
     """
 
     name: str
@@ -54,7 +54,7 @@ class PixelFormat:
 
     @property
     def grey_is_sent(self) -> bool:
-        """True if :meth:`Frame.grey` is what the camera sent; else it is made from colours."""
+        """True if the camera sends :meth:`Frame.grey` itself; else it is computed from colours."""
         return self.layout.grey_is_sent
 
     def stride(self, width: int) -> int:
@@ -67,34 +67,34 @@ class PixelFormat:
         Args:
             width: pixels.
             height: pixels.
-            stride: bytes from one row to the next; None: no padding. The last row may go without
-                its padding, where the format has one plane only.
+            stride: bytes from one row to the next; None: no padding. The last row may lack its
+                padding if the format has only one plane.
         """
         return self.layout.size(width, height, self.stride(width) if stride is None else stride)
 
     def check(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> None:
-        """See that there are bytes enough.
+        """Check that there are enough bytes.
 
         Raises:
-            FrameFormatError: there are not.
+            FrameFormatError: there are too few bytes.
         """
         self.layout.check(RawPicture(self.name, data, width, height, stride))
 
     def array(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
-        """Return the pixels as they are; see :meth:`smartcam.frames.Frame.array`."""
+        """Return the pixels without conversion; see :meth:`smartcam.frames.Frame.array`."""
         return self.layout.array(RawPicture(self.name, data, width, height, stride))
 
     def planes(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> tuple[NDArray[np.uint8], ...]:
-        """Return Y, U and V of a format that has them, views; U and V have the size they have.
+        """Return Y, U and V of a format that has them, as views; U and V keep their size.
 
         Raises:
-            FrameFormatError: the format has none, or there are too few bytes.
+            FrameFormatError: the format has no such planes, or there are too few bytes.
         """
         return self.layout.planes(RawPicture(self.name, data, width, height, stride))
 
@@ -135,7 +135,7 @@ def _pairs(name: str, fourcc: str, code: int, y: int, matrix: str) -> PixelForma
 def _planes(
     name: str, fourcc: str, across: int, down: int, matrix: str, depth: int = 8
 ) -> PixelFormat:
-    """Return a format of planes; woven where it is called NV."""
+    """Return a format of planes; U and V are interleaved if it is called NV."""
     layout = Planes(across, down, name.startswith("NV"), matrix, depth)
     bits = 8 * layout.size_of * (across * down + 2) // (across * down)
     return PixelFormat(name, fourcc, bits, 0, depth, layout=layout)
@@ -149,7 +149,7 @@ _MATRIX_ENDS: Final = (
     ("_2020", "2020"),
     ("_2020_full", "2020 full"),
 )
-"""Ends of names, and the matrix with that range."""
+"""Endings of names, with their matrix and range."""
 
 
 _BAYER: Final = {
@@ -235,14 +235,14 @@ PIXEL_FORMATS: Final = (
 )
 """All formats that are known.
 
-Y, U and V are BT.601's of limited range, as V4L2 has them by default; where the name says ``full``,
-``709`` or ``2020`` that range, BT.709 or BT.2020. Red, green and blue have the full range, unless
-the name says ``limited``. Source: PFNC 2.1 and its list of values, videodev2.h.
+Y, U and V have BT.601 and limited range, the default of V4L2, unless the name says ``full`` range,
+``709`` (BT.709) or ``2020`` (BT.2020). Red, green and blue have the full range, unless the name
+says ``limited``. Source: PFNC 2.1 and its list of values, videodev2.h.
 """
 
 
 def with_matrix(found: PixelFormat, matrix: str) -> PixelFormat:
-    """Return the format whose bytes lie the same way and whose Y, U and V mean something else.
+    """Return the format with the same layout and another matrix of Y, U and V.
 
     Args:
         found: format with Y, U and V.
@@ -268,10 +268,10 @@ _BY_NAME: Final[dict[str | int, PixelFormat]] = {
 
 
 def find_format(name: str | int) -> PixelFormat:
-    """Return the format that PFNC, or V4L2, calls so, or that has that code of PFNC.
+    """Return a format by its name in PFNC or V4L2, or by its code in PFNC.
 
     Args:
-        name: small letters and blanks at the end do not matter; or 32 bits of PFNC.
+        name: name, in any case and with or without blanks at the end; or the 32 bits of PFNC.
 
     Raises:
         FrameFormatError: there is no such format; the text lists the known ones.

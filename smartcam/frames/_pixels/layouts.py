@@ -11,6 +11,7 @@ import numpy as np
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg
+from smartcam.frames._pixels.apart import PlanesApart
 from smartcam.frames._pixels.colours import MATRICES, Colours, yuv_to_rgb
 from smartcam.frames._pixels.compiled import pairs_to_rgb
 from smartcam.frames._pixels.unpacking import Packing, unpack
@@ -26,20 +27,20 @@ class RawPicture(NamedTuple):
 
     Attributes:
         format: name of the format, for errors.
-        data: bytes of the picture.
+        data: bytes of the picture; for the brightness alone also :class:`PlanesApart`.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next.
     """
 
     format: str
-    data: bytes | bytearray | memoryview
+    data: Any
     width: int
     height: int
     stride: int
 
     def wrong(self, expected: str, got: str) -> FrameFormatError:
-        """Return the error of bytes that are no such picture."""
+        """Return the error for bytes that are no such picture."""
         return FrameFormatError(
             f"{self.format} {self.width}x{self.height}: expected {expected}, got {got}"
         )
@@ -50,20 +51,20 @@ class PixelLayout(ABC):
 
     @property
     def grey_is_sent(self) -> bool:
-        """True if :meth:`grey` is a part of what was sent."""
+        """True if :meth:`grey` is part of the sent bytes."""
         return True
 
     @abstractmethod
     def least_stride(self, width: int) -> int:
-        """Return the bytes of a row that nothing follows; 0: it has no rows."""
+        """Return the number of bytes of a row without padding; 0 if there are no rows."""
 
     @abstractmethod
     def size(self, width: int, height: int, stride: int) -> int:
-        """Return the bytes of a picture at the least; 0: it is compressed."""
+        """Return the least number of bytes of a picture; 0 if it is compressed."""
 
     @abstractmethod
     def array(self, picture: RawPicture) -> NDArray[Any]:
-        """Return the pixels as they are."""
+        """Return the pixels without conversion."""
 
     @abstractmethod
     def grey(self, picture: RawPicture) -> NDArray[Any]:
@@ -74,11 +75,11 @@ class PixelLayout(ABC):
         """Return the colours."""
 
     def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
-        """Return Y, U and V, where they are what was sent."""
+        """Return Y, U and V, if they were sent."""
         raise picture.wrong("a format of Y, U and V", "one without")
 
     def check(self, picture: RawPicture) -> None:
-        """See that the bytes can be such a picture."""
+        """Check that the bytes can be such a picture."""
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
             raise picture.wrong("a width and a height of 1 or more", f"{width}x{height}")
@@ -105,15 +106,15 @@ def _view(
 
 @dataclass(frozen=True, slots=True)
 class SampleLayout(PixelLayout):
-    """One or more samples a pixel, one pixel after the other.
+    """One or more samples per pixel, one pixel after the other.
 
     A packed format with a stride of 0 has rows that follow each other within a byte.
 
     Attributes:
-        colours: what they mean.
-        size_of: bytes of a sample; unpacked to, where they are packed.
+        colours: conversions of the samples.
+        size_of: number of bytes of a sample, after unpacking if it is packed.
         channels: samples of a pixel.
-        packing: how they share bytes.
+        packing: places of packed samples in shared bytes; None if they are not packed.
     """
 
     colours: Colours
@@ -139,14 +140,14 @@ class SampleLayout(PixelLayout):
         return stride * (height - 1) + self.least_stride(width)
 
     def check(self, picture: RawPicture) -> None:
-        """See that the bytes can be such a picture."""
+        """Check that the bytes can be such a picture."""
         if self.packing is not None and picture.stride == 0:
             width = picture.width * picture.height
             picture = picture._replace(width=width, height=1, stride=self.least_stride(width))
         PixelLayout.check(self, picture)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
-        """Return (H, W) or (H, W, C), a view; packed ones unpacked to uint16."""
+        """Return (H, W) or (H, W, C), as a view, or for packed samples as uint16."""
         self.check(picture)
         _, _, width, height, stride = picture
         if self.packing is None:
@@ -161,13 +162,13 @@ class SampleLayout(PixelLayout):
         return unpacked
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
-        """Return the brightness; of colours BT.601's Y, of a Bayer pattern a demosaiced one."""
+        """Return the brightness: of colours Y of BT.601, of a Bayer pattern the demosaiced one."""
         if self.colours.grey is None:
             raise picture.wrong("a format with brightness", "distances")
         return self.colours.grey(self.array(picture))
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
-        """Return the colours; of a grey format its grey three times."""
+        """Return the colours; for a grey format the grey three times."""
         if self.colours.rgb is None:
             raise picture.wrong("a format with colours", "distances")
         return self.colours.rgb(self.array(picture))
@@ -178,8 +179,8 @@ class YuvPairs(PixelLayout):
     """Two pixels in four bytes: each has its Y, both share U and V.
 
     Attributes:
-        y: where in a pixel's two bytes Y is; U and V stand in the other.
-        matrix: what they mean, by the name in ``MATRICES``.
+        y: index of Y in a pixel's two bytes; the other is U or V.
+        matrix: name of their matrix in ``MATRICES``.
     """
 
     y: int
@@ -194,7 +195,7 @@ class YuvPairs(PixelLayout):
         return stride * (height - 1) + self.least_stride(width)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
-        """Return (H, W, 2): Y and, by turns, U and V, in the order of the format."""
+        """Return (H, W, 2): Y and alternating U and V, in the order of the format."""
         self.check(picture)
         _, _, width, height, stride = picture
         return _view(picture, "u1", (height, width, 2), (stride, 2, 1))
@@ -228,14 +229,15 @@ class YuvPairs(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class Planes(PixelLayout):
-    """Y, then U and V of every pixel, pair or four; the rows of all follow from Y's stride.
+    """Y, then U and V for each pixel, two or four; all strides follow from that of Y.
 
     Attributes:
         across: pixels along a row that share a U and a V.
-        down: rows that do.
-        woven: U and V stand in one plane by turns, whose stride is Y's; else each has its own.
-        matrix: what they mean, by the name in ``MATRICES``.
-        depth: bits of a sample; more than 8 stand in two bytes, the low one first.
+        down: rows that share a U and a V.
+        woven: whether U and V alternate in one plane with the stride of Y; else each has its own
+            plane.
+        matrix: name of their matrix in ``MATRICES``.
+        depth: bits of a sample; more than 8 take two bytes, the low one first.
     """
 
     across: int
@@ -250,7 +252,7 @@ class Planes(PixelLayout):
         return 1 if self.depth == 8 else 2
 
     def least_stride(self, width: int) -> int:
-        """Return the bytes of a row of Y, or of U and V where these have more."""
+        """Return the number of bytes of a row of Y, or of U and V if that is larger."""
         return self.size_of * (-(-width // self.across) * 2 if self.woven else width)
 
     def _chroma(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
@@ -289,7 +291,10 @@ class Planes(PixelLayout):
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
-        self.check(picture)
+        if isinstance(picture.data, PlanesApart):  # a decoder's: it has all planes
+            picture = picture._replace(data=picture.data.first)
+        else:
+            self.check(picture)
         _, _, width, height, stride = picture
         return _view(picture, f"<u{self.size_of}", (height, width), (stride, self.size_of))
 
@@ -305,10 +310,10 @@ class Planes(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class Compressed(PixelLayout):
-    """Bytes that only a codec reads.
+    """Bytes that only a codec can read.
 
     Attributes:
-        reader: name of what reads the bytes, for errors.
+        reader: name of the codec, for errors.
     """
 
     reader: str
@@ -341,13 +346,13 @@ class Compressed(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class Jpeg(Compressed):
-    """JPEG: its luma is what it was sent for grey."""
+    """JPEG, whose luma is the brightness."""
 
     reader: str = "Codecs.decode"
 
     @property
     def grey_is_sent(self) -> bool:
-        """Always True: the luma is read, and no colour made."""
+        """Always True: only the luma is decoded."""
         return True
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:

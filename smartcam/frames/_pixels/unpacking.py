@@ -1,8 +1,8 @@
-"""Pixels of 10 and 12 bits that share bytes, and how each gets two of its own.
+"""Unpack pixels of 10 and 12 bits that share bytes, into two bytes each.
 
 PFNC packs ``10p`` and ``12p`` as one stream of bits, the lowest first. GigE Vision's older
-``10Packed`` and ``12Packed`` lay two pixels into three bytes: the high bits of each into the outer
-ones, what is left of both into the one between.
+``10Packed`` and ``12Packed`` put two pixels into three bytes: the high bits of each into the outer
+ones, the remaining bits of both into the middle one.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Packing(NamedTuple):
     """The places of some pixels' bits in some bytes, a pattern that repeats.
 
     Attributes:
-        size: bytes.
-        pixels: parts of each of the pixels in them.
+        size: number of bytes of the pattern.
+        pixels: bits of each pixel in the pattern.
     """
 
     size: int
@@ -68,16 +68,17 @@ PACKINGS: Final = {
         ),
     ),
 }
-"""By the end of a format's name. Source: PFNC, "packed pixel formats"; GigE Vision 1.2."""
+"""Packings by the ending of a format's name. Source: PFNC, "packed pixel formats"; GigE Vision
+1.2."""
 
 
 def unpack(rows: NDArray[np.uint8], width: int, packing: Packing) -> NDArray[np.uint16]:
     """Return the pixels of rows of bytes.
 
     Args:
-        rows: (H, bytes of ``width`` pixels, or more).
+        rows: (H, N), at least the bytes of ``width`` pixels in each row.
         width: pixels in a row.
-        packing: how they lie.
+        packing: places of the pixels' bits.
 
     Returns:
         (H, width).

@@ -13,10 +13,10 @@ from smartcam.exceptions import ConfigurationError
 logger: logging.Logger = logging.getLogger("smartcam.frames")
 
 CHANGE_AVERAGING_TIME: Final = 0.3
-"""Seconds over which the bytes of a frame are averaged after a change of the scene."""
+"""Seconds over which the size of frames is averaged after a change of the scene."""
 
 STEADY_AVERAGING_TIME: Final = 1.0
-"""Seconds over which the bytes of a frame are averaged otherwise: no two frames are alike."""
+"""Seconds over which the size of frames is averaged otherwise, since no two frames are alike."""
 
 COUNTED_SECONDS: Final = 2.0
 """Seconds over which frames and bytes are counted."""
@@ -34,19 +34,21 @@ MIN_DEVIATION_SHARE: Final = 0.03
 """Share of a value below which a deviation is not corrected."""
 
 BUSY_SHARE: Final = 0.7
-"""Share of the time with frames on the way, above which the link bounds the frame rate."""
+"""If frames are on the way for more than this part of the time, the link limits the frame rate."""
 
 SLOW_SOURCE_FACTOR: Final = 1.15
-"""Factor of the pause between two frames, above which the source bounds the frame rate."""
+"""If the pause between two frames is longer by this factor, the source limits the frame rate."""
 
 FREE_SHARE: Final = 0.5
-"""Share of the time with frames on the way, below which fewer frames arrive no sooner."""
+"""If frames are on the way for less than this part of the time, fewer frames do not arrive
+sooner."""
 
 LOGGED_CHANGE_FACTOR: Final = 1.25
 """Factor by which the frame rate must change before it is logged again."""
 
 STEEP: Final = 0.7
-"""Bytes of a JPEG go with its steps to this power, near enough: what is off is corrected after."""
+"""The size of a JPEG is about proportional to this power of its quantization steps; the rest is
+corrected afterwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +56,13 @@ class RateStatistics:
     """The quality and rates that a rate control has set, and the reason.
 
     Attributes:
-        quality: JPEG quality that frames are to have.
-        fps: frames a second at most.
-        why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
-            frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
-            "no frame may be smaller, nor fewer" where that is not enough.
-        bitrate: bits a second of late.
-        latency: seconds from a frame's capture to its arrival, of late.
+        quality: JPEG quality for the next frames.
+        fps: largest frame rate, frames per second.
+        why: reason for these values: "bit rate", "latency" or "the best quality"; "" before the
+            first frame. "at the lowest quality" follows if the frame rate is lowered, too, and "no
+            frame may be smaller, nor fewer" if that is not enough.
+        bitrate: recent bits per second.
+        latency: recent seconds from a frame's capture to its arrival.
     """
 
     quality: int
@@ -71,7 +73,7 @@ class RateStatistics:
 
 
 class _Mean:
-    """A mean of what came of late, weighted by time."""
+    """A mean of recent values, weighted by time."""
 
     def __init__(self) -> None:
         self.value = self._weight = 0.0
@@ -87,7 +89,7 @@ class _Mean:
 
 
 class _Flow:
-    """The number of frames and bytes that came of late, and the seconds that they took."""
+    """The number of recent frames and bytes, and the seconds that they took."""
 
     def __init__(self) -> None:
         self.frames = self.bytes = self.seconds = 0.0
@@ -100,7 +102,7 @@ class _Flow:
 
 
 class RateControl:
-    """Holds a bit rate or a latency: by the quality of JPEGs first, by the frame rate then.
+    """Keeps a bit rate or a latency, first by the quality of JPEGs, then by the frame rate.
 
     ::
 
@@ -108,18 +110,18 @@ class RateControl:
         ...  # send a frame of control.quality, control.rest seconds after the last one at least
         control.sent(size, went, took)
 
-    It lowers the quality as far as it may, and only then the frame rate; upwards the frame rate
-    comes back first. It follows a drop within a second, and rises by no more than 30 % in one, so
-    that it does not swing. With both, the lower one counts.
+    It lowers the quality as far as allowed, and only then the frame rate; upwards the frame rate is
+    raised first. It follows a drop within a second, and rises by at most 30 % per second, so that
+    it does not oscillate. If both a bit rate and a latency are given, the stricter one counts.
 
     Args:
-        bitrate: bits a second on average.
+        bitrate: bits per second on average.
         latency: seconds from capture to arrival.
-        quality: JPEG quality, the lowest and the best, 1 to 100.
-        fps: frames a second, the fewest and the most.
+        quality: lowest and highest JPEG quality, 1 to 100.
+        fps: lowest and highest frame rate, frames per second.
 
     Raises:
-        ConfigurationError: neither of them is given, or one is out of its range.
+        ConfigurationError: neither bit rate nor latency is given, or a value is out of range.
     """
 
     def __init__(
@@ -137,15 +139,16 @@ class RateControl:
         self._why: str = ""
         self._told_fps = self._fps
         self._went: float | None = None
-        self._comes = 0.0  # frames a second that the source gives, as far as is known; 0: unknown
+        # frame rate of the source, frames per second, as far as it is known; 0: unknown
+        self._comes = 0.0
         self._flow = _Flow()
-        self._weight = _Mean()  # bytes that a frame would have with steps of 1
-        self._way = _Mean()  # seconds that a byte took
+        self._weight = _Mean()  # number of bytes that a frame would have with steps of 1
+        self._way = _Mean()  # seconds per byte on the way
         self._age, self._took = _Mean(), _Mean()
 
     @property
     def quality(self) -> int:
-        """Quality that the next frame is to have."""
+        """Quality for the next frame."""
         return round(self._quality)
 
     @property
@@ -155,7 +158,7 @@ class RateControl:
 
     @property
     def rest(self) -> float:
-        """Seconds from one frame to the next at least."""
+        """Least seconds from one frame to the next."""
         return 1 / self._fps
 
     def statistics(self) -> RateStatistics:
@@ -190,7 +193,7 @@ class RateControl:
             self._learn(took / seconds)
         self._went = went
         had = self.quality if quality is None else quality
-        # a frame that was long on its way has told of all that time
+        # a frame that was long on its way has already counted for all that time
         of_late = max(seconds, took)
         self._weight.add(size * _steps(had) ** STEEP, of_late)
         self._way.add(took / size, of_late)
@@ -199,7 +202,7 @@ class RateControl:
         self._follow(seconds)
 
     def _learn(self, busy: float) -> None:
-        """See how many frames the source gives, where neither the way nor this is the bound."""
+        """Learn the frame rate of the source, if neither the link nor this control limits it."""
         came = self._flow.frames / self._flow.seconds
         if busy < BUSY_SHARE and (
             self._fps >= self._rates[1] or came * SLOW_SOURCE_FACTOR < self._fps
@@ -207,7 +210,7 @@ class RateControl:
             self._comes = came
 
     def _follow(self, seconds: float) -> None:
-        """Go to where the frames are to be: down at once, up slowly."""
+        """Move towards the wanted values: down at once, up slowly."""
         least, best = self._qualities
         wanted, wanted_fps, why = self._wanted()
         quality = min(best, max(least, _quality(self._weight.value / wanted)))
@@ -223,7 +226,7 @@ class RateControl:
             slowly = _quality(self._weight.value / (has * grows))
             self._quality = max(self._quality, min(quality, slowly))
         if why in {"bit rate", "latency"}:
-            if self._fps < self._rates[1]:  # on its way back
+            if self._fps < self._rates[1]:  # while the frame rate is coming back
                 why = f"{why}, at the lowest quality"
             elif self._quality >= best:
                 why = "the best quality"
@@ -231,7 +234,7 @@ class RateControl:
         self._tell()
 
     def _wanted(self) -> tuple[float, float, str]:
-        """Return the bytes of a frame, frames a second, and why."""
+        """Return the bytes of a frame, frames per second, and why."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
         found: list[tuple[float, float, str]] = []
@@ -267,7 +270,7 @@ def _steps(quality: float) -> float:
 
 
 def _quality(weight: float) -> float:
-    """Return the quality whose steps, to the power that bytes go with, are ``weight``."""
+    """Return the quality whose steps, to the power ``STEEP``, are ``weight``."""
     steps = float(max(1e-3, weight) ** (1 / STEEP))
     return 50 / steps if steps > 1 else 100 - 50 * steps
 

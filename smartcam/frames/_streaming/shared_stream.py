@@ -27,7 +27,7 @@ KEY_PAUSE: Final = 1.0
 """Seconds between two key frames that viewers ask for, however many they are."""
 
 MAX_FAILURES: Final = 3
-"""Frames in a row that cannot be encoded before the stream ends."""
+"""Largest number of frames in a row that cannot be encoded before the stream ends."""
 
 
 class StreamViewer(Protocol):

@@ -136,7 +136,7 @@ class BufferLayout(NamedTuple):
 
 
 PRIVATE_MAGIC: Final = 0xFEEDCAFE
-"""V4L2_PIX_FMT_PRIV_MAGIC: the fields behind ``private`` mean something."""
+"""V4L2_PIX_FMT_PRIV_MAGIC: the fields after ``private`` mean something."""
 
 COLORSPACE_JPEG: Final = 7
 

@@ -36,7 +36,7 @@ class DeviceControl:
     """A control of a device.
 
     Attributes:
-        name: label in small letters with underscores: ``white_balance_automatic``.
+        name: label in lower case with underscores: ``white_balance_automatic``.
         number: id of the control in V4L2.
         kind: integer, boolean, menu, button or bitmask.
         least: smallest value.
@@ -106,7 +106,7 @@ class DeviceControl:
 
 
 def simple(label: str) -> str:
-    """Return a label in small letters, with an underscore for all that is no letter or digit."""
+    """Return a label in lower case, with an underscore for all that is no letter or digit."""
     return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
 
 

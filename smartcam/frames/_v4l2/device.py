@@ -26,7 +26,7 @@ FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fo
 """The supported formats of V4L2."""
 
 MAX_ANSWERS: Final = 512
-"""Answers to one enumeration at most; a driver that goes on is broken."""
+"""Largest number of answers to one enumeration; a driver that goes on is broken."""
 
 MAX_RATE_OFF: Final = 0.01
 """Share by which a rate may differ from the wanted one: 29.97/s is 30/s to a camera."""
@@ -71,7 +71,7 @@ class Setting(NamedTuple):
     Attributes:
         format: format of the pixels.
         layout: how they lie in a buffer.
-        rate: frames a second; None: it does not say.
+        rate: frames per second; None: it does not say.
     """
 
     format: PixelFormat
@@ -172,7 +172,7 @@ class CaptureDevice:
         return [f"{width}x{height}" for width, height in self.sizes(code)]
 
     def rates(self, code: int, width: int, height: int) -> list[float]:
-        """Return the frames a second, fastest first; of steps the fastest and the slowest."""
+        """Return the frames per second, fastest first; of steps the fastest and the slowest."""
         found: list[float] = []
         asked = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
         for _, _, _, _, kind, *numbers in asked:

@@ -43,11 +43,12 @@ class V4L2Driver(FrameDriver):
     - the path: the device's; ``/dev/v4l/by-id/...`` is the same camera at any port.
     - ``format``: pixel format, by its name in PFNC or V4L2.
     - ``size``: ``WIDTHxHEIGHT``, pixels.
-    - ``fps``: frames a second.
+    - ``fps``: frames per second.
     - ``buffers``: number of buffers that the driver writes into, 2 to 32; default 4.
     - ``control.NAME``: sets a control, in the order of the URL, as often as the device is started:
       ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
-      small letters with underscores, the value a number, a menu's label, or ``on`` and ``off``.
+      lower case letters with underscores, the value a number, a menu's label, or ``on`` and
+      ``off``.
 
     ``source.features`` has the controls for the time in between; such a setting
     lasts until those of the URL are set again.

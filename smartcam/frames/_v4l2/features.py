@@ -1,7 +1,7 @@
 """A V4L2 device's controls as features: by SFNC's names and units where it has the same thing.
 
-A control that SFNC does not know keeps its own name, its label in small letters with underscores.
-Both names of a control are known.
+A control that SFNC does not know keeps its own name, its label in lower case with underscores. Both
+names of a control are known.
 
 Source: V4L2 documentation, user, camera and image process control classes (numbers and units:
 ``V4L2_CID_EXPOSURE_ABSOLUTE`` counts 100 us); SFNC 2.7 (names; entries of ``...Auto``).

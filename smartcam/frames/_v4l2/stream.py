@@ -1,4 +1,4 @@
-"""A device that streams: full buffers become frames, and what is wrong with them is counted."""
+"""Stream from a device: turn full buffers into frames, and count broken ones."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
 MAX_BAD_IN_A_ROW: Final = 30
-"""Buffers without a picture, one after the other, after which the stream ends."""
+"""The stream ends after this many buffers in a row without a picture."""
 
 MAX_EMPTY_IN_A_ROW: Final = 1000
-"""Times that the system may report a full buffer and give no buffer before the stream ends."""
+"""The stream ends after the system has reported a full buffer this many times without giving
+one."""
 
 HALF_OF_NUMBERS: Final = 1 << 31
 """Half of all frame numbers, which have 32 bits: a larger step forwards is one backwards."""
@@ -64,7 +65,7 @@ class CaptureStream:
         self.device.close()
 
     def drain(self, sink: FrameSink) -> None:
-        """Give all frames to the sink that are there.
+        """Pass all available frames to the sink.
 
         Raises:
             FrameSourceError: no more frames will come.

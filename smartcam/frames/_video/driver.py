@@ -79,7 +79,7 @@ class VideoDriver(FrameDriver):
     ``delay``         of a live stream: longest time from exposure to arrival, seconds; usual 1
     ``pace``          of a recording: ``real`` (usual) by its time stamps, or ``none``: each picture
                       when the readers have taken the last one; none is skipped
-    ``fps``           of a recording: pictures a second instead of its time stamps; usual 10 of
+    ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
                       files in a folder
     ``mixed``         of files: ``yes`` takes pictures of other sizes and formats than the first
                       one's, too; usual ``no``
@@ -165,7 +165,7 @@ class VideoDriver(FrameDriver):
             _log.warning("! %s: its thread hangs, and is left to end by itself", self.name)
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
     async def _begin(self) -> tuple[PictureReading, Read]:
@@ -297,7 +297,7 @@ class _Playback:
     """The times at which a recording's pictures are due.
 
     Args:
-        fps: pictures a second; None: by their time stamps.
+        fps: pictures per second; None: by their time stamps.
         rate: rate of frames without a stamp.
     """
 

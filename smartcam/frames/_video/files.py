@@ -16,6 +16,7 @@ from smartcam._extras import load
 from smartcam._natural import natural
 from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_video
+from smartcam.frames._video.jpegxl import is_jpegxl, read_jpegxl
 from smartcam.frames._video.redirects import follow_redirects
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 PICTURES: Final = frozenset(
-    {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+    {".bmp", ".jpeg", ".jpg", ".jxl", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 )
 """Suffixes of the files in a folder that count as pictures."""
 
@@ -177,6 +178,7 @@ class VideoReading(PictureReading):
             raise
         self._pictures: deque[tuple[Any, float]] = deque()
         self._lost = 0
+        self._failed = ""  # why the last picture could not be decoded
 
     def _opened(self) -> Any:
         """Return the container that FFmpeg opens, which reads nothing but what the URL names."""
@@ -220,7 +222,7 @@ class VideoReading(PictureReading):
             if isinstance(cause, OSError) and cause.errno == errno.EINVAL:
                 cure = "; #elsewhere=yes follows a playlist" if self.plan.network else ""
                 raise self.plan.wrong(
-                    "expected a format with the pictures in it, got one that FFmpeg may not take: "
+                    "expected a format with the pictures in it, got one that is not known here, or "
                     f"a playlist or another list of places{cure}"
                 ) from cause
             raise
@@ -244,6 +246,9 @@ class VideoReading(PictureReading):
         if not streams:
             raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
         stream = streams[0]
+        if stream.codec_context is None:
+            got = self._container.format.long_name
+            raise self.plan.wrong(f"expected video that FFmpeg decodes here, got {got}")
         stream.codec_context.thread_count = 1  # more of them hold frames back
         if stream.codec_context.name not in _EXPLODES_AT_TAGS:
             stream.codec_context.options = {"err_detect": "explode"}  # refuse half a picture
@@ -305,7 +310,8 @@ class VideoReading(PictureReading):
                 f"{self.plan.name}: the server ended the stream", source=self.plan.name
             )
         if not self._given_any:
-            raise self.plan.wrong("expected pictures, it ended without one")
+            why = f": {self._failed}" if self._failed else ""
+            raise self.plan.wrong(f"expected pictures, it ended without one{why}")
 
     def _take(self, packet: Any, arrived: float) -> None:
         """Decode what came, or hand it on."""
@@ -319,8 +325,8 @@ class VideoReading(PictureReading):
         damaged = bool(packet.is_corrupt)
         try:
             pictures = packet.decode()
-        except load("av").FFmpegError:
-            damaged, pictures = True, []
+        except load("av").FFmpegError as exc:
+            damaged, pictures, self._failed = True, [], _reason(exc)
         whole = [picture for picture in pictures if not picture.is_corrupt]
         if damaged or len(whole) < len(pictures):
             self._lost += self._given_any  # before the first one it may have come in midway
@@ -389,6 +395,8 @@ class PictureFiles(PictureReading):
         if not self._files or self.stopped.is_set():
             return None
         path = self._files.popleft()
+        if is_jpegxl(path):
+            return Read(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
         one = VideoReading(plan)
         try:
@@ -398,12 +406,14 @@ class PictureFiles(PictureReading):
         return None if read is None else read._replace(time=None)
 
     def close(self) -> None:
-        """Have nothing left."""
+        """Release everything."""
         self._files.clear()
 
 
 def picture_files(path: str) -> list[str]:
-    """Return the pictures of a folder or a pattern, sorted."""
+    """Return the pictures of a folder or a pattern, sorted; of a file itself."""
+    if Path(path).is_file():
+        return [path]
     if Path(path).is_dir():
         found = [str(one) for one in Path(path).iterdir() if one.suffix.lower() in PICTURES]
         return sorted(found, key=natural)
@@ -411,5 +421,7 @@ def picture_files(path: str) -> list[str]:
 
 
 def is_pictures(path: str) -> bool:
-    """Return True if a path is a folder or a pattern, not a file."""
-    return Path(path).is_dir() or (glob.has_magic(path) and not Path(path).exists())
+    """Return True if a path is a folder, a pattern or a picture that FFmpeg does not read."""
+    if Path(path).exists():
+        return Path(path).is_dir() or is_jpegxl(path)
+    return glob.has_magic(path)

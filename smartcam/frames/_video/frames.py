@@ -1,4 +1,4 @@
-"""Frames of FFmpeg, and ours: which pixel format is which, and whose bytes are whose."""
+"""Convert between FFmpeg's frames and smartcam's: pixel formats and layouts of bytes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
+from smartcam.frames._pixels.apart import PlanesApart
 from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, find_format, with_matrix
 from smartcam.frames._pixels.layouts import Planes, YuvPairs
@@ -42,7 +43,8 @@ _SAMPLES: Final = {
     "bayer_grbg16le": "BayerGR16",
 }
 _SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
-"""Pixels along a row, and rows, that share a U and a V; and what FFmpeg and we call that."""
+"""Names of the sharing of U and V, in FFmpeg and here, by pixels along a row and rows that share
+them."""
 
 _YUV: Final = {
     f"{begin}{digits}p{end}": f"I{digits}{ours}"
@@ -53,10 +55,10 @@ _YUV: Final = {
         *(("yuv", f"{depth}le", f"_{depth}") for depth in (10, 12, 16)),
     )
 } | {"nv12": "NV12", "yuyv422": "YUV422_8", "uyvy422": "YUV422_8_UYVY"}
-"""FFmpeg's formats of Y, U and V whose bytes are those of a format of ours."""
+"""FFmpeg's formats of Y, U and V whose bytes are those of one of smartcam's formats."""
 
 _TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p": "yuv444p"}
-"""FFmpeg's formats with a plane of alpha behind Y, U and V, and the same without."""
+"""FFmpeg's formats with a plane of alpha after Y, U and V, and the same formats without it."""
 
 CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
 """Formats that FFmpeg converts to on request, and its names for them."""
@@ -68,19 +70,19 @@ BT709, BT601, BT2020 = 1, 6, 9  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M, AVCOL_SP
 MATRIX_OF_SPACE: Final = {
     BT709: "709", 2: "601", 3: "601", 4: "601", 5: "601", BT601: "601", BT2020: "2020",
 }  # fmt: skip
-"""Matrix of an AVColorSpace. What says nothing (2) is BT.601's, as FFmpeg takes it; the one of the
-FCC (4) is BT.601's to a third of a grey level. 0 says that there is no Y."""
+"""Matrix of an AVColorSpace. An unspecified space (2) is taken as BT.601, as in FFmpeg; that of the
+FCC (4) is BT.601 to a third of a grey level; 0 means that there is no Y."""
 
 
 class Pixels(NamedTuple):
-    """The pixels of a decoded frame, in one of our formats.
+    """The pixels of a decoded frame, in one of smartcam's formats.
 
     Attributes:
         format: format of the pixels.
         width: pixels.
         height: pixels.
         stride: bytes from row to row.
-        data: the decoder's own where its layout is ours, else a copy.
+        data: the decoder's own bytes if their layout fits, else a copy.
     """
 
     format: PixelFormat
@@ -90,9 +92,9 @@ class Pixels(NamedTuple):
     data: bytes | memoryview
 
 
-@lru_cache(maxsize=256)  # asked for each frame
+@lru_cache(maxsize=256)  # called for each frame
 def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
-    """Return our format of one of FFmpeg's.
+    """Return smartcam's format for one of FFmpeg's.
 
     Args:
         name: name such as ``yuv420p``.
@@ -100,7 +102,7 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
         space: AVColorSpace.
 
     Raises:
-        FrameFormatError: we have none, or the space is of another kind than ours.
+        FrameFormatError: there is no such format, or the colour space is not supported.
     """
     if name in _SAMPLES:
         return find_format(_SAMPLES[name])
@@ -122,14 +124,19 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     return with_matrix(base, f"{matrix} full" if full else matrix)
 
 
-def from_video(video: Any) -> Pixels:
-    """Return a decoded frame's pixels; where we have no such format, in one that holds all of it.
+def from_video(video: Any, *, apart: bool = False) -> Pixels:
+    """Return a decoded frame's pixels, in their own format or in one that holds all of them.
 
-    A palette becomes its colours, planes of red, green and blue become samples, and Y, U and V
-    whose sharing we do not have are repeated to one of each a pixel.
+    A palette becomes its colours, planes of red, green and blue become samples, and U and V with an
+    unsupported sharing are repeated for each pixel.
+
+    Args:
+        video: frame of FFmpeg.
+        apart: whether planes may stay where the decoder left them, as :class:`PlanesApart`, which
+            a :class:`Frame` takes for its data.
 
     Raises:
-        FrameFormatError: we have no such format; the text names what was not to be lost.
+        FrameFormatError: no format holds all of it; the text names what would be lost.
     """
     name = video.format.name
     if name in _TRANSPARENT and not _opaque(video):
@@ -146,14 +153,15 @@ def from_video(video: Any) -> Pixels:
     fits = isinstance(layout, Planes) and all(
         plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
     )
-    joined = b"".join(planes) if fits else b"".join(_tight(plane, found) for plane in planes)
-    if not fits:
-        stride = found.stride(video.width)
-    return Pixels(found, video.width, video.height, stride, joined)
+    if fits:
+        joined: Any = PlanesApart(planes) if apart else b"".join(planes)
+        return Pixels(found, video.width, video.height, stride, joined)
+    joined = b"".join(_tight(plane, found) for plane in planes)
+    return Pixels(found, video.width, video.height, found.stride(video.width), joined)
 
 
 def _repacked(video: Any) -> Any:
-    """Return the frame in a format that we have and that holds all of it, or as it is."""
+    """Return the frame in a supported format that holds all of it, or unchanged."""
     kind = video.format
     parts = kind.components
     deep = max(part.bits for part in parts)
@@ -174,7 +182,7 @@ def _wider_grey(name: str, deep: int) -> str:
 
 
 def _with_known_sharing(video: Any, deep: int, *, alpha: bool) -> Any:
-    """Return Y, U and V in planes of a format that we have."""
+    """Return Y, U and V in planes of a supported format."""
     kind, size = video.format, (video.width, video.height)
     across, down = (round(one / part) for one, part in zip(size, _chroma(video), strict=True))
     bits = next(one for one in (8, 10, 12, 16) if deep <= one)
@@ -196,7 +204,7 @@ def _with_known_sharing(video: Any, deep: int, *, alpha: bool) -> Any:
 
 
 def _chroma(video: Any) -> tuple[float, float]:
-    """Return a share of the size: what of U and V stands for each side of a large picture."""
+    """Return the ratios of the size of U and V to that of Y, measured on a large picture."""
     kind, whole = video.format, 1 << 10
     return (
         video.width * kind.chroma_width(whole) / whole,
@@ -205,7 +213,7 @@ def _chroma(video: Any) -> tuple[float, float]:
 
 
 def _same_colours(video: Any, name: str) -> Any:
-    """Return a frame whose samples lie otherwise, and mean the same."""
+    """Return a frame with the same samples in another layout."""
     full = video.format.name.startswith("yuvj")
     return _told(video.reformat(format=name), video, full=full)
 
@@ -217,7 +225,7 @@ def _told(made: Any, video: Any, *, full: bool) -> Any:
 
 
 def _opaque(video: Any) -> bool:
-    """Return True if the last plane, which is alpha, hides nothing."""
+    """Return True if the last plane, alpha, is fully opaque."""
     return bool((_rows(video.planes[3]) == 255).all())
 
 
@@ -244,7 +252,7 @@ def _tight(plane: Any, found: PixelFormat) -> bytes:
     return rows[:, : plane.width * size].tobytes()
 
 
-@lru_cache(maxsize=256)  # asked for each frame
+@lru_cache(maxsize=256)  # called for each frame
 def colour_properties(found: PixelFormat) -> tuple[int, int]:
     """Return AVColorRange and AVColorSpace of a format."""
     matrix = getattr(found.layout, "matrix", "601 full")  # without one: grey, or red, green, blue
@@ -259,11 +267,11 @@ def to_video(frame: Frame, before: Any = None) -> Any:
 
     Args:
         frame: frame to encode.
-        before: frame that was returned for another one, which the encoder has done with; grey of
-            the same size is written into it.
+        before: frame that was returned earlier, and which the encoder no longer needs; grey of the
+            same size is written into it.
 
     Raises:
-        FrameFormatError: the encoder knows no way from this format, or the size is odd.
+        FrameFormatError: this format cannot be converted, or the size is odd.
     """
     name = _encodable(frame.format)
     if name is None:
@@ -295,14 +303,14 @@ def to_video(frame: Frame, before: Any = None) -> Any:
 
 
 def to_lossless_video(frame: Frame) -> Any:
-    """Return a frame for an encoder that loses nothing, FFV1's: each value as it is.
+    """Return a frame for the lossless encoder FFV1, with each value unchanged.
 
-    Samples that share bytes are unpacked, Y, U and V are parted, and red, green and blue change
+    Samples that share bytes are unpacked, Y, U and V are separated, and red, green and blue change
     places.
 
     Raises:
-        FrameFormatError: a video says less than the format does: whose a value of a Bayer pattern
-            is, that a value is a distance, what is compressed.
+        FrameFormatError: a video cannot express the format: a Bayer pattern, distances, or
+            compressed bytes.
     """
     name = _lossless(frame.format)
     if name is None:
@@ -334,7 +342,7 @@ _REPACKED: Final = {
 
 
 def _lossless(found: PixelFormat) -> str | None:
-    """Return FFmpeg's name for the unpacked values of a format, where a video can say them."""
+    """Return FFmpeg's name for the unpacked values of a format, if a video can express them."""
     layout = found.layout
     if found.name.startswith("Mono"):
         return "gray" if found.depth == 8 else f"gray{_DEPTHS[found.depth]}le"
@@ -347,7 +355,7 @@ def _lossless(found: PixelFormat) -> str | None:
 
 
 _DEPTHS: Final = {10: 10, 12: 12, 14: 16, 16: 16}
-"""Bits of FFV1's grey that hold so many."""
+"""Bits of FFV1's grey that hold a number of bits."""
 
 
 def _encodable(found: PixelFormat) -> str | None:
@@ -370,7 +378,7 @@ def _from_grey(frame: Frame, before: Any) -> Any:
         *(before.width, before.height),
         *(before.color_range, before.colorspace),
     ):
-        _fill(before.planes[0], frame.array())  # a new one has a page fault for every 4 kB
+        _fill(before.planes[0], frame.array())  # a new array has a page fault for every 4 kB
         return before
     video = _new(frame.width, frame.height, "yuv420p")
     _fill(video.planes[0], frame.array())
@@ -401,5 +409,8 @@ def _filled(frame: Frame, name: str) -> Any:
 
 
 def _fill(plane: Any, rows: Any) -> None:
+    if rows.flags.c_contiguous and rows.nbytes == plane.buffer_size:
+        plane.update(rows)  # one copy, where the code below makes one per row
+        return
     whole = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
     whole[: rows.shape[0], : rows.shape[1]] = rows

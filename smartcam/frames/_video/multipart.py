@@ -21,9 +21,15 @@ MAX_BETWEEN_BYTES: Final = 1 << 20
 """Bytes in a row that belong to no picture, after which it is no stream of pictures."""
 
 MAX_HEAD_BYTES: Final = 8 << 10
-"""Bytes before a picture in which its length is looked for."""
+"""Largest number of bytes before a picture in which its length is looked for."""
+
+MAX_STRAY_BYTES: Final = 4 << 10
+"""Bytes between two segments of a picture's head that belong to neither."""
 
 START, END = b"\xff\xd8", b"\xff\xd9"
+BEGINS: Final = START + b"\xff"
+"""Bytes that a picture begins with, and no segment but a thumbnail's has in it."""
+
 SCAN, MIN_SEGMENT = 0xDA, 0xC0
 """Markers of a scan, and the first one that a segment can have."""
 
@@ -50,7 +56,7 @@ class PictureCutter:
         self._seen = 0  # bytes of what is no picture, or of a picture, that were looked at
         self._between = 0
         self._begun = self._in_scan = self._over = False
-        self._length: int | None = None  # of the picture that has begun, as its part says
+        self._length: int | None = None  # length of the current picture, by the head of its part
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Take bytes, and yield the pictures that are whole with them.
@@ -131,6 +137,13 @@ class PictureCutter:
                 return None
         while data[at : at + 2] == b"\xff\xff":
             at += 1
+        if len(data) > at + 1 and (data[at] != 0xFF or not data[at + 1]):  # as some webcams send
+            if data.find(BEGINS, len(START), at + len(BEGINS) - 1) >= 0:
+                return -at  # a segment that was cut short went on into another picture
+            found = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
+            if found is None:
+                return None if len(data) < at + MAX_STRAY_BYTES else -at
+            at = found.start()
         self._seen = at
         self._over = data[at : at + 2] == END
         if self._over:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 MAX_REDIRECTS: Final = 5
 
-LARGEST_HEAD: Final = 64 << 10
-"""Bytes of the head of an answer, or of a body that is skipped."""
+MAX_HEAD_BYTES: Final = 64 << 10
+"""Largest number of bytes of the head of an answer, or of a body that is skipped."""
 
 REDIRECTS: Final = range(300, 400)
 """Statuses with which FFmpeg follows a ``Location``."""
@@ -35,7 +35,7 @@ _PORTS: Final = {"http": 80, "https": 443, "rtsp": 554, "rtsps": 322}
 
 class _Answer(NamedTuple):
     status: int
-    headers: Mapping[str, Sequence[str]]  # by their names in small letters
+    headers: Mapping[str, Sequence[str]]  # values by the headers' names in lower case
     peer: str  # the address that it came from
 
 
@@ -165,7 +165,7 @@ def _connected(
 def _authorization(
     url: SplitResult, plain: SplitResult, method: str, challenges: Sequence[str]
 ) -> str:
-    """Return the header that answers a challenge; "" where there is none that we know."""
+    """Return the header that answers a challenge; "" if there is none that we know."""
     user, password = unquote(url.username or ""), unquote(url.password or "")
     for challenge in challenges:
         scheme, _, said = challenge.partition(" ")
@@ -245,6 +245,6 @@ def _receive(link: socket.socket, end: float, before: int) -> bytes:
     """
     link.settimeout(_left(end))
     came = link.recv(4096)
-    if not came or before + len(came) > LARGEST_HEAD:
+    if not came or before + len(came) > MAX_HEAD_BYTES:
         raise ValueError("no end of an answer")
     return came

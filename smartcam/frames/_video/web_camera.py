@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import urllib.request
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError, FrameSourceError, MessageError
@@ -23,6 +23,10 @@ from smartcam.frames._video.web_request import WebStream
 
 if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
+
+
+WITH_BODY: Final = (200, 203, 206)
+"""Status of answers with a stream."""
 
 
 class WebDriver(VideoDriver):
@@ -88,7 +92,7 @@ class WebDriver(VideoDriver):
             async with asyncio.timeout(self._timeout):
                 await stream.open()
             self._check(stream)
-            if stream.answer.is_multipart:
+            if stream.answer.is_pictures:
                 self._playing = _PartsStream(stream, self._plan(), self._timeout, sink)
                 await self._playing.begin()
         except FrameSourceError:
@@ -104,10 +108,13 @@ class WebDriver(VideoDriver):
 
     def _check(self, stream: WebStream) -> None:
         answer = stream.answer
-        if answer.status != 200:
+        if answer.status not in WITH_BODY:
             shown = f"{answer.status} {answer.reason}".strip()
             raise self._wrong(f"cannot be read: {shown}")
-        if answer.is_multipart and self._format is not None and self._format.name == "H264":
+        coding = answer.header("content-encoding").lower()
+        if answer.is_pictures and coding not in ("", "identity"):
+            raise self._wrong(f"expected bytes as they are, got Content-Encoding: {coding[:40]}")
+        if answer.is_pictures and self._format is not None and self._format.name == "H264":
             raise self._wrong("expected H264, got MJPEG")
 
     def _plan(self) -> DecodingPlan:

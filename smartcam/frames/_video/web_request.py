@@ -1,4 +1,4 @@
-"""One request for a web camera's stream: redirects on its own host, passwords, and the bytes."""
+"""Request a web camera's stream: with redirects on its own host, passwords, and its bytes."""
 
 from __future__ import annotations
 
@@ -16,24 +16,32 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Mapping, Sequence
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Bytes of an answer's lines at most."""
+"""Largest number of bytes of an answer's head."""
 
 MAX_REFUSALS: Final = 3
-"""Refusals for a password, such as by a nonce that is too old."""
+"""Largest number of refusals for a password, such as by a nonce that is too old."""
 
 MAX_LINE_BYTES: Final = 4096
-"""Bytes of a line before a chunk."""
+"""Largest number of bytes of a line before a chunk."""
 
 PIECE_BYTES: Final = 64 << 10
-"""Bytes that are taken at a time."""
+"""Largest number of bytes that are read at a time."""
+
+INTERIM: Final = range(100, 200)
+"""Status codes of answers that only announce another one."""
 
 PORTS: Final = {"http": 80, "https": 443}
+
+_PICTURES: Final = re.compile(r"(?i)\s*(?:multipart/|video/(?:x-)?(?:m|motion-?)?jpe?g\b)")
+
+MAX_INTERIM_ANSWERS: Final = 8
+"""Largest number of answers (1xx) that only announce another one."""
 
 _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
-    """An answer whose body goes on; the names of its headers are in small letters."""
+    """An answer whose body is still being read; the names of its headers are in lower case."""
 
     status: int
     reason: str
@@ -44,9 +52,9 @@ class WebAnswer(NamedTuple):
         return next(iter(self.headers.get(name, ())), "")
 
     @property
-    def is_multipart(self) -> bool:
-        """True if the answer is a stream of parts."""
-        return self.header("content-type").lower().lstrip().startswith("multipart/")
+    def is_pictures(self) -> bool:
+        """True if the answer is a stream of JPEGs, in parts or one after the other."""
+        return _PICTURES.match(self.header("content-type")) is not None
 
 
 class WebStream:
@@ -55,7 +63,7 @@ class WebStream:
     Args:
         name: name of the source, for errors.
         url: URL with user and password.
-        tls: how the server shows who it is, where it is asked by TLS.
+        tls: options for checking the server's certificate.
 
     Attributes:
         answer: head of the server's answer; there once :meth:`open` has returned.
@@ -70,10 +78,10 @@ class WebStream:
         self._rest = b""
 
     async def open(self) -> None:
-        """Ask for it; redirects on its host and port are followed, and a password is shown.
+        """Send the request; follow redirects on its host and port, and send the password.
 
         Raises:
-            FrameSourceError: a redirect elsewhere, or too many.
+            FrameSourceError: the answer is a redirect to another host, or the last of too many.
             OSError: there is no connection.
             ValueError: the address is no web server.
 
@@ -144,10 +152,15 @@ class WebStream:
             *([f"Authorization: {shown}"] if shown else ()),
         ]
         self._writer.write("\r\n".join((*lines, "", "")).encode())
-        return await self._head()
+        self._rest = b""
+        answer = await self._head()
+        for _ in range(MAX_INTERIM_ANSWERS):
+            if answer.status not in INTERIM:
+                break
+            answer = await self._head()
+        return answer
 
     async def _head(self) -> WebAnswer:
-        self._rest = b""
         came = bytearray()
         looked = 0
         while (ends := _HEAD_ENDS.search(came, max(0, looked - 10))) is None:

@@ -84,7 +84,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
 
     @property
     def trouble_seeing(self) -> str:
-        """The reason for which no frames come; "" where they come."""
+        """The reason for which no frames come; "" if they come."""
         return self._device.eyes.trouble
 
     async def open(self) -> Self:

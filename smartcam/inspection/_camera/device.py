@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 MAX_RECORDS: Final = 32
-"""Records of a list that an In-Sight camera has cells for."""
+"""Largest number of records of a list that an In-Sight camera has cells for."""
 
 NO_VALUE: Final = "#ERR"
 """Text of a cell without a value."""

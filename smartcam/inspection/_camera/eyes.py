@@ -1,4 +1,4 @@
-"""The eyes of a software camera: a source of frames, and the programs that inspect them."""
+"""Inspect the frames of a software camera's source by its programs."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
-"""Seconds that the first frame is waited for before the camera is there without one."""
+"""Seconds to wait for the first frame; then the camera starts without one."""
 
 FRAME_WAIT: Final = 10.0
 """Seconds that a trigger waits for a frame that was exposed after it."""
 
 TOOLS_TIMEOUT: Final = 60.0
-"""Seconds that the tools of a program may take; then the result is not ok, and says so."""
+"""Seconds that the tools of a program may take; then the result is not ok, with this reason."""
 
 MAX_HUNG_THREADS: Final = 4
-"""Threads with tools that do not end; the last one is waited for."""
+"""Largest number of threads with tools that do not end; with so many, the last one is awaited."""
 
 THREAD_GRACE: Final = 1.0
-"""Seconds that a tool gets to come to its end when the camera is closed."""
+"""Seconds that a tool gets to finish when the camera is closed."""
 
 RETRY: Final = Backoff(initial=0.1, maximum=5.0)
 """Delays before a lost source of frames is tried again."""
@@ -53,7 +53,7 @@ class Judged(NamedTuple):
     Attributes:
         number: sequence number of the run.
         frame: the frame that was judged.
-        inspection: what the program says about it; None where it failed.
+        inspection: inspection by the program; None if it failed.
         application: id of the program.
     """
 
@@ -70,7 +70,7 @@ class _OrderedRun:
     order: InspectionOrder
     seen: Callable[[], None]
     done: Callable[[Values | None], None]
-    moment: float  # of time.monotonic(); its frame is exposed after it
+    moment: float  # time.monotonic(); the frame is exposed after it
     deadline: asyncio.TimerHandle
     frame: Frame | None = None
     work: Future[Inspection] | None = None
@@ -80,24 +80,24 @@ class Eyes(Inspector):
     """Inspects the first frame that is exposed after a run has begun.
 
     One thread of its own runs the tools, one picture at a time. If a run is given up while a tool
-    is at work, that thread is left to the tool, and a new one has the next picture.
+    is at work, that thread stays with the tool, and a new one takes the next picture.
 
     Args:
         name: name of the camera, for logs.
-        make: returns the source of its frames, unopened.
+        make: function that returns the source of its frames, not open yet.
         programs: the programs, by their ids.
-        recorded: the source is a recording: each run takes its next picture, and the first one
-            again after the last.
-        grey: have the grey levels of each picture made in the thread, for whoever asks for them.
+        recorded: whether the source is a recording: then each run takes its next picture, and the
+            first one again after the last.
+        grey: whether the thread makes the grey levels of each picture, for later use.
         on_sight: function that is called when frames are lost, with the reason, and with "" when
             they come again.
 
     Attributes:
         name: name of the camera.
         judged: the last picture that was judged; None before the first.
-        viewers: are shown each picture that was judged.
+        viewers: functions that get each judged picture.
         format: format of the source's frames; None before it was opened.
-        trouble: why there are no frames; "" where there are.
+        trouble: reason why there are no frames; "" if there are.
     """
 
     def __init__(
@@ -119,11 +119,11 @@ class Eyes(Inspector):
         self._make, self._programs = make, programs
         self._recorded, self._grey = recorded, grey
         self._order: _OrderedRun | None = None
-        self._wanted = asyncio.Event()  # a run waits for a frame
+        self._wanted = asyncio.Event()  # set while a run waits for a frame
         self._sighted = asyncio.Event()  # the first frame came, or cannot come
         self._task: asyncio.Task[None] | None = None
         self._thread: ToolThread | None = None
-        self._hung: list[ToolThread] = []  # those that were given up, and are still at work
+        self._hung: list[ToolThread] = []  # threads that were given up, and still run
 
     def _new_thread(self) -> ToolThread:
         return ToolThread(f"smartcam.inspection {self.name}")
@@ -131,7 +131,7 @@ class Eyes(Inspector):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open the source, and wait a moment for a first frame; ``on_sight`` hears if none comes.
+        """Open the source, and wait for a first frame; if none comes, call ``on_sight``.
 
         Cancellation: leaves it stopped.
         """
@@ -150,9 +150,9 @@ class Eyes(Inspector):
             raise
 
     async def stop(self) -> None:
-        """Give the source back. A tool that does not end is left to its thread. Idempotent.
+        """Release the source; a tool that does not end stays in its thread. Idempotent.
 
-        Cancellation: takes effect when the source is given back.
+        Cancellation: takes effect when the source is released.
         """
         self.cancel()
         task, self._task = self._task, None
@@ -180,11 +180,11 @@ class Eyes(Inspector):
         deadline = loop.call_later(FRAME_WAIT, self._give_up)
         self._order = _OrderedRun(order, seen, done, time.monotonic(), deadline)
         self._wanted.set()
-        if self.trouble:  # a restart has made the device forget it
+        if self.trouble:  # a restart of the device has dropped it
             loop.call_soon(self._tell, self.trouble)
 
     def cancel(self) -> None:
-        """Give up the inspection under way; a later one does not wait for its thread."""
+        """Give up the running inspection; a later one does not wait for its thread."""
         order, self._order = self._order, None
         self._wanted.clear()
         if order is not None:
@@ -218,7 +218,7 @@ class Eyes(Inspector):
     async def _follow(self, source: FrameSource) -> bool:
         """Give frames to the runs that wait for them; return whether any came before the end."""
         came = False
-        held: Frame | None = None  # of a recording, whose run was given up
+        held: Frame | None = None  # frame of a recording, whose run was given up
         async with source.reader(timeout=None) as reader:
             while True:
                 if self._recorded:
@@ -236,14 +236,14 @@ class Eyes(Inspector):
                     self._inspect(order, frame)
 
     def _regain(self) -> None:
-        """Note that frames come."""
+        """Note that frames come again."""
         if self.trouble:
             _log.info("%s = sees again", self.name)
             self._tell("")
         self._sighted.set()
 
     def _lose(self, why: str) -> None:
-        """Note that no frames come; the run under way is void."""
+        """Note that no frames come; the running inspection is void."""
         if why != self.trouble:
             _log.warning("%s ! sees nothing: %s", self.name, why)
         self._tell(why)
@@ -268,7 +268,7 @@ class Eyes(Inspector):
     # ------------------------------------------------------------------ tools
 
     def _inspect(self, order: _OrderedRun, frame: Frame) -> None:
-        """Have the tools look at a frame, in the thread."""
+        """Run the tools on a frame, in the thread."""
         thread = self._free_thread()
         if thread is None:
             return
@@ -289,7 +289,7 @@ class Eyes(Inspector):
         order.seen()
 
     def _free_thread(self) -> ToolThread | None:
-        """Return a thread for tools: a new one where a run that was given up is at work in it."""
+        """Return a thread for tools: a new one if the old is busy with a run that was given up."""
         thread = self._thread
         if thread is not None and thread.at_work:
             self._hung = [one for one in self._hung if one.at_work]
@@ -300,7 +300,7 @@ class Eyes(Inspector):
         return thread
 
     def _give_up_tools(self, order: _OrderedRun, frame: Frame) -> None:
-        """End a run whose tools do not; another thread has the next one."""
+        """End a run whose tools do not end; another thread takes the next one."""
         if order is not self._order:
             return
         if order.work is not None:
@@ -309,7 +309,7 @@ class Eyes(Inspector):
         self._end(order, frame, None, TimeoutError(text))
 
     def _finish(self, order: _OrderedRun, frame: Frame, work: Future[Inspection]) -> None:
-        """Take what the tools said of a run's frame, unless the run is void."""
+        """Take the tools' findings on a run's frame, unless the run is void."""
         if order is not self._order:
             return
         error = work.exception()
@@ -345,12 +345,12 @@ def _inspected(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspe
     inspection = program.inspect(frame, input=data)
     inspection.payload()
     if grey:
-        _ = inspection.picture.grey  # which takes longer than the loop has time
+        _ = inspection.picture.grey  # which would block the loop for too long
     return inspection
 
 
 def failed_values(program: Program, reason: str) -> dict[str, Any]:
-    """Return the values of a program that failed: not ok, with the reason, all else empty."""
+    """Return the values of a failed program: not ok, with the reason, and all others empty."""
     layout = program.layout
     fields = layout.fields if layout.repeat is None else layout.head
     values = {

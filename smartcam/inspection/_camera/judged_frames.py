@@ -68,7 +68,7 @@ class JudgedDriver(FrameDriver):
             await asyncio.wait({task})
 
     async def close(self) -> None:
-        """Have nothing left."""
+        """Release everything."""
         await self.stop()
 
     def _take(self, judged: Judged) -> None:

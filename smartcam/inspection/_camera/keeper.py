@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 MAX_WAITING: Final = 16
-"""Pictures that wait to be written; more are not kept, and counted."""
+"""Largest number of pictures that wait to be written; more are not kept, and counted."""
 
 _UNFIT: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')  # for the name of a file
 
@@ -36,7 +36,7 @@ class PictureKeeper:
 
     Args:
         name: name of the camera, for logs.
-        folder: folder for the pictures; it is made if need be.
+        folder: folder for the pictures; it is created if needed.
         keep: settings of keeping.
 
     Attributes:

@@ -59,7 +59,7 @@ class JudgedResults(Observer):
         self._sent = 0  # containers in it
         self._report: LastReport | None = None
         self._before = 0  # containers that the client had got before it
-        self._under_way: dict[int, _SentContainer] = {}  # by their count in the session
+        self._under_way: dict[int, _SentContainer] = {}  # containers by their count in the session
         self._kept: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
         )
@@ -97,5 +97,5 @@ class JudgedResults(Observer):
         self._found(result, sent.judged)
 
     def judged_of(self, result: Result) -> Judged | None:
-        """Return the picture of one of the last results; None where it is not known any more."""
+        """Return the picture of one of the last results; None if it is not known any more."""
         return self._kept.get((result.number, result.received_at))

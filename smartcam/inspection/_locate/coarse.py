@@ -31,22 +31,24 @@ AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
 """Agreement of two directions that are so many steps apart; of others it is 0."""
 
 MAX_TOP_POINTS: Final = 44
-"""Points of a part that are looked up everywhere: with 4 of agreement each, their sum is a byte."""
+"""Largest number of points of a part that are looked up everywhere: with 4 of agreement each, their
+sum is a byte."""
 
 MAX_POINTS: Final = 150
-"""Points of a part that are looked up at the places that are followed."""
+"""Largest number of points of a part that are looked up at the places that are followed."""
 
 MIN_RADIUS_PX: Final = 8.0
-"""Pixels from the reference to the farthest point at the smallest level at least."""
+"""Least distance, pixels, from the reference to the farthest point at the smallest level."""
 
 MAX_LEVELS: Final = 6
-"""Levels of the pyramid at most."""
+"""Largest number of levels of the pyramid."""
 
 MAX_STACK_BYTES: Final = 1 << 26
-"""Bytes of agreement that are kept at once, of all places and turns at the smallest level."""
+"""Largest number of bytes of agreement that are kept at once, of all places and turns at the
+smallest level."""
 
 MAX_CANDIDATES: Final = 100
-"""Places of a part that are followed down the pyramid at most, of each scale."""
+"""Largest number of places of a part that are followed down the pyramid, of each scale."""
 
 TOP_STEP_PX: Final = 1.6
 """Pixels that the farthest point moves by between two turns at the smallest level."""

@@ -9,9 +9,12 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.inspection._locate.segments import (
+    BLURS_PX2,
     MIN_BLUR_PX,
     Segments,
+    fit_bands,
     make_bands,
+    normal_equations,
     pixels_in,
 )
 from smartcam.inspection._measure.edges import ROUNDING
@@ -26,22 +29,25 @@ SMOOTH_PX: Final = 1.0
 """Standard deviation of the Gaussian before the gradient, in pixels."""
 
 HALF_LENGTH_PX: Final = 4.0
-"""Half of a segment's length at most, in pixels."""
+"""Largest half length of a segment, pixels."""
 
 BESIDE_PX: Final = 1.0
 """Pixels beside a straight line through a segment's middle that its points are at most."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Angle between the directions of a segment's points and its middle's, radians, at most."""
+"""Largest angle, radians, between the directions of a segment's points and that of its middle."""
 
 MIN_POINTS: Final = 4
-"""Points of a segment at least."""
+"""Least number of points of a segment."""
 
 MAX_SEGMENTS: Final = 3000
-"""Segments that are made of a picture at most."""
+"""Largest number of segments that are made of a picture."""
 
 FITS: Final = 8
 """Steps in which segments are fitted to the picture's pixels."""
+
+BLURRED_FITS: Final = 3
+"""Steps in which segments are fitted to their blurred picture."""
 
 MAX_SHIFT_PX: Final = 1.5
 """Pixels that a fit may move a segment by; more of them, and it is another edge."""
@@ -54,7 +60,7 @@ MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
 which the edge is a step whose place can be told to a fraction of a pixel."""
 
 MAX_SIGMA_PX: Final = 0.3
-"""Standard deviation of the place of a taught edge at most, in pixels."""
+"""Largest standard deviation of the place of a taught edge, pixels."""
 
 STEP_SLOPE: Final = 8 / (math.sqrt(2 * math.pi) * 1.5)
 """Response of Sobel's operator to an edge of one grey level behind the blur of picture and
@@ -135,12 +141,14 @@ def segments_of(found: EdgePoints) -> Segments:
         return _no_segments()
     middles, directions, bends, halves = (np.array(one) for one in zip(*rows, strict=True))
     ones = np.ones(len(rows))
-    return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones)
+    moves = np.zeros((len(rows), len(BLURS_PX2)))
+    return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones, moves)
 
 
 def _no_segments() -> Segments:
     none = np.zeros(0)
-    return Segments(np.zeros((0, 2)), np.zeros((0, 2)), none, none, none, none, none)
+    places, moves = np.zeros((0, 2)), np.zeros((0, len(BLURS_PX2)))
+    return Segments(places, places, none, none, none, none, none, moves)
 
 
 def _segment(points: Array, normals: Array) -> tuple[Array, Array, float, float]:
@@ -184,6 +192,29 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
     return TaughtEdges(shifted, exact & (shifted.heights > 0), points)
 
 
+def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Array:
+    """Return the shifts of segments across by blurs, (N, K), by blurring their picture.
+
+    Beside a corner, a bent edge or another edge, a blurred edge is no step at the same place.
+    """
+    cv2 = load("cv2", "inspection needs")
+    bands = make_bands(segments, points)
+    identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    exact = levels.astype(np.float64)
+    found = []
+    for variance in BLURS_PX2:
+        more = cv2.GaussianBlur(exact, (0, 0), math.sqrt(variance), borderType=cv2.BORDER_REPLICATE)
+        pixels = pixels_in(bands, identity, more)
+        blurs = np.sqrt(segments.blurs**2 + variance)[pixels.owners]
+        moved = np.zeros(len(segments.halves))
+        for _ in range(BLURRED_FITS):
+            across, _ = segments.places(pixels.points, pixels.owners)
+            fit = fit_bands(across - moved[pixels.owners], blurs, pixels, len(moved))
+            moved = moved + np.where(np.isfinite(fit.sigmas), fit.shifts, 0.0).clip(-0.5, 0.5)
+        found.append(moved.clip(-MAX_SHIFT_PX, MAX_SHIFT_PX))
+    return np.column_stack(found)
+
+
 def _fitted(
     pixels: BandPixels, segments: Segments
 ) -> tuple[Segments, Array, NDArray[np.bool_], Array]:
@@ -199,7 +230,7 @@ def _fitted(
     slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
     rise = load("scipy.special").ndtr(part)
     columns = np.stack([np.ones_like(part), rise, slope, slope * along, slope * part * blurs])
-    square, right = _normal_equations(columns, pixels.levels, pixels.owners, count)
+    square, right = normal_equations(columns, pixels.levels, pixels.owners, count)
     number = np.bincount(pixels.owners, minlength=count)
     good = number >= 20
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", square), 1e-12))
@@ -225,16 +256,3 @@ def _fitted(
         blurs=np.maximum(segments.blurs * (1 + growth), MIN_BLUR_PX),
     )
     return made, rms, good, np.sqrt(inverse[:, 2, 2]) / tall
-
-
-def _normal_equations(
-    columns: Array, values: Array, owners: NDArray[np.intp], count: int
-) -> tuple[Array, Array]:
-    """Return the square matrices (N, K, K) and right sides (N, K) of all bands."""
-    size = len(columns)
-    square, right = np.zeros((count, size, size)), np.zeros((count, size))
-    for i in range(size):
-        right[:, i] = np.bincount(owners, columns[i] * values, count)
-        for j in range(i, size):
-            square[:, i, j] = square[:, j, i] = np.bincount(owners, columns[i] * columns[j], count)
-    return square, right

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from smartcam.inspection._locate.model import PartModel
     from smartcam.inspection._picture import Picture
 
-CONTRAST_SHARE: Final = 0.15
-"""Part of the taught contrast that a found edge has at least, where nothing else is set."""
+CONTRAST_SHARE: Final = 0.12
+"""Part of its taught contrast that a found edge has at least, where nothing else is set."""
 
 MIN_CONTRAST: Final = 8.0
-"""Grey levels of 255 of a found edge at least, where nothing else is set."""
+"""Least contrast of a found edge, grey levels of 255, unless another one is set."""
 
 MAX_FITS: Final = 12
-"""Places that are fitted at most, besides four for each part that is looked for."""
+"""Largest number of places that are fitted, besides four for each part that is looked for."""
 
 SCORE_MARGIN: Final = 0.1
 """Score by which a fit may raise the coarse one: what is below that of the parts that were found by
@@ -205,26 +205,25 @@ class _SearchedPicture:
                 break
             if _is_enough(found, one, search) or any(_is_near(one, other) for other in found):
                 continue
-            part = self._fitted(model, one, search, ranges.contrast, allowed)
+            part = self._fitted(model, one, search, allowed)
             if part.refusal:
                 bad.append(part)
             else:
                 found.append(part)
         kept = _apart(found, search.overlap)[: search.most]
-        return [self._without_doubt(model, one, search, ranges.contrast) for one in kept], bad
+        return [self._without_doubt(model, one, search) for one in kept], bad
 
     def _moved(self, one: RoughPlace) -> RoughPlace:
         """Return a candidate in the whole picture's pixels."""
         return one._replace(x=one.x + self._corner[0], y=one.y + self._corner[1])
 
-    def _fit(
-        self, model: PartModel, start: PixelPose, search: PartSearch, contrast: float
-    ) -> FinePose | None:
+    def _fit(self, model: PartModel, start: PixelPose, search: PartSearch) -> FinePose | None:
         use = FineSettings(
-            contrast * self._unit,
+            contrasts_of(model, search) * self._unit,
             self._noise * self._unit,
             search.any_polarity,
             search.scales[1] > search.scales[0],
+            search.least_score,
             model.symmetry.fold != 0,
         )
         return fit_pose(self._levels, model.segments, model.bands, start, use)
@@ -234,12 +233,11 @@ class _SearchedPicture:
         model: PartModel,
         one: RoughPlace,
         search: PartSearch,
-        contrast: float,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
         """Return the part at a place, or why there is none."""
         start = PixelPose(one.x, one.y, one.angle, one.scale)
-        fine = self._fit(model, start, search, contrast)
+        fine = self._fit(model, start, search)
         if fine is None:
             return _unfitted(model, one, search, "too few of its edges agree on a pose")
         part = _part(model, fine)
@@ -257,14 +255,14 @@ class _SearchedPicture:
         return dataclasses.replace(part, refusal=refusal)
 
     def _without_doubt(
-        self, model: PartModel, part: LocatedPart, search: PartSearch, contrast: float
+        self, model: PartModel, part: LocatedPart, search: PartSearch
     ) -> LocatedPart:
         """Return a part with the doubt whether it is turned otherwise."""
         for angle, share in model.symmetry.alike:
             if part.score >= share + SAME_SCORE:
                 continue
             turned = _turned(part.pose, model.symmetry.about, angle)
-            other = self._fit(model, turned, search, contrast)
+            other = self._fit(model, turned, search)
             if other is not None and other.score >= part.score - SAME_SCORE:
                 doubt = (
                     f"as much of it is seen if it is turned by {math.degrees(angle):.0f} degrees"
@@ -275,10 +273,7 @@ class _SearchedPicture:
 
 def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
     """Return the ranges of the coarse search for a model."""
-    taught = float(np.median(model.segments.heights))
-    contrast = search.contrast
-    if contrast is None:
-        contrast = max(MIN_CONTRAST, CONTRAST_SHARE * taught)
+    contrast = float(np.median(contrasts_of(model, search)))
     return Ranges(
         angles=(0.0, 0.0) if model.symmetry.fold == 0 else search.angles,
         scales=search.scales,
@@ -287,6 +282,14 @@ def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
         contrast=contrast,
         least_score=search.least_score,
     )
+
+
+def contrasts_of(model: PartModel, search: PartSearch) -> Array:
+    """Return the grey levels of 255 that each edge of a part has at least, (N,)."""
+    heights = model.segments.heights
+    if search.contrast is not None:
+        return np.full(len(heights), search.contrast)
+    return np.maximum(MIN_CONTRAST, CONTRAST_SHARE * heights)
 
 
 def _part(model: PartModel, fine: FinePose) -> LocatedPart:

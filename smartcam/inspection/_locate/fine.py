@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from smartcam.inspection._locate.ground import Ground, common_error, fit_on_ground, ground_beside
 from smartcam.inspection._locate.segments import (
     MIN_BLUR_PX,
     BandPixels,
@@ -28,16 +29,16 @@ FIRST_BLURS_PX: Final = (3.0, 2.0)
 """Blurs of the first steps of a fit, in pixels: a wide step is drawn from farther away."""
 
 MAX_STEPS: Final = 12
-"""Steps of a fit at most."""
+"""Largest number of steps of a fit."""
+
+GROUND_STEPS: Final = 2
+"""Steps of a fit beside a ground that is not of one level."""
 
 STILL_PX: Final = 2e-4
 """Pixels that no segment moves by any more when a fit has come to rest."""
 
 MAX_SHIFT_PX: Final = 2.0
 """Pixels that a segment says in one step at most that it should move."""
-
-MIN_BEND: Final = 0.01
-"""Bend of an edge, per pixel, from which on a blur moves it by something that matters."""
 
 MAX_BLUR_PX: Final = 4.0
 """Blur of a picture's edges up to which they are fitted, in pixels."""
@@ -55,7 +56,7 @@ MAX_MISFIT: Final = 0.3
 """Rms about a step beyond the noise, in parts of the edge's height, up to which it is an edge."""
 
 MIN_SEEN: Final = 6
-"""Segments that a pose is worked out from at least."""
+"""Least number of segments that a pose is worked out from."""
 
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
 """Standard deviation of an angle of which nothing is known, in radians."""
@@ -67,10 +68,11 @@ MAX_INVERSE: Final = 1e8
 class FineSettings(NamedTuple):
     """Settings of a fit."""
 
-    contrast: float  # grey levels from the darker to the brighter side at least
+    contrast: Array  # (N,), grey levels from the darker to the brighter side at least
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
     scaled: bool = False  # whether the scale is fitted
+    least_score: float = 0.0  # of a pose whose ground matters
     turned: bool = True  # whether the angle is fitted; that of a round part is not
 
 
@@ -83,7 +85,7 @@ class FinePose(NamedTuple):
     seen: NDArray[np.bool_]  # (N,), segments that were seen
     kept: NDArray[np.bool_]  # (N,), segments that the pose follows from
     noise: float  # standard deviation of the pixels, grey levels
-    chi_square: float  # of the kept segments about the pose, per degree of freedom
+    chi_square: float  # chi-square of the kept segments around the pose, per degree of freedom
     reversed: float  # part of the edges that are there with the other polarity
     blur: float  # median standard deviation of the edges' blur, pixels
 
@@ -127,20 +129,33 @@ def _matrix(pose: PixelPose) -> Array:
 
 
 def _steps(
-    pixels: BandPixels, segments: Segments, pose: PixelPose, widened: float, first: float | None
+    pixels: BandPixels,
+    segments: Segments,
+    pose: PixelPose,
+    widened: float,
+    first: float | None,
+    ground: Ground | None = None,
+    noise: float = 0.0,
 ) -> tuple[StepFit, Array]:
     """Return the steps in all bands at a pose, and the blurs that they were fitted with."""
-    across, _ = segments.places(pose.from_picture(pixels.points), pixels.owners)
-    blurs = segments.blurs * pose.scale
-    blurs = np.sqrt(np.maximum(blurs**2 + widened, MIN_BLUR_PX**2))
+    places, blurs = _places(pixels, segments, pose, widened)
     if first is not None:
         blurs = np.full_like(blurs, first)
-    count = len(segments.halves)
-    # a blur moves a bent edge towards its middle, by its variance over the diameter
-    bent = np.where(np.abs(segments.bends) >= MIN_BEND, segments.bends, 0.0)
-    moved = 0.5 * bent * widened / pose.scale
-    across = across * pose.scale - moved[pixels.owners]
-    return fit_bands(across, blurs[pixels.owners], pixels, count), blurs
+    count, own = len(segments.halves), blurs[pixels.owners]
+    if ground is None:
+        return fit_bands(places[0], own, pixels, count), blurs
+    return fit_on_ground(places, own, pixels, ground, noise), blurs
+
+
+def _places(
+    pixels: BandPixels, segments: Segments, pose: PixelPose, widened: float
+) -> tuple[tuple[Array, Array], Array]:
+    """Return the places of pixels across and along their edges (P,), and the edges' blurs (N,)."""
+    across, along = segments.places(pose.from_picture(pixels.points), pixels.owners)
+    blurs = segments.blurs * pose.scale
+    blurs = np.sqrt(np.maximum(blurs**2 + widened, MIN_BLUR_PX**2))
+    moved = segments.moved_by(widened / pose.scale**2)
+    return (pose.scale * (across - moved[pixels.owners]), pose.scale * along), blurs
 
 
 def _widened(widened: float, growth: float, blur: float) -> float:
@@ -259,39 +274,42 @@ def _result(
     free: NDArray[np.bool_],
 ) -> FinePose | None:
     """Return the pose with what the steps at it say."""
-    fit, blurs = _steps(pixels, segments, pose, widened, None)
-    rows, weights, noise, edges = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
-    off = np.abs(fit.shifts)
-    sigmas = np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 1e-12)), np.inf)
-    seen = edges & (off <= SEEN_PX + CUT * np.minimum(sigmas, 1.0))
-    kept, freedom, chi_square, spread = seen, 1, 1.0, 1.0
-    for _ in range(3):
-        kept = seen & (off <= CUT * spread * sigmas)
-        if np.count_nonzero(kept) < MIN_SEEN:
-            return None
-        freedom = max(int(kept.sum()) - int(free.sum()), 1)
-        chi_square = float(((off[kept] / sigmas[kept]) ** 2).sum()) / freedom
-        spread = max(math.sqrt(chi_square), 1.0)
-    solved = _least_squares(rows[kept], fit.shifts[kept], weights[kept], free)
-    if solved is None:
+    fit, blurs = steps = _steps(pixels, segments, pose, widened, None)
+    rows, weights, noise, edges = _equations(steps, segments, pose, use, MAX_STEPS)
+    # as much of each edge counts as it is where it should be, and a step
+    off = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
+    seen = edges & (off <= 1)
+    lengths = segments.halves / segments.halves.sum()
+    score = float((lengths * (1 - off**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
+    wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
+    ground = None
+    if score >= use.least_score:
+        places, _ = _places(pixels, segments, pose, widened)
+        ground = ground_beside(places, blurs[pixels.owners], pixels, segments, seen)
+        for _ in range(GROUND_STEPS if ground is not None else 0):
+            fit, _ = _steps(pixels, segments, pose, widened, None, ground, noise)
+            again = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
+            rows, weights, noise = again[0], np.where(seen, again[1], 0.0), again[2]
+            solved = _solve(rows, fit.shifts, weights, free)
+            if solved is None:
+                return None
+            pose = _moved(pose, solved[0])
+    settled = _settled(rows, fit.shifts, np.where(seen, weights, 0.0), free)
+    if settled is None:
         return None
-    move, covariance = solved
+    move, covariance, kept, chi_square = settled
+    if ground is not None:
+        left = (fit.shifts - rows @ move) * np.sqrt(weights)
+        covariance = covariance * common_error(segments, left, kept)
     pose = _moved(pose, move)
-    if chi_square > 1 + 4 * math.sqrt(2 / freedom):  # the part is not quite the taught one
-        covariance = covariance * chi_square
     covariance[3] *= pose.scale
     covariance[:, 3] *= pose.scale
     if not use.turned:
         covariance[2, 2] = UNKNOWN_ANGLE**2
-    # as much of each edge counts as it is where it should be, and a step
-    beside = off / (SEEN_PX + CUT * np.minimum(sigmas, 1.0))
-    alike = (1 - beside**2) * (1 - _misfits(fit, use) ** 2)
-    lengths = segments.halves / segments.halves.sum()
-    wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     return FinePose(
         pose._replace(angle=math.remainder(pose.angle, 2 * math.pi)),
         covariance,
-        float((lengths * alike)[seen].sum()),
+        score,
         seen,
         kept,
         noise,
@@ -299,3 +317,33 @@ def _result(
         float(lengths[wrong].sum()),
         float(np.median(blurs)),
     )
+
+
+def _settled(
+    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
+    """Return the last move of a pose (4,), its covariance, and the segments that it follows from.
+
+    Besides, the squares of their shifts in parts of what they may have; None: too few agree.
+    """
+    off = np.abs(shifts) * np.sqrt(weights)
+    kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
+    for _ in range(3):
+        kept = (weights > 0) & (off <= CUT * spread)
+        if np.count_nonzero(kept) < MIN_SEEN:
+            return None
+        freedom = max(int(kept.sum()) - int(free.sum()), 1)
+        chi_square = float((off[kept] ** 2).sum()) / freedom
+        spread = max(math.sqrt(chi_square), 1.0)
+    solved = _least_squares(rows[kept], shifts[kept], weights[kept], free)
+    if solved is None:
+        return None
+    move, covariance = solved
+    if chi_square > 1 + 4 * math.sqrt(2 / freedom):  # the part is not quite the taught one
+        covariance = covariance * chi_square
+    return move, covariance, kept, chi_square
+
+
+def _of_weights(weights: Array) -> Array:
+    """Return the standard deviations of weights."""
+    return np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 1e-12)), np.inf)

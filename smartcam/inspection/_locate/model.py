@@ -24,10 +24,15 @@ from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
-from smartcam.inspection._locate.edges import edge_points, fit_segments, segments_of
+from smartcam.inspection._locate.edges import (
+    blurred_moves,
+    edge_points,
+    fit_segments,
+    segments_of,
+)
 from smartcam.inspection._locate.fine import FineSettings, fit_pose
 from smartcam.inspection._locate.outlines import MM, drawn_outline, read_outline
-from smartcam.inspection._locate.segments import Bands, Segments, make_bands
+from smartcam.inspection._locate.segments import BLURS_PX2, Bands, Segments, make_bands
 from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
@@ -43,23 +48,24 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.inspection._locate.outlines import Unit
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of the files of models."""
 
 MAX_FILE_BYTES: Final = 1 << 21
-"""Bytes of a model's file at most."""
+"""Largest number of bytes of a model's file."""
 
 MAX_SEGMENTS: Final = 400
-"""Segments of a model at most, evenly chosen; more of them cost time and tell little more."""
+"""Largest number of segments of a model, evenly chosen; more of them cost time and tell little
+more."""
 
 MAX_REGION_PX: Final = 25_000_000
 """Pixels of a region that is taught, at most."""
 
 MIN_SEGMENTS: Final = 12
-"""Segments whose place is told to a fraction of a pixel that a part has at least."""
+"""Least number of segments whose place is told to a fraction of a pixel that a part has."""
 
 MIN_TOP_POINTS: Final = 16
-"""Points of a part at the smallest level of the pyramid at least."""
+"""Least number of points of a part at the smallest level of the pyramid."""
 
 BORDER_PX: Final = 3.0
 """Pixels from the region's border within which an edge is left out."""
@@ -68,7 +74,7 @@ MAX_BORDER_SHARE: Final = 0.1
 """Part of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
-"""Part of the edges, by their directions, that tells a place along the others at least."""
+"""Least part of the edges, by their directions, that must determine a place along the others."""
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
@@ -80,7 +86,7 @@ MIN_SELF_CONTRAST: Final = 1.0
 """Grey levels of an edge of a part that is located in its own picture, at least."""
 
 LEVEL_RESPONSE: Final = 0.8
-"""Response of Sobel's operator to a part's edge of one grey level at a level, at least."""
+"""Least response of Sobel's operator, at a level, to a part's edge of one grey level."""
 
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
@@ -92,7 +98,7 @@ MAX_LEVEL: Final = 255.0
 """Contrast or noise that may be given at most, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
-"""Grey levels of 255 of a taught edge at least, where nothing else is set."""
+"""Least contrast of a taught edge, grey levels of 255, unless another one is set."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,6 +350,8 @@ def _taught(
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.some(exact)
+    moves = blurred_moves(levels, segments, found.points)
+    segments = segments._replace(moves=moves)
     _check_directions(segments)
     centre = found.points.mean(axis=0)
     segments = _ordered(segments._replace(middles=segments.middles - centre))
@@ -373,7 +381,7 @@ def _off_middle(
     """
     levels, (x, y), noise = taught
     turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
-    use = FineSettings(MIN_SELF_CONTRAST, noise, turned=fold != 0)
+    use = FineSettings(np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, turned=fold != 0)
     found = []
     for number in range(turns if fold != 1 else 0):
         start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
@@ -436,7 +444,7 @@ def _ordered(segments: Segments) -> Segments:
 
 
 def _check_directions(segments: Segments) -> None:
-    """Raise where the edges' directions leave a place open."""
+    """Raise if the edges' directions leave a place open."""
     weights = segments.halves / segments.halves.sum()
     square = (segments.normals * weights[:, None]).T @ segments.normals
     if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:
@@ -492,6 +500,8 @@ Part = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
 Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
 Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
 Row = tuple[Place, Place, Part, Part, Part, Length, Height, Length, Length]
+Move = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
+Moves = Annotated[list[Move], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
 
 
 class _ModelFile(BaseModel):
@@ -502,7 +512,7 @@ class _ModelFile(BaseModel):
     )
 
     kind: Literal["smartcam part model"] = "smartcam part model"
-    version: Literal[1] = VERSION
+    version: Literal[2] = VERSION
     name: Annotated[str, Field(min_length=1, max_length=50)]
     reference: tuple[Number, Number]
     border: Annotated[float, Field(ge=0, le=1)]
@@ -511,6 +521,7 @@ class _ModelFile(BaseModel):
     alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
     about: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
+    moves: Annotated[list[Moves], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
     outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
 
@@ -519,6 +530,8 @@ class _ModelFile(BaseModel):
         for number, level in enumerate(self.levels):
             if not level or max(level) >= len(self.segments):
                 raise ValueError(f"levels.{number}: expected indices of segments")
+        if len(self.moves) != len(self.segments):
+            raise ValueError("moves: expected as many as segments")
         places = np.array([row[:2] for row in self.segments] + self.outline)
         if float(np.prod(np.ptp(places, axis=0))) > MAX_REGION_PX:
             raise ValueError(f"expected a part of {MAX_REGION_PX} pixels at most")
@@ -542,6 +555,7 @@ class _ModelFile(BaseModel):
             alike=list(model.symmetry.alike),
             about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
+            moves=one.moves.round(5).tolist(),
             levels=[one.tolist() for one in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )
@@ -549,10 +563,11 @@ class _ModelFile(BaseModel):
     def model(self) -> PartModel:
         """Return the model of the file."""
         rows = np.array(self.segments, np.float64)
+        numbers = (rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7], rows[:, 8])
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
         return PartModel(
             name=self.name,
-            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T),
+            segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(np.array(one, np.intp) for one in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),

@@ -1,7 +1,7 @@
-"""Outlines of parts in files of DXF and SVG, and the picture that a part of this outline gives.
+"""Outlines of parts in files of DXF and SVG, and draw a picture of such a part.
 
-Curves are read by the libraries ezdxf and fontTools, and are closed here: lines whose ends meet
-make a loop. A loop in a loop is a hole.
+The libraries ezdxf and fontTools read the curves; here lines whose ends meet are joined to loops. A
+loop inside a loop is a hole.
 """
 
 from __future__ import annotations
@@ -33,37 +33,38 @@ DXF_UNITS: Final = {1: "inch", 4: "mm", 5: "cm", 6: "m"}
 """Units by the numbers that a DXF file has for them in its header, as $INSUNITS."""
 
 SVG_UNITS: Final = {"mm": "mm", "cm": "cm", "in": "inch", "px": "px"}
-"""Units by what stands behind a number in SVG."""
+"""Units by the suffix of a number in SVG."""
 
 SVG_SILENT: Final = frozenset({"defs", "desc", "metadata", "namedview", "style", "title"})
 """Elements of SVG that show nothing by themselves."""
 
 MAX_FILE_BYTES: Final = 1 << 24
-"""Bytes of an outline's file at most."""
+"""Largest number of bytes of an outline's file."""
 
 MAX_POINTS: Final = 200_000
-"""Corners of an outline at most, curves included."""
+"""Largest number of corners of an outline, those of curves included."""
 
 MAX_NESTED: Final = 30
-"""Groups of SVG in each other at most."""
+"""Largest depth of nested groups in SVG."""
 
 MAX_OUTLINE_PX: Final = 4_000_000
-"""Pixels of the picture of an outline at most."""
+"""Largest number of pixels of the picture of an outline."""
 
 FLATNESS_PX: Final = 0.01
-"""Pixels by which a curve may leave the polygon that stands for it."""
+"""Largest distance between a curve and its polygon, pixels."""
 
 JOIN_PX: Final = 0.1
-"""Pixels between the ends of two lines that are taken for one point."""
+"""Ends of two lines within this distance count as one point, pixels."""
 
 MARGIN_PX: Final = 12
-"""Pixels around the part in its picture."""
+"""Margin around the part in its picture, pixels."""
 
 SUBROWS: Final = 16
-"""Lines across each row of pixels along which the outline's area is taken."""
+"""Number of lines through each row of pixels along which the outline's area is measured."""
 
 DARK, CONTRAST, NOISE, BLUR_PX = 60.0, 130.0, 1.0, 0.8
-"""Grey levels of the darker side, from it to the brighter one, and of the noise; and the blur."""
+"""Grey level of the darker side, difference to the brighter one, noise in grey levels, and blur in
+pixels."""
 
 
 class Outline(NamedTuple):
@@ -117,7 +118,7 @@ def read_outline(
 
 
 def _closed(path: Path, lines: list[Array], pixels_per_mm: float) -> list[Array]:
-    """Return the loops that lines (K, 2) make."""
+    """Join lines (K, 2) to loops."""
     loops: list[Array] = []
     rest = list(lines)
     while rest:
@@ -216,7 +217,7 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> float:
-    """Return the millimetres of a user unit, by the drawing's width and what it shows."""
+    """Return the millimetres of a user unit, by the drawing's width and ``viewBox``."""
     if unit is not None:
         return MM[unit]
     sizes = [_length(root.get(name, "")) for name in ("width", "height")]
@@ -281,7 +282,7 @@ class _SvgReader:
                     yield line @ matrix[:2, :2].T + matrix[:2, 2]
 
     def _flatness(self, matrix: Array) -> float:
-        """Return the length that is as long as the flatness, in an element's coordinates."""
+        """Return the flatness in an element's coordinates."""
         return FLATNESS_PX / max(math.sqrt(abs(float(np.linalg.det(matrix[:2, :2])))), 1e-9)
 
     def _shape(self, tag: str, element: ElementTree.Element, flat: float) -> Iterator[Array]:
@@ -318,7 +319,7 @@ def _loop(corners: Array) -> Array:
 
 
 def _steps(radius: float, flat: float) -> int:
-    """Return the corners of a polygon that leaves a circle by the flatness at most."""
+    """Return the number of corners of a polygon within the flatness of a circle."""
     return max(16, math.ceil(math.pi / math.sqrt(2 * min(flat / max(radius, 1e-9), 0.5))))
 
 
@@ -339,7 +340,7 @@ def _path_lines(text: str, flat: float) -> Iterator[Array]:
 
 
 def _curve(corners: Array, flat: float) -> list[Any]:
-    """Return corners along a Bezier curve behind its first one."""
+    """Return corners along a Bezier curve after its first one."""
     reach = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
     count = min(2 * _steps(reach, flat), 2000)
     part = np.linspace(0, 1, count + 1)[1:, None]

@@ -29,6 +29,10 @@ BAND_PX: Final = 4.0
 MIN_BLUR_PX: Final = 0.35
 """Least standard deviation of an edge's blur, in pixels, with the pixels' own area in it."""
 
+BLURS_PX2: Final = (0.5, 1.0, 2.0, 4.0, 6.0, 9.0)
+"""Variances of a blur beyond the taught one of which it is known how far they move edges, in pixels
+of the picture that was taught."""
+
 MIN_BAND_PIXELS: Final = 12
 """Pixels that a band has at least; a fit of fewer says too little about its noise."""
 
@@ -43,6 +47,7 @@ class Segments(NamedTuple):
     heights: Array  # (N,), grey levels of 255 from the darker to the brighter side
     blurs: Array  # (N,), standard deviation of the step's blur
     sigmas: Array  # (N,), standard deviation of the place across the edge
+    moves: Array  # (N, K), how far each of BLURS_PX2 moves the edge across, as a step is fitted
 
     def some(self, which: NDArray[Any]) -> Segments:
         """Return some of the segments."""
@@ -63,6 +68,19 @@ class Segments(NamedTuple):
         bend = 0.5 * self.bends[owners] * t * t
         points = self.middles[owners] + t[:, None] * self.tangents[owners]
         return points + bend[:, None] * self.normals[owners], owners
+
+    def moved_by(self, variance: float) -> Array:
+        """Return the shift of each edge across by a blur beyond the taught one, (N,)."""
+        if variance < 0:  # what is sharper moves edges the other way
+            first: Array = self.moves[:, 0] * max(variance / BLURS_PX2[0], -1.0)
+            return first
+        at = min(variance, BLURS_PX2[-1])
+        above = int(np.searchsorted(BLURS_PX2, at))
+        known = np.column_stack([np.zeros(len(self.moves)), self.moves])
+        low, high = (0.0, *BLURS_PX2)[above : above + 2]
+        part = (at - low) / (high - low)
+        found: Array = (1 - part) * known[:, above] + part * known[:, above + 1]
+        return found
 
     def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the places of points (P, 2) of these segments: across and along the edge."""
@@ -156,7 +174,7 @@ class StepFit(NamedTuple):
     height_sigmas: Array  # (N,), for noise of one grey level
     variances: Array  # (N,), of the pixels about the step
     freedoms: Array  # (N,), pixels less fitted values
-    widening: float  # by how much the common blur should grow, in parts of itself
+    widening: float  # relative growth that the common blur needs
 
 
 def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> StepFit:
@@ -168,29 +186,21 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     part = across / blurs
     rise = load("scipy.special").ndtr(part)
     slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
-    widen = part * slope * blurs
-    owners, levels = pixels.owners, pixels.levels
-
-    def sums(*factors: Array) -> Array:
-        product = factors[0]
-        for one in factors[1:]:
-            product = product * one
-        return np.bincount(owners, product, count).astype(np.float64, copy=False)
-
-    columns = (rise, slope)
+    owners = pixels.owners
     number = np.bincount(owners, minlength=count).astype(np.float64)
     safe = np.maximum(number, 1.0)
-    rest = sums(levels) / safe
-    means = [sums(one) / safe for one in columns]
-    # products about the means of each band: what the unknown level of its dark side leaves
-    rr, rs, ss = (
-        sums(rise, rise) - number * means[0] ** 2,
-        sums(rise, slope) - number * means[0] * means[1],
-        sums(slope, slope) - number * means[1] ** 2,
-    )
-    ry = sums(rise, levels) - number * means[0] * rest
-    sy = sums(slope, levels) - number * means[1] * rest
-    yy = sums(levels, levels) - number * rest**2
+
+    def centred(values: Array) -> Array:
+        """Return values about the mean of their band: what its unknown level leaves."""
+        about: Array = values - (np.bincount(owners, values, count) / safe)[owners]
+        return about
+
+    def sums(one: Array, other: Array) -> Array:
+        return np.bincount(owners, one * other, count).astype(np.float64, copy=False)
+
+    rise, slope, widen, levels = map(centred, (rise, slope, part * slope * blurs, pixels.levels))
+    rr, rs, ss = sums(rise, rise), sums(rise, slope), sums(slope, slope)
+    ry, sy, yy = sums(rise, levels), sums(slope, levels), sums(levels, levels)
     determinant = rr * ss - rs * rs
     good = (number >= MIN_BAND_PIXELS) & (determinant > 1e-9 * np.maximum(rr * ss, 1e-12))
     det = np.where(good, determinant, 1.0)
@@ -198,25 +208,35 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     moved = np.where(good, (rr * sy - rs * ry) / det, 0.0)
     left = np.maximum(yy - heights * ry - moved * sy, 0.0)
     freedoms = np.maximum(number - 3.0, 1.0)
+    variances = np.maximum(left / freedoms, ROUNDING**2)
     tall = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
     infinite = np.where(good, 0.0, np.inf)
-    residuals = levels - rest[owners]
-    residuals -= heights[owners] * (rise - means[0][owners])
-    residuals -= moved[owners] * (slope - means[1][owners])
+    # what heights and shifts leave of the change by a wider blur, and of the pixels
+    wr, ws = sums(widen, rise), sums(widen, slope)
+    square = sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / det
+    grown = sums(widen, levels) - heights * wr - moved * ws
+    weights = np.where(good, 1 / variances, 0.0)
+    weights[np.abs(heights) < np.median(np.abs(heights))] = 0.0
+    total = float((weights * heights**2 * square).sum())
     return StepFit(
         -moved / tall,
         np.sqrt(np.maximum(rr / det, 0.0)) / np.abs(tall) + infinite,
         heights,
         np.sqrt(np.maximum(ss / det, 0.0)) + infinite,
-        np.maximum(left / freedoms, ROUNDING**2),
+        variances,
         freedoms,
-        _widening(residuals, widen, heights, owners),
+        -float((weights * heights * grown).sum()) / total if total > 0 else 0.0,
     )
 
 
-def _widening(residuals: Array, widen: Array, heights: Array, owners: NDArray[np.intp]) -> float:
-    """Return by how much the common blur should grow, by the strongest half of the edges."""
-    tall = np.abs(heights)
-    column = -widen * np.where(tall >= np.median(tall), heights, 0.0)[owners]
-    square = float(column @ column)
-    return float(column @ residuals) / square if square > 0 else 0.0
+def normal_equations(
+    columns: Array, values: Array, owners: NDArray[np.intp], count: int
+) -> tuple[Array, Array]:
+    """Return the square matrices (N, K, K) and right sides (N, K) of all bands."""
+    size = len(columns)
+    square, right = np.zeros((count, size, size)), np.zeros((count, size))
+    for i in range(size):
+        right[:, i] = np.bincount(owners, columns[i] * values, count)
+        for j in range(i, size):
+            square[:, i, j] = square[:, j, i] = np.bincount(owners, columns[i] * columns[j], count)
+    return square, right

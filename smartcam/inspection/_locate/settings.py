@@ -11,10 +11,10 @@ from smartcam.inspection._places import RegionSetting
 from smartcam.inspection._tool import ToolSettings
 
 MAX_PARTS: Final = 200
-"""Parts in one result."""
+"""Largest number of parts in one result."""
 
 MAX_MODELS: Final = 50
-"""Models that are looked for at once."""
+"""Largest number of models that are looked for at once."""
 
 MAX_SECONDS: Final = 30.0
 """Seconds that a search may take, if the settings allow for so many."""
@@ -91,7 +91,7 @@ class LocateSettings(ToolSettings):
         None,
         ge=1,
         le=255,
-        description="grey levels of 255 of an edge at least; default: a seventh of the taught ones",
+        description="grey levels of 255 of an edge at least; default: an eighth of its taught ones",
     )
     sigma: float | None = Field(
         None,

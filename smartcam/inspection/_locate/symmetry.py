@@ -27,16 +27,16 @@ NEAR_PX: Final = 1.5
 """Pixels beside the outline that a turned point may be."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Angle between the directions of a turned edge and of the one that it lies on, at most."""
+"""Largest angle between the direction of a turned edge and that of the edge that it lies on."""
 
 CENTRE_STEPS: Final = 6
 """Steps in which the place is found that a part turns about."""
 
 CENTRE_PX: Final = 8.0
-"""Pixels between a turned segment and the one that it lies on at the first step, at most."""
+"""Largest distance, pixels, of a turned segment from the one that it lies on, at the first step."""
 
 MIN_MET: Final = 8
-"""Segments that lie on another one when they are turned, at least."""
+"""Least number of segments that lie on another one when they are turned."""
 
 COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
 """Folds of which the middle is always looked for: a notch may move the reference off it."""

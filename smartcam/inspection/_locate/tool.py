@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_DRAWN: Final = 80
-"""Edges of a part that are drawn."""
+"""Largest number of edges of a part that are drawn."""
 
 STEPS: Final = np.array([0.5, 0.5, 1e-3])
 """Pixels, and radians, by which a pose is moved to see what its place in the plane does."""
@@ -177,7 +177,7 @@ class Locate(Tool[LocateSettings]):
         )
 
     def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
-        """Return why what was found is not ok; "" where it is."""
+        """Return why what was found is not ok; "" if it is."""
         least, most = self._wanted
         count, nearest = len(found.parts), found.nearest
         if not least <= count <= most:

@@ -46,22 +46,23 @@ PIXEL_VARIANCE: Final = 1 / 12
 """Variance of a place in a pixel of width 1, which adds to the blur's, pixels^2."""
 
 SIGNIFICANCE = 6.0
-"""Standard deviations of the noise that an edge stands out from it at least."""
+"""An edge must stand out from the noise by this many of its standard deviations."""
 
 MIN_PART = 0.2
 """Height of the weakest edge of a strip in parts of the strongest one; weaker ones are none."""
 
 MAX_SAMPLES = 8_000_000
-"""Pixels in all strips of a search together at most."""
+"""Largest number of pixels in all strips of a search together."""
 
 MAX_WIDTH_PX = 250.0
 """Pixels that a strip may be wide."""
 
 MAX_EDGES = 12
-"""Edges of a strip that are fitted at most, the strongest ones."""
+"""Largest number of edges of a strip that are fitted, the strongest ones."""
 
 MAX_TOGETHER = 4
-"""Edges that are fitted together at most, where they are so near that their blurs overlap."""
+"""Largest number of edges that are fitted together, where they are so near that their blurs
+overlap."""
 
 NEAR_PX = 8.0
 """Pixels between two edges below which they are fitted together."""
@@ -146,7 +147,7 @@ class Edge(NamedTuple):
     # (K + 1, K + 1), for noise of one grey level: of the places of the K edges that were fitted
     # together, and of their tilt; K edges share one array
     unit_covariance: Array
-    number: int  # of the edge among these, from 0
+    number: int  # index of the edge among these
     noise: float  # standard deviation of the pixels about the fit, grey levels
     height: float  # grey levels from before to behind it; negative from light to dark
     blur: float  # standard deviation of the lens' blur, pixels

@@ -59,7 +59,7 @@ class FoundShape(NamedTuple):
     """The edges of a line or a circle, in pixels."""
 
     edges: Edges
-    troubles: tuple[NotMeasuredError, ...]  # of the strips without an edge
+    troubles: tuple[NotMeasuredError, ...]  # errors of the strips without an edge
     blur: float  # standard deviation of most edges' slopes, pixels
     misfit: float  # pixels by which all edges may be wrong on the same side
     kept: NDArray[np.bool_] | None = None  # (N,), the edges that count; None: not known yet

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MAX_STARTS = 600
-"""Lines or circles through two or three edges that are tried at most."""
+"""Largest number of lines or circles through two or three edges that are tried."""
 
 GATE = 3.5
 """Standard deviations to a line or a circle from which on an edge is left out."""
@@ -38,7 +38,7 @@ MAX_ROUNDS = 10
 """Times that edges are left out and a fit is made again, at most; two or three are usual."""
 
 MAX_STEPS = 30
-"""Steps of a fit at most; three to five are usual."""
+"""Largest number of steps of a fit; three to five are usual."""
 
 MOST_LEFT_OUT = 0.5
 """Part of the edges that may be left out."""
@@ -63,7 +63,7 @@ class Line(NamedTuple):
     direction: Array  # (2,), of length 1
     # (2, 2), of the offset along the normal at that middle, and of the angle in radians
     covariance: Array
-    reach: float  # from the middle to the edges at both ends
+    reach: float  # distance from the middle to the edges at both ends
 
     @property
     def normal(self) -> Array:
@@ -93,7 +93,7 @@ class ShapeFit(NamedTuple, Generic[ShapeT]):
     shape: ShapeT
     kept: Mask  # (N,), the edges that agree with it
     residuals: Array  # (N,), distances of the edges from it along their normals
-    excess: float  # by which the edges spread more than their sigmas say, 1 at least
+    excess: float  # ratio of the edges' spread to that by their sigmas, at least 1
 
 
 def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[Line]:

@@ -1,11 +1,12 @@
-"""Planes in which lengths are measured: the picture in pixels, a calibrated one in millimetres.
+"""Define the planes in which lengths are measured: the picture, in pixels, or a calibrated plane.
 
-Edges are mapped to the plane, and what is measured is measured there: so neither a camera's tilt
-nor, with a lens in the calibration, its distortion bends a line or shortens a length.
+Edges are mapped to the plane, and lengths are measured there, in millimetres for a calibrated one.
+So neither a camera's tilt nor, with a lens in the calibration, its distortion bends a line or
+shortens a length.
 
-A calibration has errors of its own, the same ones for all edges of a picture. They are made of
-independent parts, each of one standard deviation; a map without such a part, beside the one with
-it, says what the part does to a result.
+A calibration has errors of its own, the same ones for all edges of a picture. They consist of
+independent parts, each of one standard deviation; the effect of a part on a result is the
+difference between maps with and without it.
 """
 
 from __future__ import annotations
@@ -26,25 +27,25 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 STEP_PX = 0.5
-"""Pixels to each side of a point between which a map's derivative is taken."""
+"""A map's derivative is taken between points this many pixels to each side."""
 
 MM = 1000.0
-"""Millimetres of a metre."""
+"""Millimetres per metre."""
 
 
 class Plane(NamedTuple):
     """A plane in which lengths are measured."""
 
     unit: str  # "px" or "mm"
-    # from pixels (N, 2) to points of the plane (N, 2)
+    # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
     # maps that are off by one standard deviation each, in independent ways
     variants: tuple[Callable[[Array], Array], ...] = ()
-    # for people, what of the map's errors nothing tells
+    # unknown errors of the map, for people
     remark: str = ""
 
     def points(self, pixels: Array) -> Array:
-        """Return pixels (N, 2) in the plane; NotMeasuredError: it does not reach there."""
+        """Map pixels (N, 2) to the plane; raise NotMeasuredError if it does not reach there."""
         try:
             return self.map(pixels)
         except CalibrationError as exc:
@@ -59,7 +60,7 @@ class Plane(NamedTuple):
         return np.stack(ends, axis=2)
 
     def edges(self, edges: Edges) -> Edges:
-        """Return edges of the picture in the plane."""
+        """Map edges of the picture to the plane."""
         slopes = self.slopes(edges.points)
         # an edge's line has the direction t; what moves it by s along its normal n moves the
         # mapped line by s |det J| / |J t| across
@@ -86,7 +87,7 @@ def picture_of(calibration: Any) -> Plane:
 def robot_plane_of(calibration: Any) -> Plane:
     """Return the plane of a calibration in the robot's x and y, millimetres, as :func:`plane_of`.
 
-    The plane is as good as level: of what lies in it, the robot's z follows.
+    The plane must be nearly level: then the robot's z follows from its x and y.
     """
     return plane_of(calibration, robot=True)
 
@@ -144,7 +145,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
 
 
 def _remark(calibration: Any, plane: Any) -> str:
-    """Return the errors that sigma is without; "" where all are known."""
+    """Return the errors that sigma does not include; "" if all are known."""
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")

@@ -37,10 +37,10 @@ MAX_TILT = 0.7
 """Tangent of the angle to which a step may be turned out of its strip."""
 
 MAX_STEPS = 25
-"""Steps of a fit at most; most fits take four to eight."""
+"""Largest number of steps of a fit; most fits take four to eight."""
 
 STILL_PX = 1e-4
-"""Pixels by which places move in the last step at most."""
+"""A fit ends when a step moves places by at most this many pixels."""
 
 MIN_SIDE_PX = 1e-3
 """Pixels that a pixel is wide at least, seen along an edge; 0 would be divided by."""

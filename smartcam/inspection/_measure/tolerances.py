@@ -1,4 +1,4 @@
-"""Tolerances as people write them: ``12.00 +- 0.05 mm``."""
+"""Parse tolerances as people write them: ``12.00 +- 0.05 mm``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNITS: Final = {
     "px": ("px", 1.0),
     "deg": ("deg", 1.0),
 }
-"""Units of a tolerance: the unit that is measured in, and how many of these one is."""
+"""Units of a tolerance: the unit of the measurement, and its number in one of these."""
 
 _NUMBER = r"(\d{1,12}(?:\.\d{0,12})?|\.\d{1,12})"
 _SIGNED = rf"([+-]?\s?{_NUMBER})"
@@ -59,7 +59,7 @@ class Tolerance(NamedTuple):
         """Return the tolerance of a text.
 
         Raises:
-            ConfigurationError: no such text, or the larger limit first.
+            ConfigurationError: there is no such text, or the larger limit first.
         """
         plain = check_text(text, "tolerance", most=100).strip()
         unit = plain[len(plain.rstrip(_LETTERS)) :]
@@ -84,7 +84,7 @@ class Tolerance(NamedTuple):
         return self.text[len(self.text.rstrip(_LETTERS)) :]
 
     def complaint(self, value: float, sigma: float, guard: float) -> str:
-        """Return why a value is not good; "" where it is.
+        """Return the reason why a value is not good; "" if it is good.
 
         It has to be inside by ``guard`` times its sigma: otherwise it may be outside, as well.
         Degrees are compared whatever turns of 360 are between them.
@@ -98,7 +98,8 @@ class Tolerance(NamedTuple):
             return f"{said} is above {self.most:.{digits}f} {self.unit}"
         if value < self.least:
             return f"{said} is below {self.least:.{digits}f} {self.unit}"
-        if not min(self.most - value, value - self.least) >= guard * sigma:  # NaN is not, either
+        # NaN is not inside, either
+        if not min(self.most - value, value - self.least) >= guard * sigma:
             return f"{said} is too near to the limit: sigma is {sigma:.2g} {self.unit}"
         return ""
 

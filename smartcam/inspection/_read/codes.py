@@ -38,8 +38,8 @@ class ReadCode:
         angle: direction of its upper edge, radians from x towards y.
         unused_correction: share of the code's error correction that reading did not need, 0 to 1;
             None: the kind has none.
-        level: error correction level, such as ``H``; "" where the kind has none.
-        version: size of the symbol, such as ``12x26``; "" where the kind has none.
+        level: error correction level, such as ``H``; "" if the kind has none.
+        version: size of the symbol, such as ``12x26``; "" if the kind has none.
         prepared: what had to be done to the picture before; "" for nothing.
     """
 

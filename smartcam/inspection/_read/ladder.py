@@ -1,7 +1,8 @@
 """Try again after a miss: the same reader, on the picture prepared otherwise.
 
 Each rung stands here because it reads codes of the measured sets that those before it miss; they
-stand in the order of what they gain for their time. ``tests.proofs.codes`` measures them.
+stand in the order of what they gain for their time. ``tests.inspection.proofs.codes`` measures
+them.
 """
 
 from __future__ import annotations

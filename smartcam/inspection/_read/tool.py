@@ -1,4 +1,4 @@
-"""The tool `read`: what is asked of it, and its finding."""
+"""The tool `read`: its settings, and its finding."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_CODES: Final = 255
-"""Codes in one result; zxing-cpp finds no more."""
+"""Largest number of codes in one result; zxing-cpp finds no more."""
 
 MAX_TEXT_BYTES: Final = 4000
-"""Bytes of a code's text; no code holds many more."""
+"""Largest number of bytes of a code's text; no code holds many more."""
 
 INPUT: Final = "input"
-"""The word for the value of the input, as what a code has to hold."""
+"""Setting by which a code must hold the value of the input."""
 
 
 def _pattern(given: str | None) -> str | None:
@@ -40,7 +40,7 @@ def _pattern(given: str | None) -> str | None:
 
 
 class ReadSettings(ToolSettings):
-    """The codes that are read, and the text that they have to hold."""
+    """The codes to read, and the text that they must hold."""
 
     codes: Annotated[
         tuple[str, ...],
@@ -89,12 +89,12 @@ class ReadTool(Tool[ReadSettings]):
 
     @property
     def fields(self) -> str:
-        """The number of codes, and the first one."""
+        """The fields: number of codes, and the first one."""
         return f"count: uint8, {self._of_code}" if self.settings.most == 1 else "count: uint8"
 
     @property
     def records(self) -> str:
-        """Each code."""
+        """The fields of each code."""
         return "" if self.settings.most == 1 else self._of_code
 
     @property
@@ -145,8 +145,8 @@ class ReadTool(Tool[ReadSettings]):
 
         Args:
             grey: the picture, (H, W), in one block.
-            origin: place of its first pixel in the picture that corners are of.
-            counts: function that says whether a code lies where it counts.
+            origin: place of its first pixel in the coordinates of the corners.
+            counts: function that returns whether a code lies where codes count.
         """
         started = time.monotonic()
         back = np.array([[1.0, 0, origin[0]], [0, 1, origin[1]]])
@@ -164,7 +164,7 @@ class ReadTool(Tool[ReadSettings]):
         return sorted(codes, key=lambda code: (code.centre[1], code.centre[0]))
 
     def _reason(self, codes: list[ReadCode], given: bytes) -> str:
-        """Return why these codes are not what they have to be; "" where they are."""
+        """Return why these codes are not the required ones; "" if they are."""
         settings = self.settings
         if len(codes) < settings.least:
             return f"{len(codes)} codes, expected {settings.least}"

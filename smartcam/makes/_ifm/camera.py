@@ -19,7 +19,7 @@ from smartcam.makes._ifm.chunks import JPEG, MONO8, ImageChunk
 from smartcam.makes._ifm.dialect import (
     ASYNCHRONOUS,
     ERRORS,
-    MAX_INPUT,
+    MAX_INPUT_BYTES,
     NOTIFICATIONS,
     OVERRUN,
     PCIC,
@@ -40,7 +40,7 @@ _NETWORK = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa:
 
 @dataclass(frozen=True, kw_only=True)
 class IfmApplication:
-    """An application of an emulated sensor, as its options say.
+    """An application of an emulated sensor, from its options.
 
     Attributes:
         id: number, 1 to 99.
@@ -48,7 +48,7 @@ class IfmApplication:
         processing_time: seconds of an evaluation.
         trigger: what starts evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
         images: pictures of an evaluation.
-        jpeg: path of a JPEG file that each picture is, or its bytes; none for grey levels.
+        jpeg: path or bytes of a JPEG file for all pictures; none for grey levels.
     """
 
     id: int
@@ -99,7 +99,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         options: the options of :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     protocol = PCIC
@@ -153,7 +153,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return {"layouter": "flexible", "format": form, "elements": elements}
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Do what a request says; a long one is answered while the next ones are heard."""
+        """Carry out a request; a long one is answered while the next ones are read."""
         call = cast("IfmClient", client.keep())
         untold = call.dialect.tickets and not call.ticket
         call.answer("?") if untold else super().hear(call, line)
@@ -200,7 +200,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda one: one.outputs & 4)
 
     def activated(self) -> None:
-        """Go on by itself where the active application does so."""
+        """Start evaluating, if the active application runs continuously."""
         if self.active and self.application.trigger == "continuous":
             self.begin(None)
 
@@ -301,7 +301,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     @request(r"j(0\d)(\d{9})(.*)")
     def _j(self, call: IfmClient, number: str, length: str, text: str) -> str:
         """Put a text with its length into an input container, 00 to 09."""
-        if int(length) != len(text) or len(text) > MAX_INPUT:
+        if int(length) != len(text) or len(text) > MAX_INPUT_BYTES:
             return "!"
         self.inputs[int(number)] = text
         return "*"
@@ -351,5 +351,5 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
 
 def _counted(text: str) -> str:
-    """Return a text behind its length."""
+    """Return a text after its length."""
     return f"{len(text):09}{text}"

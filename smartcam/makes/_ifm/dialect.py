@@ -47,8 +47,8 @@ READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 MAX_APPLICATION = 99
 """Largest number of an application: the commands that switch have two digits for it."""
 
-MAX_INPUT = 256
-"""Bytes of an input container."""
+MAX_INPUT_BYTES = 256
+"""Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
 """Codes of our own for the answers of a single character."""
@@ -170,8 +170,10 @@ def _image(dialect: PcicDialect, message: m.ReadImage) -> Script:
 
 def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
     data = message.data
-    if len(data) > MAX_INPUT:
-        raise ConfigurationError(f"ifm: an input container has {MAX_INPUT} bytes, got {len(data)}")
+    if len(data) > MAX_INPUT_BYTES:
+        raise ConfigurationError(
+            f"ifm: an input container has {MAX_INPUT_BYTES} bytes, got {len(data)}"
+        )
     answer = yield f"j{dialect.container:02}{len(data):09}{data.decode('latin-1')}"
     return m.SetInputAnswer(code=CODES[answer])
 
@@ -228,7 +230,7 @@ class PcicDialect(TicketedDialect):
         """Return the dialect with what a URL says.
 
         Raises:
-            ConfigurationError: no such trigger or container.
+            ConfigurationError: there is no such trigger or container.
         """
         kind = check_choice(parameters.get("trigger", "sync"), "trigger", ("sync", "async"))
         container = parameters.get("input", str(self.container))

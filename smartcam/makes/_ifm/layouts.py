@@ -30,7 +30,7 @@ _TYPES: Mapping[str, tuple[str, str]] = {
 _CODES: Mapping[str, str] = dict(_TYPES.values())
 
 MAX_DEPTH = 8
-"""Records in records that a layout may have."""
+"""Largest number of records in records that a layout may have."""
 
 
 def layout_json(layout: Layout) -> str:

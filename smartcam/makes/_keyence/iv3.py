@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from smartcam.makes._keyence.words import (
     ENCODING,
     LINE_END,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     READY,
     asked_word,
     check_done,
@@ -120,7 +120,7 @@ LINES = LineDialect(
     ),
     ids=range(LAST_PROGRAM + 1),
     line_end=LINE_END,
-    max_line=MAX_LINE,
+    max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
     split=lambda line: (asked_word(line, {"T2": "RT"}), line),
     codes=CODES,

@@ -1,6 +1,6 @@
-"""Keyence SR readers: LON begins to read a code, LOFF ends it, and one line says what was read.
+"""Speak to Keyence SR readers: LON begins to read a code, LOFF ends it, a line has the code.
 
-What is known of them, and who says so, stands in ``docs/keyence.md``.
+The known facts about them, with sources, are in ``docs/keyence.md``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.makes._keyence.words import (
     ENCODING,
     LINE_END,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     READY,
     asked_word,
     check_done,
@@ -50,7 +50,7 @@ CODES = {
     22: CodeMeaning("a file is wrong", Verdict.REFUSED),
     99: CodeMeaning("the reader is broken", Verdict.REFUSED),
 }
-"""Codes behind ``ER,<command>``; 00, an unknown command, is 100 here, since 0 is done."""
+"""Codes after ``ER,<command>``; 00, an unknown command, is 100 here, since 0 means done."""
 
 
 def _code(line: str) -> int:
@@ -74,7 +74,7 @@ def _scanned(line: str) -> tuple[m.Message, ...]:
 
 
 def _unasked(line: str) -> m.ResultContainer:
-    if line.startswith(("ER,", "OK,LON")):  # an answer, and no code: none is shown for LON
+    if line.startswith(("ER,", "OK,LON")):  # an answer and no code: LON has none
         raise ValueError(line)
     return read_code(line)
 
@@ -92,7 +92,7 @@ def _reply(line: str) -> LineReply:
 
 
 def _split(line: str) -> tuple[str, str]:
-    """Return the command that a line answers, "" where it is what was read."""
+    """Return the command that a line answers; "" if the line is a code."""
     first, _, rest = line.partition(",")
     return (asked_word(line, {}) if first in {"OK", "ER"} and rest else ""), line
 
@@ -150,7 +150,7 @@ LINES = SrDialect(
     rows=_rows(None),
     ids=range(LAST_BANK + 1),
     line_end=LINE_END,
-    max_line=MAX_LINE,
+    max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
     split=_split,
     at_once=True,

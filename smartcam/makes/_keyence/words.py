@@ -13,8 +13,9 @@ LINE_END = b"\r"
 ENCODING = "latin-1"
 """One byte for each character: what a code holds is not always text."""
 
-MAX_LINE = 8192
-"""Bytes of a line at most: the longest two-dimensional codes have some 7,000 characters."""
+MAX_LINE_BYTES = 8192
+"""Largest number of bytes of a line: the longest two-dimensional codes have some 7,000
+characters."""
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import VisionResult
 
 MAX_BOOK_CHARACTERS = 1 << 28
-"""Characters of the values that the results of a server keep, as JSON."""
+"""Largest number of characters of the values that the results of a server keep, as JSON."""
 
 MAX_HANDLES = 10_000
 """Handles that clients have not released; beyond it the oldest are forgotten."""
@@ -58,7 +58,7 @@ class ResultBook:
             self._characters -= len(gone.text)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
-        """Return a camera's result by its id; None where it is not there, or not any more."""
+        """Return a camera's result by its id; None if it is not there, or not any more."""
         found = self._kept.get(key)
         return found if found is not None and found.result.camera == camera else None
 

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.nodes import CameraNodes
 
 MAX_FILES = 32
-"""Files that are open at a time; a client that wants another one is refused."""
+"""Largest number of files that are open at a time; a client that wants another one is refused."""
 
 MAX_FILE_BYTES = 1 << 26
-"""Bytes of a picture; a larger one is not transferred."""
+"""Largest number of bytes of a picture; a larger one is not transferred."""
 
 MAX_READ_BYTES = 1 << 20
-"""Bytes of one answer to ``Read``."""
+"""Largest number of bytes of one answer to ``Read``."""
 
 FILE_SECONDS = 60.0
 """Seconds after a client's last call after which its file is gone."""
@@ -190,7 +190,7 @@ def _read(path: Any) -> bytes:
     """Return the bytes of a picture.
 
     Raises:
-        OSError: the file is not there any more, or too large.
+        OSError: the file does not exist any more, or too large.
     """
     with path.open("rb") as stream:
         data: bytes = stream.read(MAX_FILE_BYTES + 1)

@@ -98,13 +98,13 @@ class VisionResult:
         id: id of the result.
         camera: name of the camera.
         state: number of its state, as the nodeset numbers them.
-        application: application that made it; None where that is not known.
+        application: application that made it; None if that is not known.
         job: job that it is of; None for a result that no job has asked for.
         created: time at which it came, UTC.
         said: fields of its JSON object.
-        error: text that says why there are no values; "" where there are.
+        error: text that says why there are no values; "" if there are.
         picture: file of its picture; None without.
-        simulated: True for an emulated camera, False for a real one, None where that is not known.
+        simulated: True for an emulated camera, False for a real one, None if that is not known.
     """
 
     id: str

@@ -15,7 +15,7 @@ class VisionStates:
 
     Attributes:
         vision: name of the state of the whole system.
-        automatic: name of the state of the machine of jobs; "" where the system is not operational.
+        automatic: name of the state of the machine of jobs; "" if the system is not operational.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class VisionStates:
 
         Args:
             target: name of the state.
-            cause: name of the method that causes it; "" where it moves by itself.
+            cause: name of the method that causes it; "" if it moves by itself.
 
         Raises:
             WrongStateError: there is no such transition.

@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
-MAX_TEXT = 1000
-"""Characters of an id or a text that a client gives."""
+MAX_TEXT_CHARACTERS = 1000
+"""Largest number of characters of an id or a text that a client gives."""
 
 MAX_LISTED = 100
-"""Results or recipes of one answer; a client asks for the rest by ``StartIndex``."""
+"""Largest number of results or recipes of one answer; a client asks for the rest by
+``StartIndex``."""
 
 CALL_SECONDS = 700.0
 """Seconds within which every call ends: beyond all that its camera may take."""
@@ -203,7 +204,7 @@ class Methods:
         if not text and told is None:
             return None
         found = self._values.identity(kind, text)
-        if told is not None and len(told.Text or "") <= MAX_TEXT:
+        if told is not None and len(told.Text or "") <= MAX_TEXT_CHARACTERS:
             found.Description = told
         return found
 
@@ -383,7 +384,7 @@ def _text(value: Any) -> str:
     if text is None and not empty and not hasattr(value, "Id"):
         raise MethodArgumentError
     text = (text or "").strip()
-    if len(text) > MAX_TEXT:
+    if len(text) > MAX_TEXT_CHARACTERS:
         raise MethodArgumentError
     return text
 

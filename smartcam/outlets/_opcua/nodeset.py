@@ -31,7 +31,7 @@ class Transition(NamedTuple):
         name: name of the transition.
         node: numeric id of its node.
         source: name of the state before it.
-        target: name of the state behind it.
+        target: name of the state after it.
         cause: name of the method that causes it; "" for one by itself.
         effects: names of the types of the events that it raises.
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.server import VisionServer
 
 MAX_STATES = 1_000
-"""Cameras whose state is kept."""
+"""Largest number of cameras whose state is kept."""
 
 
 class OpcUaOutlet(Outlet[OpcUaSettings]):
@@ -34,7 +34,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
     def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
         super().__init__(name, settings, folder, desk)
         self._thread = LoopThread(f"smartcam.outlets.{name}.server")
-        self._loop: asyncio.AbstractEventLoop | None = None  # of the cameras
+        self._loop: asyncio.AbstractEventLoop | None = None  # event loop of the cameras
         self._server: VisionServer | None = None
         self._states: dict[str, Mapping[str, Any]] = {}
         self._open = False

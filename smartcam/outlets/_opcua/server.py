@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_CAMERAS = 1_000
-"""Cameras of one server."""
+"""Largest number of cameras of one server."""
 
 MAX_CONNECTIONS = 100
-"""Clients of one server at a time."""
+"""Largest number of clients of one server at a time."""
 
 METHOD_TYPES = (VISION, AUTOMATIC, "RecipeManagementType", "ResultManagementType")
 """Types whose methods a camera has."""

@@ -10,10 +10,10 @@ from pydantic import AfterValidator, Field, model_validator
 from smartcam.outlets._settings import OutletSettings, Secret
 
 MAX_USERS = 100
-"""Users of one server."""
+"""Largest number of users of one server."""
 
 MAX_RECIPES = 1000
-"""Names for applications."""
+"""Largest number of names for applications."""
 
 
 def _endpoint(text: str) -> str:

@@ -34,10 +34,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_REMEMBERED_JOBS = 1000
-"""Jobs whose results are still known as theirs when they come late from the spool."""
+"""Largest number of jobs whose results are still known as theirs when they come late from the
+spool."""
 
 MAX_PENDING = 1000
-"""Results that wait until it is known whether they are of the job under way."""
+"""Largest number of results that wait until it is known whether they are of the job under way."""
 
 RESULT_WAIT = 5.0
 """Seconds between the end of a trigger and its result from the spool."""
@@ -85,7 +86,7 @@ class VisionSystem:
         picture: returns the file of a result's picture.
         new_job: returns an id for a job.
         names: returns the names of the camera's own applications, with their numbers.
-        simulated: True for an emulated camera, False for a real one, None where that is not known.
+        simulated: True for an emulated camera, False for a real one, None if that is not known.
     """
 
     def __init__(
@@ -107,7 +108,8 @@ class VisionSystem:
         self._command, self._picture, self._new_job = command, picture, new_job
         self._names = names
         self._simulated = simulated
-        self._connected: bool | None = None  # None: not known yet
+        # whether the camera is connected; None if not known yet
+        self._connected: bool | None = None
         self._by_client = False  # clients prepare recipes: no other becomes ready by itself
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
@@ -215,7 +217,7 @@ class VisionSystem:
 
         Args:
             external: one of :attr:`recipes`, or the number as a text.
-            internal: number as a text; "" where only the name is given.
+            internal: number as a text; "" if only the name is given.
 
         Raises:
             UnknownRecipeError: there is no such recipe, or both ids are of different ones.
@@ -500,7 +502,7 @@ class VisionSystem:
             job.seen.set()
 
     def _job_of(self, said: Mapping[str, Any], at: datetime) -> VisionJob | None:
-        """Return the job of a result; None where it is not sure."""
+        """Return the job of a result; None if it is not sure."""
         trigger = _time(said.get("triggered_at"))
         if trigger is not None:
             found = self._by_trigger.pop(trigger, None)

@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Fields of a structure made from a layout; what is beyond stands in the JSON alone."""
+"""Largest number of fields of a structure made from a layout; what is beyond stands in the JSON
+alone."""
 
 MAX_RECORDS = 1000
-"""Records of a result that become structures; what is beyond stands in the JSON alone."""
+"""Largest number of records of a result that become structures; what is beyond stands in the JSON
+alone."""
 
 MAX_STRUCTURES = 2000
 """Structures of one server: one for each layout of a camera's application."""
@@ -91,7 +93,7 @@ class Structure(NamedTuple):
     columns: tuple[Column, ...]
 
     def pack_all(self, records: Sequence[Mapping[str, Any]]) -> list[ua.Variant] | None:
-        """Return records as structures; None where one does not fit, as before a layout changed."""
+        """Return records as structures; None if one does not fit, as before a layout changed."""
         try:
             packed = [self._pack(record) for record in records]
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):

@@ -81,7 +81,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
 
 
 def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
-    """Return every field of one complete frame, in order; bytes behind them as ``surplus``.
+    """Return every field of one complete frame, in order; bytes after them as ``surplus``.
 
     Raises MessageError: it is no complete frame of this dialect from this sender.
     """

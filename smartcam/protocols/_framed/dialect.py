@@ -122,12 +122,14 @@ class StatusBits:
 
 
 MAX_KNOWN = 256
-"""Messages kept of each kind; statuses and answers are few, and a peer could send any."""
+"""Largest number of messages kept of each kind; statuses and answers are few, and a peer could send
+any."""
 
 
-MAX_SURPLUS = 1 << 12
-"""Bytes that a body may be longer than documented, where that is a matter of a fixed length: newer
-firmware may append fields, which are a few words. More is a length that is wrong."""
+MAX_SURPLUS_BYTES = 1 << 12
+"""Largest number of bytes that a body may be longer than documented, where that is a matter of a
+fixed length: newer firmware may append fields, which are a few words. More is a length that is
+wrong."""
 
 
 class Codec:
@@ -137,7 +139,7 @@ class Codec:
         type: class of the message.
         message_id: id of the message on the wire.
         size: bytes of the fields of fixed size together.
-        has_data: True if the bytes behind these fields are a field, too.
+        has_data: True if the bytes after these fields are a field, too.
         names: names of all fields.
     """
 
@@ -186,7 +188,7 @@ class Codec:
     def lengths(self) -> range:
         """The lengths of a body that are accepted."""
         least = self.size if self._code is None else min(self._code.size, self.size)
-        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
+        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS_BYTES + 1)
 
     def fits(self, size: int) -> bool:
         """Return True if a body has the documented length."""
@@ -208,7 +210,7 @@ class Codec:
         return body + getattr(message, self._data) if self._data is not None else body
 
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
-        """Return the message whose body is at a place; bytes behind it are ignored.
+        """Return the message whose body is at a place; bytes after it are ignored.
 
         An answer that is nothing but a refusing code is taken as such: the rest is 0. Raises
         MessageError: the body is shorter than its message.
@@ -477,6 +479,10 @@ class FramedDialect(Dialect):
         word = reader.status_bits.write(report.status)
         return dataclasses.replace(report, status=self.status_bits.read(word))
 
+    def data_begins(self, sender: Sender, message_id: int) -> int | None:
+        codec = self.decoders(sender).get(message_id)
+        return codec.size if codec is not None and codec.has_data else None
+
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""
         fields: dict[str, Any] | None = None
@@ -520,7 +526,7 @@ class FramedDialect(Dialect):
         return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
     def body(self, answer: Message) -> bytes:
-        """Return an answer's bytes behind the header."""
+        """Return an answer's bytes after the header."""
         return self.to_frame(answer).payload
 
     def message_type(self, sender: Sender, message_id: int) -> type[Message]:

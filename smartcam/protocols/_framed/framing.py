@@ -1,11 +1,11 @@
-"""Cutting frames out of bytes, by the length field only.
+"""Cut frames out of bytes, by the length field only.
 
-A frame is a header (a magic number in some dialects, a length, a message id) and a payload. What
-the header looks like is data: :class:`HeaderLayout`. A length above the limit, or above what its
+A frame is a header (a magic number in some dialects, a length, a message id) and a payload. The
+form of the header is data: :class:`HeaderLayout`. A length above the limit, or above what its
 message may have, is refused as soon as the header is there, so no more than one header and one
 payload of the permitted size is ever kept.
 
-A chunk is not copied: frames are cut out of it by place. The rest of a large frame has a buffer of
+A chunk is not copied: frames are found in it by offset. The rest of a large frame has a buffer of
 its own, into which the transport may write.
 """
 
@@ -23,34 +23,36 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 DEFAULT_MAX_LENGTH = 1 << 20
-"""Bytes of payload accepted by default. The camera sends about 64 kB at most (HALCON script
-manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
+"""Largest number of bytes of payload accepted by default. The camera sends about 64 kB (HALCON
+script manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
 
 
 MIN_OWN_BUFFER_BYTES = 1 << 12
-"""Bytes of a frame from which on its rest is collected in a buffer of its own. Below it an
+"""The rest of a frame with at least this many bytes is collected in a buffer of its own. A smaller
 unfinished frame is copied in front of the next chunk, which costs less."""
 
 Buffer: TypeAlias = bytes | memoryview
 Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
-"""Reads fields at a place of a buffer."""
+"""Function that reads fields at an offset of a buffer."""
 
 
-FIRST_READ = 1 << 12
-"""Bytes that one read takes at most, at first. It doubles each time that a read took so many."""
+FIRST_READ_BYTES = 1 << 12
+"""Largest number of bytes that one read takes at first. It doubles each time that a read took so
+many."""
 
 MAX_READ_BYTES = 1 << 15
-"""Bytes that one read takes at most in the end; right after a large frame as many as that had. So
-many bytes of results fit into a subscriber's queue where each has 16 bytes or more: then one that
-keeps up loses nothing."""
+"""Largest number of bytes that one read takes in the end; right after a large frame, as many as
+that had. This many bytes of results fit into a subscriber's queue if each has 16 bytes or more, so
+that a subscriber that keeps up loses nothing."""
 
 
 MIN_READ_BYTES = 1 << 10
-"""Bytes that one read takes at most where the frames are many and small."""
+"""Least number of bytes that one read takes where the frames are many and small."""
 
 
 MAX_ALIKE_FRAMES = 16
-"""Frames that are cut at once where they begin with the same bytes, the length among them."""
+"""Largest number of frames that are cut at once where they begin with the same bytes, the length
+among them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,20 +96,20 @@ class HeaderLayout:
         return self.magic + self._fields.pack(message_id, length)
 
     def reader(self, more: int = 0) -> Read:
-        """Return a reader of headers: magic, the two numbers, ``more`` bytes behind."""
+        """Return a reader of headers: magic, the two numbers, and ``more`` bytes after them."""
         behind = f"{more}s" if more else ""
         return struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}").unpack_from
 
 
 class Framer:
-    """Bytes in, frames out.
+    """Cuts frames out of bytes.
 
     :meth:`feed` bytes, then call :meth:`cut` or :meth:`next_frame` until it returns None. After a
     :exc:`FrameError` the stream has no frame boundary any more: drop the link, or call
     :meth:`resync`, which skips to the next magic number.
 
     Args:
-        header: what a header looks like.
+        header: form of the headers.
         max_length: largest payload accepted, bytes.
     """
 
@@ -120,30 +122,31 @@ class Framer:
         self._header = header
         self._max_length = max_length
         self._lengths: Mapping[int, range] = {}
-        self._always = max_length  # a length that every message may have
+        self._always = max_length  # length that every message may have
         self._read = header.reader()
         self.buffer: Buffer = (
-            b""  # a chunk as it came, or one large frame: of it cut() tells places
+            b""  # a chunk as it came, or one large frame; cut() returns offsets in it
         )
-        self.start: int = 0  # where in it the next frame begins
-        self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
+        self.start: int = 0  # offset of the next frame
+        self._large: memoryview | None = None  # whole size of an unfinished large frame
         self._filled = 0
-        self._store = memoryview(b"")  # where a transport writes; large frames stay there
-        self._window = self._store  # what of it the next read may take
-        self._most = MAX_READ_BYTES  # what it may be in the end
+        # buffer that a transport writes into; large frames stay there
+        self._store = memoryview(b"")
+        self._window = self._store  # size of the next read
+        self._most = MAX_READ_BYTES  # largest size of a read
 
     def expect(self, lengths: Mapping[int, range]) -> None:
         """Refuse a payload that is longer than its message may have, even if it is not too long.
 
-        ``lengths``: bytes that the payload of a message may have, by its id; any number where it is
-        not among them.
+        ``lengths``: largest number of bytes of a message's payload, by its id; others are not
+        limited.
         """
         self._lengths = lengths
         self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
 
     @property
     def buffered(self) -> int:
-        """Bytes kept for the next frame."""
+        """Number of bytes kept for the next frame."""
         return self._filled if self._large is not None else len(self.buffer) - self.start
 
     @property
@@ -171,19 +174,19 @@ class Framer:
     def room(self) -> memoryview:
         """Return the buffer for a transport's next bytes; call :meth:`filled` next.
 
-        The rest of a large frame, or a buffer that grows as long as it is filled each time: an
-        idle camera has a small one, a fast one few reads.
+        It is the rest of a large frame, or a buffer that grows while it is filled each time: so an
+        idle camera has a small buffer, and a fast one few reads.
         """
         if self._large is not None:
             return self._large[self._filled :]
         if not self._store:
-            self._window = self._store = memoryview(bytearray(FIRST_READ))
+            self._window = self._store = memoryview(bytearray(FIRST_READ_BYTES))
         return self._window
 
     def filled(self, count: int) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`.
+        """Take ``count`` bytes that were written into :meth:`room`, like :meth:`feed`.
 
-        Returns False where a large frame goes on, so that there is nothing to cut yet.
+        Returns False if a large frame goes on, so that there is nothing to cut yet.
         """
         if self._large is not None:
             self._fill(count)
@@ -196,7 +199,8 @@ class Framer:
         if self.start < len(self.buffer):
             self.feed(data)
         elif count >= MIN_OWN_BUFFER_BYTES and self._header_at(data, 0)[1] >= MIN_OWN_BUFFER_BYTES:
-            self.buffer, self.start = data, 0  # not copied: it is cut before the next bytes come
+            # not copied: the frame is cut before the next bytes come
+            self.buffer, self.start = data, 0
             self._window = self._store
         else:
             self.buffer, self.start = bytes(data), 0
@@ -205,18 +209,19 @@ class Framer:
         return True
 
     def read_less(self) -> None:
-        """Take half as much a read: the last one had too many frames for one go.
+        """Halve the size of reads: the last one had too many frames for one turn.
 
-        As long as reads are filled; who has little to say is not held back.
+        This applies only while reads are filled, so it does not slow a quiet camera.
         """
         self._most = max(MIN_READ_BYTES, min(len(self._window), MAX_READ_BYTES) // 2)
         self._window = self._store[: self._most]
 
     def cut(self) -> tuple[int, int, int] | None:
-        """Return the next whole frame as id and place of its payload, or None for "more bytes".
+        """Return the id and the payload's place of the next whole frame, or None for "more bytes".
 
-        What is at the place gives :meth:`take`, before the next :meth:`feed`. Raises FrameError:
-        wrong magic, or a length that is impossible or above the limit; nothing is consumed.
+        :meth:`take` returns the bytes at this place, before the next :meth:`feed`. Raises
+        FrameError: wrong magic, or a length that is impossible or above the limit; nothing is
+        consumed.
         """
         if self._large is not None:
             return None
@@ -247,15 +252,15 @@ class Framer:
         return message_id, begin, end
 
     def take(self, begin: int, end: int) -> bytes:
-        """Return the bytes at a place that :meth:`cut` told."""
+        """Return the bytes at a place from :meth:`cut`."""
         return bytes(self.buffer[begin:end])
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
         """Return the payloads of the whole frames that come next and are of the same kind.
 
-        Those with the id and the first ``size`` bytes of payload of the frame that begins at
-        ``like``; their other bytes are returned. The first that differs ends it, errors included.
-        ``read``: a header's reader with ``size`` bytes more.
+        They must have the id and the first ``size`` bytes of payload of the frame that begins at
+        ``like``; their other bytes are returned. The first frame that differs, or is wrong, ends
+        the list. ``read``: a header's reader with ``size`` bytes more.
         """
         header, buffer, start = self._header, self.buffer, self.start
         found: list[bytes] = []
@@ -295,7 +300,7 @@ class Framer:
     def unfinished(self) -> tuple[int, int] | None:
         """Return message id and size, header included, of a frame of which only a part is there.
 
-        None where not even the header is there. To be asked when :meth:`cut` has returned None.
+        None if not even the header is there. To be asked when :meth:`cut` has returned None.
         """
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         if self.buffered < self._header.size:
@@ -331,7 +336,7 @@ class Framer:
         return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:
-        """Skip to the next magic number behind the present place; return the bytes skipped.
+        """Skip to the next magic number after the present place; return the skipped bytes.
 
         Without one in the buffer, only the bytes that may begin one are kept. A dialect without a
         magic number has no such place: everything is dropped.
@@ -339,7 +344,7 @@ class Framer:
         magic = self._header.magic
         if self._large is not None:
             self.buffer, self.start, self._large = self.pending, 0, None
-        self._keep(self.start)  # of a view there would be a copy for each place
+        self._keep(self.start)  # a view would be copied for each place
         begin = self.start
         found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
@@ -369,7 +374,7 @@ class Framer:
         return message_id, length - self._header.length_includes
 
     def _keep(self, start: int) -> None:
-        """Keep the rest of a chunk that was a view."""
+        """Keep a copy of the rest of a chunk that was a view."""
         if isinstance(self.buffer, memoryview):
             self.buffer, self.start = bytes(self.buffer[start:]), 0
 
@@ -413,8 +418,8 @@ class Framer:
 def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[bytes]) -> int:
     """Cut frames of ``length`` bytes that begin with ``head``, in which that length is told.
 
-    Sixteen at a time, all or none of them: the first that differs may have another length, and what
-    would be cut behind it is no frame. What is behind the heads goes to ``found``.
+    Sixteen are cut at a time, or none of them: the first that differs may have another length, so
+    anything after it would be no frame. The bytes after the heads are added to ``found``.
 
     Returns:
         The place of the next frame.

@@ -8,7 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from smartcam.exceptions import (
     FrameError,
@@ -48,14 +48,16 @@ the receive task takes in a turn, so that reading would have to pause after each
 
 
 MAX_FAMILIAR = 64
-"""Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
-each, and a peer could send any."""
+"""Largest number of messages of a kind that are known by their frames: of statuses and answers a
+camera has a handful each, and a peer could send any."""
 
 MAX_KNOWN_CHUNKS = 16
-"""Chunks that a camera's machine knows as a whole: a client has a handful of short requests."""
+"""Largest number of chunks that a camera's machine knows as a whole: a client has a handful of
+short requests."""
 
 MAX_KNOWN_CHUNK_BYTES = 64
-"""Bytes of the longest of these chunks: a Query, a sequence number and a Trigger have 40."""
+"""Largest number of bytes of the longest of these chunks: a Query, a sequence number and a Trigger
+have 40."""
 
 
 _SESSION_REQUESTS = (
@@ -158,7 +160,13 @@ class Machine:
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
             that the answer to Connect does not fit are left out when it comes; where several are
             left, :meth:`adopt` decides.
+
+    Attributes:
+        transitions: the next state by state, sender and type of message; what is not in it is
+            illegal.
     """
+
+    transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
 
     def __init__(
         self,
@@ -232,7 +240,7 @@ class Machine:
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
-        self._takes_bursts = self._plain and result.size > 0
+        self._takes_bursts = self._asks and result.size > 0
         self._said = {}
         self._forget_familiar()
 
@@ -656,6 +664,10 @@ class Machine:
         if not more:
             return
         self.counters.frames_received += len(more)
+        if self._trace is not None:
+            front = framer.take(begin, begin + self._burst_size)
+            for data in more:
+                self._trace(self._sender, Frame(self._result_id, front + data))
         size = len(first.data) + framer.start - start - len(more) * head
         more.insert(0, first.data)
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)

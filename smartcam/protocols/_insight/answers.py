@@ -13,7 +13,7 @@ from smartcam.protocols._insight.words import (
     ENDS,
     INFO_LINES,
     LINE_END,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     AnswerForm,
     StatusCode,
     checksum,
@@ -23,8 +23,9 @@ from smartcam.protocols._line_reader import LineReader
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
-MAX_IMAGE = 1 << 26
-"""Bytes of an image that are accepted: 20 million pixels of three bytes, and then some."""
+MAX_IMAGE_BYTES = 1 << 26
+"""Largest number of bytes of an image that are accepted: 20 million pixels of three bytes, and then
+some."""
 
 _BMP_MAGIC = b"BM"
 _BMP_SIZE_AT = slice(2, 6)  # of the file, UINT32 little endian
@@ -57,7 +58,7 @@ class AnswerReader(LineReader):
     def __init__(
         self, *, max_length: int, on_pieces: Callable[[Sequence[bytes], bool], None]
     ) -> None:
-        super().__init__(ENDS, max_line=MAX_LINE, encoding=ENCODING)
+        super().__init__(ENDS, max_line=MAX_LINE_BYTES, encoding=ENCODING)
         self._max_length = max_length
         self._on_pieces = on_pieces
         self._reading: Generator[None, None, CommandAnswer] | None = None
@@ -174,7 +175,7 @@ class AnswerReader(LineReader):
         if end - (len(lines) - 1) * len(LINE_END) > most:
             del lines[bisect_right(list(accumulate(map(len, lines))), most) :]
         digits = b"".join(lines)
-        if any(not 0 < size <= MAX_LINE or size % 2 for size in set(map(len, lines))):
+        if any(not 0 < size <= MAX_LINE_BYTES or size % 2 for size in set(map(len, lines))):
             return None
         data = _from_hex(digits)
         if data:
@@ -195,8 +196,8 @@ def _bitmap_size(data: bytearray) -> int:
     if not data.startswith(_BMP_MAGIC):
         raise FrameError("an image came that is no bitmap", data=bytes(data[:64]))
     size = int.from_bytes(data[_BMP_SIZE_AT], "little")
-    if not _BMP_SIZE_AT.stop < size <= MAX_IMAGE:
-        raise FrameError(f"a bitmap of {size} bytes comes; at most {MAX_IMAGE} are accepted")
+    if not _BMP_SIZE_AT.stop < size <= MAX_IMAGE_BYTES:
+        raise FrameError(f"a bitmap of {size} bytes comes; at most {MAX_IMAGE_BYTES} are accepted")
     return size
 
 

@@ -48,8 +48,9 @@ if TYPE_CHECKING:
 
     from smartcam.protocols._machine import Frame
 
-MAX_LOGIN = 255
-"""Characters of a user's name or password; the camera's own bound is not published."""
+MAX_LOGIN_CHARACTERS = 255
+"""Largest number of characters of a user's name or password; the camera's own bound is not
+published."""
 
 _VERDICTS: Mapping[int, Verdict] = {
     StatusCode.DONE: Verdict.DONE,
@@ -104,7 +105,7 @@ class InSightDialect(Dialect):
         Raises ConfigurationError: a cell is not valid, or a text cannot be sent.
         """
         for key in ("user", "password"):
-            problem = unsendable(parameters.get(key, ""), MAX_LOGIN)
+            problem = unsendable(parameters.get(key, ""), MAX_LOGIN_CHARACTERS)
             if problem is not None:
                 raise ConfigurationError(f"{key}: {problem}")
         counter = _cell_names(parameters.get("counter", ""))
@@ -120,7 +121,7 @@ class InSightDialect(Dialect):
 
     @property
     def remark(self) -> str:
-        """Text which says that a result is empty where no cells are asked for."""
+        """Text which says that a result is empty if no cells are asked for."""
         if self.cells:
             return ""
         return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"

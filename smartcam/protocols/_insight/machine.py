@@ -31,7 +31,7 @@ from smartcam.protocols._insight.words import (
     LAST_JOB_ID,
     LINE_END,
     LOGGED_IN,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     PASSWORD_PROMPT,
     TRIGGER_EVENT,
     USER_PROMPT,
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 """Status of a camera that is online and takes event 8; no other state is told."""
 
-READ_SIZE = 1 << 15
-"""Bytes that one read takes at most."""
+MAX_READ_BYTES = 1 << 15
+"""Largest number of bytes that one read takes."""
 
 
 class Piece(enum.IntEnum):
@@ -87,7 +87,7 @@ class Command(m.Request):
     line: str
 
     def __post_init__(self) -> None:
-        problem = unsendable(self.line, MAX_LINE)
+        problem = unsendable(self.line, MAX_LINE_BYTES)
         if problem is None and self.line[:2].upper() not in COMMANDS:
             problem = f"it begins with none of {', '.join(COMMANDS)}"
         if problem is not None:
@@ -147,7 +147,7 @@ class InSightMachine:
         self.state: State = State.IDLE
         self._trace = trace
         self._reader = AnswerReader(max_length=max_length, on_pieces=self._on_pieces)
-        self._store = memoryview(bytearray(READ_SIZE))
+        self._store = memoryview(bytearray(MAX_READ_BYTES))
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._login: Iterator[None] = iter(())
@@ -221,8 +221,8 @@ class InSightMachine:
                 next(self._login, None)
             if self.state is State.CONNECTED:
                 self._read_answers()
-            elif self.buffered > 2 * MAX_LINE:
-                raise FrameError(f"more than {2 * MAX_LINE} bytes came before the login")
+            elif self.buffered > 2 * MAX_LINE_BYTES:
+                raise FrameError(f"more than {2 * MAX_LINE_BYTES} bytes came before the login")
         except RemoteProtocolError as error:
             if self._trace is not None:
                 self._trace(m.Sender.CAMERA, error)

@@ -45,9 +45,9 @@ LOGGED_IN = "User Logged In"
 INVALID_PASSWORD = "Invalid Password"  # noqa: S105 - the camera's words
 """The line that refuses a login (clients, derived)."""
 
-MAX_LINE = 4096
-"""Bytes of a line, its end not counted, that either side takes. The longest regular ones are values
-of cells; the camera's own bound is not published."""
+MAX_LINE_BYTES = 4096
+"""Largest number of bytes of a line, its end not counted, that either side takes. The longest
+regular ones are values of cells; the camera's own bound is not published."""
 
 LAST_COLUMN = "Z"
 """The last column of the spreadsheet; the first one is A (manual, published)."""
@@ -56,8 +56,8 @@ LAST_ROW = 399
 """The last row of the spreadsheet; the first one is 0 (manual, published)."""
 
 MAX_CELLS = 1024
-"""Cells that a range, or a result, may have; ranges are of this library: each cell is asked for on
-its own, which takes a round trip."""
+"""Largest number of cells that a range, or a result, may have; ranges are of this library: each
+cell is asked for on its own, which takes a round trip."""
 
 LAST_JOB_ID = 999
 """The largest id of a job; the first one is 0 (manual, published)."""
@@ -119,7 +119,7 @@ class CommandRow(NamedTuple):
     Attributes:
         mnemonic: the command's two letters, in upper or lower case (manual, published).
         title: name of the command in the manual.
-        arguments: text behind the letters, without a space unless one is shown.
+        arguments: text after the letters, without a space unless one is shown.
         form: form of the answer.
         mode: mode in which the command is possible; in the other mode the answer is -2.
         codes: meaning of the status codes other than 1 and 0.
@@ -385,7 +385,7 @@ def parse_tag(text: str) -> str:
 def job_id(file: str) -> int | None:
     """Return the id of a job: the number that its file name begins with (manual, published).
 
-    None where it begins with no number, or one above 999.
+    None if it begins with no number, or one above 999.
     """
     match = _JOB_NUMBER.match(file)
     return None if match is None else int(match[1])
@@ -427,4 +427,4 @@ before it is dropped, since ``\r\0`` is telnet's bare CR."""
 
 def command_reader() -> LineReader:
     """Return a new reader that cuts a client's bytes into lines."""
-    return LineReader(COMMAND_ENDS, max_line=MAX_LINE, encoding=ENCODING)
+    return LineReader(COMMAND_ENDS, max_line=MAX_LINE_BYTES, encoding=ENCODING)

@@ -63,8 +63,8 @@ def write_bag(
         What is in the bag.
 
     Raises:
-        ConfigurationError: no such camera, an option that cannot work, or the folder is there
-            already or cannot be made.
+        ConfigurationError: there is no such camera, an option that cannot work, or the folder is
+            there already or cannot be created.
         UnsupportedError: a camera whose results cannot be read again from their bytes.
         RecordingError: the bag cannot be written to its end; nothing is left of it.
         MissingExtraError: a library is not installed.

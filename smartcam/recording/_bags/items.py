@@ -18,6 +18,7 @@ from smartcam.models import (
     Header,
     Localization,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Reconnected,
@@ -203,12 +204,12 @@ class _BagCamera:
     """One camera: its topics, its state as far as it was told, and containers on their way."""
 
     name: str
-    title: str  # for topics
+    title: str  # name in topics
     make: ResultMessages
     url: str = ""
-    known: KnownState = field(init=False)  # as far as it was told
-    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # that were told
-    specs: Specs = field(default_factory=Specs)  # how its results are read
+    known: KnownState = field(init=False)  # state, as far as it was recorded
+    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # facts that were recorded
+    specs: Specs = field(default_factory=Specs)  # specifications by which its results are read
 
     def __post_init__(self) -> None:
         self.known = KnownState(self.name)
@@ -216,7 +217,7 @@ class _BagCamera:
         self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
         self._status = Topic(f"/{self.title}/status", STATUS_TYPE, LATCHED)
-        self._told: object = None  # of the last diagnostics
+        self._told: object = None  # contents of the last diagnostics
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
@@ -300,7 +301,7 @@ def topic_of_camera(name: str) -> str:
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
-    """Return the localizations that recorded JSON holds; None where it holds anything else."""
+    """Return the localizations that recorded JSON holds; None if it holds anything else."""
     if not isinstance(value, list):
         return None
     said: list[Any] = value
@@ -320,16 +321,18 @@ def _part(said: Mapping[str, Any]) -> Localization:
         raise TypeError("no text")
     if type(photo) is not int:
         raise TypeError("no index")
-    return Localization(
-        feature,
-        _number(said["quality"]),
-        photo,
-        Pose(
-            Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
-            Position(*(_number(pose["position"][name]) for name in "xyz")),
-            Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
-        ),
+    place = Pose(
+        Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
+        Position(*(_number(pose["position"][name]) for name in "xyz")),
+        Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
     )
+    if "sigma" in pose:
+        told = {name: pose["sigma"][name] for name in PoseSigma._fields}
+        errors: dict[str, Any] = {
+            name: None if one is None else _number(one) for name, one in told.items()
+        }
+        place = place.with_sigma(PoseSigma(**errors))
+    return Localization(feature, _number(said["quality"]), photo, place)
 
 
 def _number(said: object) -> float:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
     from smartcam.models import Result
     from smartcam.observers import TraceEntry
-    from smartcam.recording._mcap.form import Item
+    from smartcam.recording._recorder import Given
 
 
 DISTRIBUTION = "jazzy"
@@ -29,7 +29,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
     """Make a bag's folder, and what writes it.
 
     Raises:
-        ConfigurationError: the folder cannot be made.
+        ConfigurationError: the folder cannot be created.
         MissingExtraError: a library is not installed.
     """
     types = RosTypes(DISTRIBUTION)
@@ -91,7 +91,7 @@ class _BagFile:
         self.start, self.flush = self._writer.start, self._writer.flush
         self.finish, self.close = self._writer.finish, self._writer.close
 
-    def add(self, item: Item | Description, /) -> None:
+    def add(self, item: Given, /) -> None:
         """Write one thing; raises ValueError: no message can be made of it."""
         if isinstance(item, Description):
             self.items.describe(item.facts)

@@ -18,7 +18,7 @@ class Specs:
     """The interpreters that ``interpret_as`` names, for all applications or for each.
 
     Args:
-        said: value of ``interpret_as``, or its text; "" where it was not told.
+        said: value of ``interpret_as``, or its text; "" if it was not told.
         pixels: whether places are in pixels, whatever ``said`` is.
     """
 
@@ -34,7 +34,7 @@ class Specs:
         self._with_parts: set[int] = set()  # applications that gave some
 
     def parts(self, result: Result) -> list[Localization] | None:
-        """Return a result's localizations in metres; None where it has none, or in pixels.
+        """Return a result's localizations in metres; None if it has none, or in pixels.
 
         An empty list is taken for localizations where its application gives these.
         """

@@ -59,7 +59,7 @@ class _BagChannel:
     """A topic as it stands in the file, and how many messages it has."""
 
     id: int
-    metadata: dict[str, str]  # of its topic, for ``metadata.yaml``
+    metadata: dict[str, str]  # metadata of its topic, for ``metadata.yaml``
     count: int = 0
 
 
@@ -72,7 +72,7 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
 
     Raises:
         ConfigurationError: the folder is there already, holds something else than a bag, another
-            recorder writes it, or it cannot be made.
+            recorder writes it, or it cannot be created.
     """
     what = f"bag {folder}"
     try:
@@ -95,7 +95,7 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
 
 
 def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
-    """Make the folder where it is not there; return whether it was made."""
+    """Make the folder where it does not exist; return whether it was made."""
     try:
         folder.mkdir()
     except FileExistsError as exc:

@@ -144,7 +144,7 @@ class FolderFiles:
         """Begin a camera's next file, and end the one before, if any; ``first``: what it is for.
 
         Raises:
-            OSError: the file cannot be made.
+            OSError: the file cannot be created.
         """
         now = self._clock()
         if now - self._looked > LOOK_INTERVAL:

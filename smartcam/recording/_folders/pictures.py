@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 MAX_BYTES_WITH_PICTURES: Final = 3 * MAX_WAITING_BYTES // 4
-"""Bytes that may wait for the disk behind a picture: the rest of the room is for results."""
+"""Largest number of bytes that may wait for the disk behind a picture: the rest of the room is for
+results."""
 
 RETRY: Final = Backoff(initial=1.0, maximum=30.0)
 """Delays before pictures that do not come are tried again."""

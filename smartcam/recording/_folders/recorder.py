@@ -15,7 +15,7 @@ from smartcam._extras import from_part
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Result, StatusChanged
-from smartcam.observers import Observer, TraceEntry
+from smartcam.observers import Observer
 from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folders.files import Limits
@@ -23,12 +23,13 @@ from smartcam.recording._folders.writer import FolderWriter
 from smartcam.recording._mcap.form import RecordedError, load_compress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from smartcam.fleet import FleetServer
     from smartcam.fleet._inside import RecordSection
     from smartcam.frames import Frame
+    from smartcam.observers import RawFrame
     from smartcam.recording._folders.pictures import FleetPictures
     from smartcam.recording._folders.track import CameraTrack, RecordingAccount
     from smartcam.recording._mcap.form import Item
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
 class _SeenResult(NamedTuple):
     """A result as an agent has it."""
 
-    result: Result[Any]  # its value says whose it is
-    endian: int | None  # None where it is not known
+    result: Result[Any]  # result, whose value says which camera it is from
+    endian: int | None  # byte order; None if it is not known
 
 
 class FleetRecorder(Server):
@@ -98,7 +99,7 @@ class FleetRecorder(Server):
     async def start(self) -> None:
         """Begin to write the folder.
 
-        A folder that cannot be made, or written, is no error: it is tried again.
+        A folder that cannot be created, or written, is no error: it is tried again.
 
         Raises:
             ConfigurationError: another recorder writes the folder, or the server was started.
@@ -163,7 +164,7 @@ class FleetRecorder(Server):
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None if all is well."""
         return None if self._writer is None else self._writer.trouble
 
     def _tell(self, trouble: RecordingError | None) -> None:
@@ -194,7 +195,8 @@ class _Hooks(Observer):
     ) -> None:
         self._server, self._section, self._writer = server, section, writer
         self._pictures = pictures
-        self._tracks: dict[str, CameraTrack | None] = {}  # None: it is not recorded
+        # track of each camera; None for one that is not recorded
+        self._tracks: dict[str, CameraTrack | None] = {}
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep an event."""
@@ -206,12 +208,15 @@ class _Hooks(Observer):
             if self._pictures is not None:
                 self._pictures.follow(track)
 
-    def on_result(self, result: Result) -> None:
-        """Keep a result."""
-        track = self._track(result.camera)
-        if track is not None:
-            came = _SeenResult(result, self._endian(result.camera))
-            self._writer.put(track, came, 4 * len(result.raw))
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Keep results that came together."""
+        camera = results[0].camera
+        track = self._track(camera)
+        if track is None:
+            return
+        endian = self._endian(camera)
+        for result in results:
+            self._writer.put(track, _SeenResult(result, endian), 4 * len(result.raw))
             if self._pictures is not None:
                 self._pictures.result(track, result)
 
@@ -261,11 +266,11 @@ class _Hooks(Observer):
 class _Frames(_Hooks):
     """Hands on frames, too."""
 
-    def on_frame(self, entry: TraceEntry) -> None:
-        """Keep a frame."""
-        track = self._track(entry.camera)
+    def on_raw_frame(self, frame: RawFrame) -> None:
+        """Keep a frame; the writer's thread decodes it."""
+        track = self._track(frame.camera)
         if track is not None:
-            self._writer.put(track, entry, len(entry.hex))
+            self._writer.put(track, frame, 2 * frame.size)
 
 
 class _SeenReading:

@@ -72,7 +72,7 @@ class CameraTrack:
         left_out: offered records that found no room to wait.
         written: records on the disk.
         lost: records that waited, but are not on the disk and will not be.
-        overflow: the gap that grows where too much waits; None where nothing is left out.
+        overflow: the gap that grows where too much waits; None if nothing is left out.
     """
 
     def __init__(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> None:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 MIN_FREE_BYTES = 4 * CHUNK
-"""Bytes that must be free on a disk that was full before it is tried again."""
+"""Least number of bytes that must be free on a disk that was full before it is tried again."""
 
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that did not take something is tried again; the last for ever."""
@@ -57,7 +57,7 @@ class _Trouble:
     error: RecordingError
     reason: str  # without the folder
     full: bool  # there was no room
-    again: float  # when it is tried again, on the steady clock
+    again: float  # time of the next try, on the monotonic clock
     tries: int = 0
 
 
@@ -80,7 +80,7 @@ class FolderWriter:
         clock: function that returns seconds, for the files' age and delays.
 
     Attributes:
-        trouble: why nothing is written at the time; None where all is well.
+        trouble: why nothing is written at the time; None if all is well.
     """
 
     def __init__(
@@ -256,7 +256,7 @@ class FolderWriter:
 
         Raises:
             ConfigurationError: another recorder has the folder now.
-            OSError: the folder is not there, or there is no room.
+            OSError: the folder does not exist, or there is no room.
         """
         trouble, now = self._trouble, self._clock()
         if trouble is None:

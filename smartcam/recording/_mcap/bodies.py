@@ -6,10 +6,12 @@ from collections import deque
 from typing import Generic, TypeVar
 
 MAX_FRAMES = 4096
-"""Frames that are kept: a delivery has been traced whole before its first result is told."""
+"""Largest number of frames that are kept: a delivery has been traced whole before its first result
+is told."""
 
 MAX_CHARACTERS = 1 << 23
-"""Characters of hex that they may have together; the last one is kept whatever it has."""
+"""Largest number of characters of hex that they may have together; the last one is kept whatever it
+has."""
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -41,5 +43,5 @@ class LastBodies(Generic[Key, Value]):
                 del self._known[key]
 
     def get(self, key: Key) -> Value | None:
-        """Return the value added for a key; None where it is not kept."""
+        """Return the value added for a key; None if it is not kept."""
         return self._known.get(key)

@@ -58,22 +58,23 @@ told; a later one goes before an earlier one."""
 GAP = "RecordingGap"
 """Class that a :class:`RecordedError` names where records were not written."""
 
-MAX_MESSAGE = 1 << 26
-"""Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
-room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
+MAX_MESSAGE_BYTES = 1 << 26
+"""Largest number of bytes of a message, written or read. A frame stands in one as bytes and as
+fields, so this has room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
 
 MAX_PICTURE_SIZE_BYTES = 1 << 27
-"""Bytes of a picture that is written: half of the largest record that is read."""
+"""Largest number of bytes of a picture that is written: half of the largest record that is read."""
 
 MAX_VALUES = 3_000_000
 """Commas and opening brackets of a message, written or read: each may become an object that takes
 a hundred times its room. A container of 1 MiB with a field a byte has two million."""
 
 MAX_CAMERAS = 10_000
-"""Cameras in a file: their facts are kept while it is read."""
+"""Largest number of cameras in a file: their facts are kept while it is read."""
 
-MAX_NAME = 1000
-"""Characters of a camera's name: a client takes 200, and HOST:PORT has fewer than 300."""
+MAX_NAME_CHARACTERS = 1000
+"""Largest number of characters of a camera's name: a client takes 200, and HOST:PORT has fewer than
+300."""
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 
@@ -89,7 +90,7 @@ class RecordedError(NamedTuple):
         at: time at which the recorder was told, UTC.
         error: name of the exception's class.
         text: text of the error.
-        triggered_at: time of the call of ``trigger()``, UTC; None where no trigger ended so.
+        triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended so.
         since: time of the first record that was not written, UTC, where ``error`` is
             ``RecordingGap``; ``at`` is that of the last one. None for other errors.
         records: number of records in a gap that were not written. None for other errors.
@@ -113,7 +114,7 @@ class RecordedPicture(NamedTuple):
         frame: the :class:`~smartcam.frames.Frame`.
         left_out: pictures before it that were not written, since too much waited for the disk.
         result_number: :attr:`~smartcam.Result.number` of the result that was made of the picture;
-            None where the recorder was not told.
+            None if the recorder was not told.
         result_received_at: when that result came, UTC: each client begins its numbers anew.
     """
 
@@ -139,7 +140,7 @@ class Kind(NamedTuple):
 
     topic: str  # last part of its topic
     schema: str  # name of its schema
-    about: str  # what it is, for the schema
+    about: str  # description for the schema
     properties: Mapping[str, Any]  # the schema's, by field
     required: tuple[str, ...]  # fields that are always there
     to_text: Callable[..., str]  # makes the message of an item, in ASCII
@@ -187,8 +188,8 @@ def count_values(data: bytes) -> int:
     Raises:
         ValueError: the message goes beyond one.
     """
-    if len(data) > MAX_MESSAGE:
-        raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE} at most")
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE_BYTES} at most")
     values = data.count(b",") + data.count(b"{") + data.count(b"[")
     if values > MAX_VALUES:
         raise ValueError(f"a message of {values} values, expected {MAX_VALUES} at most")
@@ -208,8 +209,17 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
         ValueError: nobody could read it back.
     """
     to_text = KINDS[kind].to_text
-    data = (to_text(item) if raw_from is None else to_text(item, raw_from)).encode()
-    if len(data) > min(MAX_MESSAGE, MAX_VALUES):  # a shorter one has fewer values
+    return bounded(to_text(item) if raw_from is None else to_text(item, raw_from))
+
+
+def bounded(text: str) -> bytes:
+    """Return a message's text as bytes.
+
+    Raises:
+        ValueError: nobody could read it back.
+    """
+    data = text.encode()
+    if len(data) > min(MAX_MESSAGE_BYTES, MAX_VALUES):  # a shorter one has fewer values
         count_values(data)
     return data
 
@@ -224,12 +234,6 @@ def message_fields(data: bytes) -> dict[str, Any]:
     if not isinstance(parsed, dict):
         raise ValueError(f"a message is a {type(parsed).__name__}, expected an object")  # noqa: TRY004
     return cast("dict[str, Any]", parsed)
-
-
-def body_of(entry: TraceEntry) -> str:
-    """Return the data that a frame of the camera has, as hex; "" where it has none."""
-    data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
-    return data if type(data) is str else ""
 
 
 def topic_of(camera: str, kind: str) -> str:
@@ -294,8 +298,10 @@ def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
 def camera_name(fields: Mapping[str, Any]) -> str:
     """Return the name of a message's camera; raises as :func:`_get`."""
     name = _get(fields, "camera", str)
-    if len(name) > MAX_NAME:
-        raise ValueError(f"camera: a name of {len(name)} characters, expected {MAX_NAME} at most")
+    if len(name) > MAX_NAME_CHARACTERS:
+        raise ValueError(
+            f"camera: a name of {len(name)} characters, expected {MAX_NAME_CHARACTERS} at most"
+        )
     return name
 
 

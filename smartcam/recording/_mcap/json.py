@@ -10,14 +10,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam._json import NULL, hex_text, text_of
-from smartcam.models import Result
+from smartcam.observers import TraceEntry
+from smartcam.protocols.messages import Sender
 
 if TYPE_CHECKING:
-    from smartcam.observers import TraceEntry
+    from smartcam.models import Result
+    from smartcam.observers import RawFrame
+
+MAX_FRAMES_ALIKE = 256
+"""Kinds of frames whose text is kept, apart from their time and data."""
 
 VALUE_IS_RAW = '"raw"'
-
-_RESULT = tuple(f'"{name}":' for name in (*Result._fields, "raw_from", "value_from"))
 
 
 def frame_text(entry: TraceEntry) -> str:
@@ -43,6 +46,48 @@ def frame_text(entry: TraceEntry) -> str:
     )
 
 
+class FrameTexts:
+    """Makes the texts of frames; of those that are alike but for their data, most of it once."""
+
+    def __init__(self) -> None:
+        # by all that tells a kind: what stands in front of the data and behind it. The dialect is
+        # kept with them, as its place in memory would be another one's afterwards
+        self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
+
+    def text(self, raw: RawFrame) -> tuple[str, str]:
+        """Return a frame's text as :func:`frame_text` makes it, and its data as hex.
+
+        The data is "" where there is none, and where the frame is no camera's.
+        """
+        frame, dialect = raw.frame, raw.dialect
+        if isinstance(frame, TraceEntry):
+            return frame_text(frame), body_of(frame)
+        begins, payload = dialect.data_begins(raw.sender, frame.message_id), frame.payload
+        if begins is None or len(payload) <= begins or raw.sender is not Sender.CAMERA:
+            entry = raw.entry()
+            return frame_text(entry), body_of(entry)
+        kind = raw.camera, id(dialect), frame.message_id, payload[:begins], len(payload)
+        data, known = payload[begins:].hex(), self._known.get(kind)
+        if known is None:
+            entry = raw.entry()
+            text = frame_text(entry)
+            before = f'{{"at":{text_of(raw.at)}'
+            behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
+            if text.startswith(before) and text.endswith(data + behind):
+                if len(self._known) >= MAX_FRAMES_ALIKE:
+                    self._known.clear()
+                front = text[len(before) : len(text) - len(data) - len(behind)]
+                self._known[kind] = front, behind, dialect
+            return text, body_of(entry)
+        return f'{{"at":{text_of(raw.at)}{known[0]}{data}{known[1]}', data
+
+
+def body_of(entry: TraceEntry) -> str:
+    """Return the data that a frame of the camera has, as hex; "" where it has none."""
+    data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
+    return data if type(data) is str else ""
+
+
 def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[str, Any]:
     """Return a body with its ``data`` again, which begins at that byte of the frame.
 
@@ -63,13 +108,25 @@ def result_text(result: Result[Any], raw_from: int | None = None) -> str:
         raw_from: number of the frame whose ``data`` is :attr:`~smartcam.Result.raw`; None:
             write ``raw`` itself.
     """
-    raw, value = result.raw, result.value
-    raw_text = NULL if raw_from is not None else text_of(raw)
-    said, said_from = (NULL, VALUE_IS_RAW) if value is raw else (text_of(value), NULL)
-    last = raw_text, said, text_of(raw_from), said_from
-    return _object_of(_RESULT, (*map(text_of, result[:-2]), *last))
-
-
-def _object_of(names: tuple[str, ...], texts: tuple[str, ...]) -> str:
-    pairs = zip(names, texts, strict=True)
-    return f"{{{','.join([name + text for name, text in pairs if text != NULL])}}}"
+    camera, application, sequence, number, triggered_at, received_at, latency, raw, value = result
+    text = f'{{"camera":{text_of(camera)},"application":{text_of(application)}'
+    if sequence is not None:
+        text += f',"sequence":{text_of(sequence)}'
+    text += f',"number":{text_of(number)}'
+    if triggered_at is not None:
+        text += f',"triggered_at":{text_of(triggered_at)}'
+    text += f',"received_at":{text_of(received_at)}'
+    if latency is not None and (said := text_of(latency)) != NULL:
+        text += f',"latency":{said}'
+    if raw_from is None:
+        text += f',"raw":{text_of(raw)}'
+    if value is raw:
+        end = f',"value_from":{VALUE_IS_RAW}}}'
+    else:
+        end = "}"
+        said = text_of(value)
+        if said != NULL:
+            text += f',"value":{said}'
+    if raw_from is not None:
+        text += f',"raw_from":{raw_from}'
+    return text + end

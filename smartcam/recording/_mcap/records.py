@@ -13,27 +13,29 @@ from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from smartcam.exceptions import RecordingError
-from smartcam.recording._mcap.form import MAX_MESSAGE, load_extra
+from smartcam.recording._mcap.form import MAX_MESSAGE_BYTES, load_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-MAX_RECORD = 1 << 28
-"""Bytes of one record of a file: ours have about 1 MiB, a damaged length says anything."""
+MAX_RECORD_BYTES = 1 << 28
+"""Largest number of bytes of one record of a file: ours have about 1 MiB, a damaged length says
+anything."""
 
-MAX_CHUNK = MAX_MESSAGE + (1 << 21)
-"""Bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so the largest has one
-message more; 2 kB of zstd can claim as much as this."""
+MAX_CHUNK_BYTES = MAX_MESSAGE_BYTES + (1 << 21)
+"""Largest number of bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so
+the largest has one message more; 2 kB of zstd can claim as much as this."""
 
-MAX_FACTS = 1 << 20
-"""Bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
+MAX_FACTS_BYTES = 1 << 20
+"""Largest number of bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
 
 MIN_RECORDS = 10_000
-"""Records that every file may have; a larger file as many as it has bytes. A recorder indexes each
-message with 16 bytes behind its chunk, and a chunk of 1 MiB has fewer than these."""
+"""Least number of records that every file may have; a larger file as many as it has bytes. A
+recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer than
+these."""
 
-MIN_UNPACKED = 1 << 29
-"""Bytes that the chunks of every file may unpack to together: seconds of work."""
+MIN_UNPACKED_BYTES = 1 << 29
+"""Least number of bytes that the chunks of every file may unpack to together: seconds of work."""
 
 UNPACKED_PER_BYTE = 10_000
 """Bytes that a larger file may unpack to for each of its own. Containers of nothing but zeros come
@@ -93,8 +95,8 @@ Record: TypeAlias = Schema | Channel | McapMessage | Metadata
 class RecordReader:
     """Reads a file from its begin to its end, once."""
 
-    _stream: IO[bytes]  # at the file's begin
-    _name: object  # of the file, for errors
+    _stream: IO[bytes]  # stream at the beginning of the file
+    _name: object  # name of the file, for errors
 
     def __post_init__(self) -> None:
         self.place: int = 0  # bytes read so far
@@ -116,8 +118,8 @@ class RecordReader:
             crc = self._crc
             opcode, length = _HEAD.unpack(self._read(_HEAD.size))
             self._count_one()
-            if length > MAX_RECORD:
-                raise ValueError(f"a record of {length} bytes, expected {MAX_RECORD} at most")
+            if length > MAX_RECORD_BYTES:
+                raise ValueError(f"a record of {length} bytes, expected {MAX_RECORD_BYTES} at most")
             if opcode == _CHUNK:
                 yield from self._unpack(memoryview(self._read(length)))
             elif opcode == _FOOTER:
@@ -149,11 +151,11 @@ class RecordReader:
             RecordingError: with them it goes beyond the bound.
         """
         self._unpacked += size
-        if self._unpacked > max(MIN_UNPACKED, UNPACKED_PER_BYTE * self.place):
+        if self._unpacked > max(MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE * self.place):
             raise RecordingError(
                 f"recording {self._name}: the first {self.place} bytes of the file unpack to "
                 f"{self._unpacked}, expected {UNPACKED_PER_BYTE} for each at most, or "
-                f"{MIN_UNPACKED}"
+                f"{MIN_UNPACKED_BYTES}"
             )
 
     def _unpack(self, body: memoryview) -> Iterator[Record]:
@@ -197,10 +199,10 @@ class RecordReader:
         while piece := inflate(PIECE_BYTES):
             data += piece
             self.count_unpacked(len(piece))
-            if len(data) > MAX_CHUNK:
+            if len(data) > MAX_CHUNK_BYTES:
                 raise RecordingError(
                     f"recording {self._name}: a chunk unpacks to more than {len(data) - 1} bytes, "
-                    f"expected {MAX_CHUNK} at most"
+                    f"expected {MAX_CHUNK_BYTES} at most"
                 )
         return data
 
@@ -270,8 +272,8 @@ class _Body:
 
 
 def _small(length: int) -> int:
-    if length > MAX_FACTS:
-        raise ValueError(f"a record of {length} bytes, expected {MAX_FACTS} at most")
+    if length > MAX_FACTS_BYTES:
+        raise ValueError(f"a record of {length} bytes, expected {MAX_FACTS_BYTES} at most")
     return length
 
 
@@ -315,7 +317,7 @@ _PARSERS: dict[int, Callable[[memoryview], Record]] = {
 def _zstd(packed: memoryview) -> Callable[[int], bytes]:
     """Return a reader of the next bytes; a frame's window is as large as its chunk at most."""
     library: Any = load_extra("zstandard")
-    inflater = library.ZstdDecompressor(max_window_size=1 << (MAX_CHUNK - 1).bit_length())
+    inflater = library.ZstdDecompressor(max_window_size=1 << (MAX_CHUNK_BYTES - 1).bit_length())
     stream = inflater.stream_reader(packed)
 
     def inflate(size: int) -> bytes:

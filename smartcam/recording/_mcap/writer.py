@@ -1,7 +1,7 @@
-"""Writing MCAP: chunks of messages packed by zstd, an index of each, and what stands at the end.
+"""Write MCAP: chunks of messages packed by zstd, their indexes, and the summary at the end.
 
-Byte for byte what the mcap library's ``Writer`` makes of the same calls, for a fifth of its time a
-message: that is most of what a small message costs.
+The bytes are those of the mcap library's ``Writer`` with the same calls, in a fifth of its time per
+message, which is most of the cost of a small message.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _ZSTD = "zstd"
 
 
 class McapWriter:
-    """Writes a file from its begin to its end; not for several threads.
+    """Writes a file from its beginning to its end, in one thread.
 
     After an error nothing more may be written: the file could not be read.
 
     Args:
         stream: the file, open.
-        compress: packs a chunk, as ``zstandard.compress``.
-        chunk_size: bytes of a chunk that end it.
+        compress: function that packs a chunk, such as ``zstandard.compress``.
+        chunk_size: number of bytes at which a chunk is ended.
     """
 
     def __init__(
@@ -46,22 +46,23 @@ class McapWriter:
         self._stream = stream
         self._compress = compress
         self._chunk_size = chunk_size
-        self._parts: list[bytes] = []  # of the chunk that is being filled
-        self._packs = True  # the chunk, when it is ended
-        self._size = 0  # bytes in them
-        self._places: dict[int, list[int]] = {}  # by channel: times and places in it, in turn
-        self._first = self._last = 0  # times of its messages
-        self._counts: dict[int, int] = {}  # messages of each channel
-        self._began = self._ended = 0  # times of them all
+        self._parts: list[bytes] = []  # parts of the chunk that is being filled
+        self._packs = True  # the chunk when it is ended
+        self._size = 0  # number of bytes in these
+        # times and offsets in the chunk by channel, alternating
+        self._places: dict[int, list[int]] = {}
+        self._first = self._last = 0  # first and last time of its messages
+        self._counts: dict[int, int] = {}  # number of messages of each channel
+        self._began = self._ended = 0  # first and last time of all messages
         self._chunks = 0
-        # for what stands at the end
+        # records to repeat at the end
         self._schema_records: list[bytes] = []
         self._channel_records: list[bytes] = []
         self._chunk_indexes: list[bytes] = []
         self._metadata_indexes: list[bytes] = []
 
     def start(self, profile: str, library: str) -> None:
-        """Write what stands first."""
+        """Write the beginning of the file."""
         self._stream.write(MAGIC + _record(_HEADER, _text(profile), _text(library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -116,19 +117,19 @@ class McapWriter:
             self.end_chunk()
 
     def add_metadata(self, name: str, facts: Mapping[str, str]) -> None:
-        """Write facts under a name; they stand before the chunk that is being filled."""
+        """Write facts under a name, before the chunk that is being filled."""
         record = _record(_METADATA, _text(name), _map(facts))
         place = struct.pack("<QQ", self._stream.tell(), len(record))
         self._metadata_indexes.append(_record(_METADATA_INDEX, place, _text(name)))
         self._stream.write(record)
 
     def flush(self) -> None:
-        """End the chunk, if there is a message in it, and hand everything to the system."""
+        """End the chunk if it has a message, and pass everything to the system."""
         self.end_chunk()
         self._stream.flush()
 
     def finish(self) -> None:
-        """Write the index and what stands last."""
+        """Write the index and the end of the file."""
         self.end_chunk()
         self._stream.write(_record(_DATA_END, bytes(4)))
         start = place = self._stream.tell()

@@ -90,7 +90,7 @@ class RecordedDriver(TaskDriver):
 
         Raises:
             FrameFormatError: there is no picture in it, or there are those of several cameras.
-            FrameSourceError: the path is not there, or no recording of smartcam.
+            FrameSourceError: the path does not exist, or no recording of smartcam.
         """
         first = await asyncio.to_thread(self._first)
         self._camera = first.camera

@@ -14,7 +14,7 @@ from smartcam.recording._folder import FileName, RecordingFolder
 from smartcam.recording._folders.files import Limits
 from smartcam.recording._folders.writer import FolderWriter
 from smartcam.recording._mcap.form import (
-    MAX_NAME,
+    MAX_NAME_CHARACTERS,
     MAX_PICTURE_SIZE_BYTES,
     RecordedPicture,
     captured_at,
@@ -118,7 +118,7 @@ class RotatingRecorder:
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None if all is well."""
         return None if self._writer is None else self._writer.trouble
 
     @property
@@ -140,7 +140,7 @@ class RotatingRecorder:
             ConfigurationError: an argument is wrong.
         """
         check_kind(frame, Frame, "frame", "a Frame", "recordings")
-        camera = check_text(camera, "camera", "recordings", most=MAX_NAME)
+        camera = check_text(camera, "camera", "recordings", most=MAX_NAME_CHARACTERS)
         if self._writer is None:
             return False
         name = camera or file_name(frame.source)
@@ -181,7 +181,7 @@ class RotatingRecorder:
 
 
 def file_name(name: str) -> str:
-    """Return the name that a source has in a recording: small letters, digits and hyphens."""
+    """Return the name that a source has in a recording: lower case letters, digits and hyphens."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
 
 

@@ -12,12 +12,18 @@ from smartcam.recording._judged import PictureMatcher
 from smartcam.recording._mcap.form import RecordedPicture, captured_at
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from smartcam.frames import Frame, FrameSource
     from smartcam.models import Result
     from smartcam.recording._recorder import Recorder
 
 MAX_MATCHED_BYTES: Final = 1 << 26
-"""Bytes of a camera's last pictures that are kept until the result that was made of one comes."""
+"""Largest number of bytes of a camera's last pictures that are kept until the result that was made
+of one comes."""
+
+FIRST_PICTURE_TIMEOUT: Final = 2.0
+"""Seconds until the first picture is there, at most, before the first trigger is sent."""
 
 LAST_PICTURE_TIMEOUT: Final = 2.0
 """Seconds that the picture of a result may come behind it, at most, where the recording ends."""
@@ -36,12 +42,13 @@ class JudgedPictures(Observer):
         self._recorder = recorder
         self._matcher = PictureMatcher(MAX_MATCHED_BYTES)
         self._settled = asyncio.Event()
+        self._streams = asyncio.Event()
 
-    def on_result(self, result: Result) -> None:
-        """Look for the picture of a result."""
+    def on_results(self, results: Sequence[Result]) -> None:
+        """Look for the pictures of results."""
         self._settled.clear()
-        self._matcher.results.append(result)
-        self._settle(result.camera)
+        self._matcher.results += results
+        self._settle(results[0].camera)
 
     async def record(self, source: FrameSource, camera: str) -> None:
         """Record pictures of an open source until it ends.
@@ -53,6 +60,7 @@ class JudgedPictures(Observer):
         """
 
         def take(frame: Frame) -> bool:
+            self._streams.set()
             self._matcher.add_picture(RecordedPicture(camera, captured_at(frame), frame))
             self._settle(camera)
             return True
@@ -62,6 +70,12 @@ class JudgedPictures(Observer):
             await tap.ended()
         finally:
             tap.close()
+
+    async def wait_streaming(self) -> None:
+        """Wait until a picture has come, before which no result can have one; 2 s at most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_PICTURE_TIMEOUT):
+                await self._streams.wait()
 
     async def wait_settled(self) -> None:
         """Wait until each result so far has its picture, or can have none; 2 s at most."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.recording._mcap.form import MAX_CAPTURE_TIME, MAX_NAME, RecordedPicture
+from smartcam.recording._mcap.form import MAX_CAPTURE_TIME, MAX_NAME_CHARACTERS, RecordedPicture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ MAX_SIDE_PX: Final = 1 << 20
 """Pixels along a side of a picture that is written, or read."""
 
 MAX_FIELDS: Final = 1000
-"""Fields of a message that is read; ours have fewer than 30."""
+"""Largest number of fields of a message that is read; ours have fewer than 30."""
 
 RAW: Final = "foxglove.RawImage"
 COMPRESSED: Final = "foxglove.CompressedImage"
@@ -179,8 +179,8 @@ def picture_message(picture: RecordedPicture) -> bytes:
         "sequence": max(0, frame.sequence),
         "lost": frame.lost,
         "left_out": picture.left_out,
-        "source": frame.source[:MAX_NAME],
-        "remark": frame.remark[:MAX_NAME],
+        "source": frame.source[:MAX_NAME_CHARACTERS],
+        "remark": frame.remark[:MAX_NAME_CHARACTERS],
         "result_number": picture.result_number,
         "stride": frame.stride,
         "result_received": received and received.timestamp(),
@@ -292,7 +292,7 @@ def picture_of(schema: str, data: memoryview) -> RecordedPicture:
         received = said.result_received_at()
     except (FrameFormatError, OverflowError, OSError) as exc:
         raise ValueError(f"a picture: {exc!s:.300}") from exc
-    camera = said.text("frame_id", MAX_NAME)
+    camera = said.text("frame_id", MAX_NAME_CHARACTERS)
     made = said.number_of_result(), received
     return RecordedPicture(camera, at, frame, said.whole("left_out"), *made)
 
@@ -318,8 +318,8 @@ def _frame(said: _Values, found: PixelFormat) -> Frame:
         device_time=said.real("device_time") if said.has("device_time") else None,
         sequence=said.whole("sequence"),
         lost=said.whole("lost"),
-        source=said.text("source", MAX_NAME),
-        remark=said.text("remark", MAX_NAME),
+        source=said.text("source", MAX_NAME_CHARACTERS),
+        remark=said.text("remark", MAX_NAME_CHARACTERS),
     )
 
 

@@ -9,7 +9,7 @@ from smartcam._arguments import check_callable, check_integer, check_kind, check
 from smartcam.exceptions import SmartCamError
 from smartcam.frames import FrameSource
 from smartcam.frames._inside import FrameTap
-from smartcam.recording._mcap.form import MAX_NAME
+from smartcam.recording._mcap.form import MAX_NAME_CHARACTERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +47,7 @@ async def record_frames(
     if count is not None:
         count = check_integer(count, "count", 1, 1 << 62, "recording")
     check_callable(on_start, "on_start", "recording")
-    camera = check_text(camera, "camera", "recording", most=MAX_NAME)
+    camera = check_text(camera, "camera", "recording", most=MAX_NAME_CHARACTERS)
     _ = source.format  # it is open
     kept = 0
     refusals: list[SmartCamError] = []

@@ -1,4 +1,4 @@
-"""Pictures as a video: Matroska, in which nothing of them is lost but fractions of milliseconds."""
+"""Write pictures as a Matroska video, which loses only fractions of milliseconds of their times."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.frames import Frame
-    from smartcam.recording._mcap.form import Item
-    from smartcam.recording._recorder import Description
+    from smartcam.recording._recorder import Given
 
 TICK_DURATION: Final = Fraction(1, 1000)
 """Step of a Matroska file's times as FFmpeg writes them, seconds."""
 
 OPTIONS: Final = {"cluster_time_limit": "500", "flush_packets": "1"}
-"""FFmpeg's: a crash costs the cluster that was being filled, half a second."""
+"""Options for FFmpeg, by which a crash loses only the last cluster, half a second."""
 
 
 def check_writable(frame: Frame) -> None:
-    """Raise FrameFormatError where a video cannot hold a frame without loss."""
+    """Raise FrameFormatError if a video cannot hold a frame without loss."""
     if frame.format.name != "MJPEG":
         try:
             to_lossless_video(frame)
@@ -46,7 +45,7 @@ class VideoFile:
     Args:
         stream: the open file, closed at the end.
         path: path of the file.
-        overwrite: take the place of further files that are there.
+        overwrite: whether to replace existing further files.
 
     Attributes:
         paths: the files that were begun so far.
@@ -64,11 +63,11 @@ class VideoFile:
         self._last = -1
 
     def check_picture(self, frame: Frame, camera: str) -> None:
-        """See whether the video can hold a picture.
+        """Check that the video can hold a picture.
 
         Raises:
             ConfigurationError: the video is another camera's.
-            FrameFormatError: something of it would be lost.
+            FrameFormatError: a part of the picture would be lost.
         """
         if not self._camera:
             check_writable(frame)
@@ -80,9 +79,9 @@ class VideoFile:
             )
 
     def start(self) -> None:
-        """Do nothing: what stands first says what the pictures are."""
+        """Do nothing: the first picture decides about the form."""
 
-    def add(self, item: Item | Description, /) -> None:
+    def add(self, item: Given, /) -> None:
         """Write a picture.
 
         Raises:
@@ -101,7 +100,7 @@ class VideoFile:
             raise ValueError(str(exc)) from exc
 
     def flush(self) -> None:
-        """Have what FFmpeg gave put on the disk."""
+        """Write FFmpeg's output to the disk."""
         self._stream.flush()
         os.fsync(self._stream.fileno())
 
@@ -117,7 +116,7 @@ class VideoFile:
         self._stream.flush()
 
     def close(self) -> None:
-        """Close the file; what it does not take any more is dropped."""
+        """Close the file; bytes that it no longer takes are dropped."""
         container, self._container = self._container, None
         if container is not None:
             with contextlib.suppress(OSError, ValueError):
@@ -126,7 +125,7 @@ class VideoFile:
             self._stream.close()
 
     def _begin(self, picture: RecordedPicture, form: tuple[str, int, int]) -> None:
-        """Begin a video for pictures of a form, in a further file where there is one already."""
+        """Begin a video for pictures of a form, in a further file if there is one already."""
         frame = picture.frame
         if self._form is not None:
             self.finish()
@@ -147,7 +146,7 @@ class VideoFile:
         video.time_base = TICK_DURATION
         video.codec_context.time_base = TICK_DURATION
         if jpeg:
-            video.pix_fmt = "yuvj420p"  # nothing is encoded: the JPEGs say it themselves
+            video.pix_fmt = "yuvj420p"  # nothing is encoded: the JPEGs have these values themselves
         else:
             video.pix_fmt = to_lossless_video(frame).format.name
             video.codec_context.color_range, video.codec_context.colorspace = colour_properties(

@@ -20,7 +20,7 @@ from smartcam.observers import TraceEntry
 from smartcam.protocols import LineDialect
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import load_protocol
-from smartcam.recording._replays.schedule import MAX_REPLAY
+from smartcam.recording._replays.schedule import MAX_REPLAY_BYTES
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
@@ -135,11 +135,11 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
     """Work out what each line got: what came behind it, or what names it as its question.
 
     Raises:
-        RecordingError: the recording is more than :data:`MAX_REPLAY`.
+        RecordingError: the recording is more than :data:`MAX_REPLAY_BYTES`.
     """
     plan = LinesPlan()
     now, place, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0
-    known: dict[str, _AskedLine] = {}  # by what answers are known by
+    known: dict[str, _AskedLine] = {}  # lines by the key that identifies their answers
     lines: list[_AskedLine] = []
     for number, item in enumerate(items):
         if isinstance(item, Disconnected):
@@ -150,8 +150,10 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
             continue
         at, data = item.at.timestamp(), bytes.fromhex(item.hex)
         size += len(data)
-        if size > MAX_REPLAY:
-            raise RecordingError(f"recording: {size} bytes of lines, expected {MAX_REPLAY} at most")
+        if size > MAX_REPLAY_BYTES:
+            raise RecordingError(
+                f"recording: {size} bytes of lines, expected {MAX_REPLAY_BYTES} at most"
+            )
         if item.direction == "<":
             answered = known.get(codec.answer_key(data), now)
             answered.at = answered.at or at  # nobody asked for a greeting
@@ -288,14 +290,14 @@ class ReplayedLines(LineCamera):
                 return {}
             found[of_result[result.number]] = answer
             size += len(answer)
-            if size > MAX_REPLAY:
+            if size > MAX_REPLAY_BYTES:
                 raise RecordingError(
-                    f"recording: {size} bytes of pictures, expected {MAX_REPLAY} at most"
+                    f"recording: {size} bytes of pictures, expected {MAX_REPLAY_BYTES} at most"
                 )
         return found
 
     def _image_for(self, line: str) -> bytes | None:
-        """Return the picture of the last trigger; None where no picture is asked for, or known."""
+        """Return the picture of the last trigger; None if no picture is asked for, or known."""
         row = self.lines.row_of(line)
         if self.lines.message_type(m.Sender.CLIENT, row) is not m.ReadImage:
             return None

@@ -1,8 +1,8 @@
-"""The pictures of recorded results, each shown when a replay gives its result again.
+"""Show the pictures of recorded results, each when a replay sends its result again.
 
-A smart camera whose wire has no pictures, such as a BVS camera, shows them beside it: as the frames
-of the camera at an agent. A result is known by its application and its bytes; where results with
-the same bytes cannot be told apart, they have no picture.
+A smart camera whose protocol has no pictures, such as a BVS camera, shows them separately, as the
+frames of the camera at an agent. A result is identified by its application and its bytes; if
+results with the same bytes cannot be distinguished, they have no picture.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
 from smartcam.frames._inside import changed
-from smartcam.recording._replays.schedule import MAX_REPLAY
+from smartcam.recording._replays.schedule import MAX_REPLAY_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,14 +40,14 @@ class ReplayedPictures:
     Args:
         recording: recording that is played.
         camera: name of the camera in it.
-        applications: plan of what is played, by application.
+        applications: planned results, by application.
         speed: factor by which it is played faster than recorded.
 
     Attributes:
         name: name of the camera.
-        shown: picture of the last result that was given; None before the first, and where it has
-            none.
-        first: first picture that there is; None: there is none.
+        shown: picture of the last result that was sent; None before the first, or if it has no
+            picture.
+        first: first picture of the recording; None without one.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class ReplayedPictures:
         self._began = time.monotonic()
 
     def given(self, application: int, data: bytes) -> None:
-        """Show the picture of a result that is given now."""
+        """Show the picture of a result that is sent now."""
         key = application, data
         pictures = self._pictures.get(key)
         found = None
@@ -94,18 +94,20 @@ class ReplayedPictures:
 def _told_apart(
     recording: Recording, camera: str, applications: Mapping[int, TakeList]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
-    """Return the pictures of results with the same bytes, in order, where that is their order."""
+    """Return the pictures of results with the same bytes, if their order is certain."""
     found: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
     size = 0
     for result, picture, _ in recording.judged(camera):
         some = found.setdefault((result.application, result.raw), [])
         size += 0 if picture is None else memoryview(picture.data).nbytes
-        if picture is None or size > MAX_REPLAY:
+        if picture is None or size > MAX_REPLAY_BYTES:
             some.append(None)
         else:
             some.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
-    if size > MAX_REPLAY:
-        _log.warning("%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY)
+    if size > MAX_REPLAY_BYTES:
+        _log.warning(
+            "%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
+        )
     counts = _in_one_order(applications)
     return {key: some for key, some in found.items() if counts.get(key) == len(some)}
 
@@ -125,7 +127,7 @@ def _in_one_order(applications: Mapping[int, TakeList]) -> dict[tuple[int, bytes
 
 
 class _ResultPictures(FrameDriver):
-    """Gives the picture of each result that a replay gives, after that of the last one."""
+    """Delivers the picture of each result that a replay sends, beginning with the last one."""
 
     times_frames: ClassVar[bool] = True
 
@@ -151,18 +153,18 @@ class _ResultPictures(FrameDriver):
         return StreamFormat(first.format, first.width, first.height)
 
     async def start(self, sink: FrameSink) -> None:
-        """Give the picture of the last result, and those of the next ones."""
+        """Deliver the picture of the last result, and those of the next ones."""
         self._sink = sink
         self._pictures.sinks.add(sink)
         if self._pictures.shown is not None:
             sink.frame(self._pictures.shown)
 
     async def stop(self) -> None:
-        """Give nothing more."""
+        """Stop delivering."""
         if self._sink is not None:
             self._pictures.sinks.discard(self._sink)
             self._sink = None
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()

@@ -68,7 +68,7 @@ class _Takes:
 
     @property
     def head(self) -> Take | None:
-        """The next one; None where there is none any more."""
+        """The next one; None if there is none any more."""
         return self._takes[self._next] if self._next < len(self._takes) else None
 
     @property
@@ -88,8 +88,8 @@ class _Takes:
 class _Numbers(NamedTuple):
     """The place of the sequence number in a container."""
 
-    field: Field  # of the layout
-    offset: int  # of its first byte
+    field: Field  # field of the layout
+    offset: int  # offset of its first byte
 
     def put(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
         """Return a container with another number; one that has none as it is."""
@@ -107,19 +107,19 @@ class _Numbers(NamedTuple):
 class _Track:
     """The parts of a replay that belong to one application."""
 
-    waits: bool  # it waits for triggers
+    waits: bool  # whether the camera waits for triggers
     triggered: _Takes  # takes for triggers
     unasked: _Takes  # takes that come by themselves
     current: Take | None = None  # the take of the inspection under way
-    # its further containers, still to be sent
+    # further containers, still to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
-    # how to give containers the client's numbers; None: they keep their own
+    # numbering of containers by the client's numbers; None: they keep their own
     numbers: _Numbers | None = None
     # is told each container that is given, as it was recorded
     told: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
-        """End the inspection: return its container; None where it sends nothing."""
+        """End the inspection: return its container; None if it sends nothing."""
         take, self.current = self.current, None
         if take is None or not take.containers:
             return None
@@ -249,7 +249,7 @@ class ReplayedCamera(EmulatedCamera):
         self._reference = 0.0  # the next unasked take is counted from here
         self._alarm: TimerHandle | None = None
         self._due = False  # an unasked take is to begin as soon as it can
-        self._round: float | None = None  # when the present round of conditions began
+        self._round: float | None = None  # time at which the present round of conditions began
         self._changed = 0  # changes of conditions in it
         self._change_alarm: TimerHandle | None = None
         self._pictures: ReplayedPictures | None = None
@@ -416,7 +416,7 @@ class ReplayedCamera(EmulatedCamera):
 
 
 def _numbers(interpret_as: str | None) -> _Numbers | None:
-    """Return the offset of the sequence number; None where it is not told, or nowhere."""
+    """Return the offset of the sequence number; None if it is not told, or nowhere."""
     try:
         layout = None if interpret_as is None else resolve(interpret_as).layout
     except ConfigurationError:  # a plug-in's that is not there, or a mapping

@@ -44,16 +44,18 @@ MAX_TIME_BEHIND_FIRST = 0.1
 """Seconds behind its first container in which an inspection's others come, where the camera says
 all the time that it waits for a trigger."""
 
-MAX_REPLAY = 1 << 30
-"""Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
+MAX_REPLAY_BYTES = 1 << 30
+"""Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
+per second."""
 
 
 @dataclass(slots=True)
 class Take:
     """One inspection."""
 
-    containers: list[bytes]  # what it sent, in order; nothing where the trigger had no result
-    seconds: float  # from its begin to its first container, or to its end where it sent nothing
+    # containers that the camera sent, in order; empty if the trigger had no result
+    containers: list[bytes]
+    seconds: float  # seconds from its beginning to its first container, or to its end without one
     # seconds from the end of the one before, or from the begin of the run, to its begin; only where
     # nobody had triggered it
     gap: float = 0.0
@@ -67,8 +69,8 @@ class TakeList:
     application: int
     triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
     unasked: list[Take] = field(default_factory=list[Take])  # the others
-    waits: bool = True  # it waits for triggers; otherwise it runs free
-    load_time: float | None = None  # seconds that a switch to it took; None where none was recorded
+    waits: bool = True  # whether it waits for triggers; otherwise it runs free
+    load_time: float | None = None  # seconds that a switch to it took; None if none was recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +87,14 @@ class ReplayPlan:
     """Everything that a replay needs to know."""
 
     dialect: str
-    quirks: tuple[str, ...]  # its deviations
+    quirks: tuple[str, ...]  # deviations from the dialect
     transport: Literal["tcp", "udp"]
-    applications: Mapping[int, TakeList]  # what each gave, by id; never empty
+    applications: Mapping[int, TakeList]  # takes of each application, by id; never empty
     active: int  # id of the one that gave the first container
     running: bool  # whether the camera ran
     endian: int  # the status message's endian field
-    conditions: Status  # those that were set at first
-    changes: tuple[Change, ...]  # of conditions afterwards, in order
+    conditions: Status  # conditions at first
+    changes: tuple[Change, ...]  # later changes of conditions, in order
     seconds: float  # length of the recording from its first session on
 
 
@@ -100,9 +102,8 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     """Work out how to play a camera of a recording, by default the only one in it.
 
     Raises:
-        ConfigurationError: no such camera, it had no session, or it cannot be
-                emulated.
-        RecordingError: its containers are more than :data:`MAX_REPLAY`.
+        ConfigurationError: there is no such camera, it had no session, or it cannot be emulated.
+        RecordingError: its containers are more than :data:`MAX_REPLAY_BYTES`.
     """
     known = recording.camera(camera)
     dialect, transport = _spoken(recording, known)
@@ -201,12 +202,12 @@ class _What(enum.Enum):
 class _ReplayStep(NamedTuple):
     """The meaning of a frame, or of the end of a link, for a replay."""
 
-    at: float  # when, seconds since 1970
+    at: float  # time, seconds since 1970
     what: _What
     number: int = 0  # an application's id, or the endian field
-    bits: Status = Status(0)  # of a status
-    data: bytes = b""  # of a container
-    # what the record says, seconds since 1970, where ``at`` may be later: times never go back
+    bits: Status = Status(0)  # bits of a status
+    data: bytes = b""  # bytes of a container
+    # time in the record, seconds since 1970; ``at`` may be later, since times never go back
     told_at: float | None = None
 
 
@@ -290,10 +291,10 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
             continue
         step = step._replace(told_at=item.at.timestamp())
         size += len(step.data)
-        if size > MAX_REPLAY:
+        if size > MAX_REPLAY_BYTES:
             raise RecordingError(
-                f"recording: {size} bytes of containers until {item.at}, expected {MAX_REPLAY} at "
-                "most for a replay"
+                f"recording: {size} bytes of containers until {item.at}, expected "
+                f"{MAX_REPLAY_BYTES} at most for a replay"
             )
         if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
             step = step._replace(number=active)  # a quirk: it does not say whose it is
@@ -339,10 +340,10 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
                 steps.append(_ReplayStep(at, _What.CONTAINER, item.application, data=item.raw))
             case _:
                 pass
-        if size > MAX_REPLAY:
+        if size > MAX_REPLAY_BYTES:
             raise RecordingError(
-                f"recording: {size} bytes of containers until {at:.0f}, expected {MAX_REPLAY} at "
-                "most for a replay"
+                f"recording: {size} bytes of containers until {at:.0f}, expected "
+                f"{MAX_REPLAY_BYTES} at most for a replay"
             )
     return _on_one_clock(steps)
 
@@ -394,7 +395,7 @@ def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
 
 
 def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
-    """Return the step that a frame means; None where it does not matter."""
+    """Return the step that a frame means; None if it does not matter."""
     key, fields = (entry.direction, entry.message), entry.fields
     if key in _PLAIN:
         return _ReplayStep(at, _PLAIN[key])
@@ -442,22 +443,23 @@ class _ScheduleMaker:
     """Follows a recording, step by step."""
 
     def __init__(self, free: set[int]) -> None:
-        self.lists: dict[int, TakeList] = {}  # what came so far, by application
-        self.began: float | None = None  # when the first session began, seconds; None before
+        self.lists: dict[int, TakeList] = {}  # takes so far, by application
+        # time at which the first session began, seconds; None before
+        self.began: float | None = None
         self.now: float = 0.0  # time of the last step, seconds
         self.first: int | None = None  # application of the first container; None before
         self.ran_at_first: bool = False  # the first status said Running
-        self.endian: int = 0  # of the last status before the first container
-        self.conditions: Status = Status(0)  # those of the first status
-        self.changes: list[Change] = []  # of conditions so far
+        self.endian: int = 0  # byte order of the last status before the first container
+        self.conditions: Status = Status(0)  # conditions of the first status
+        self.changes: list[Change] = []  # changes of conditions so far
         self._free = free  # applications that run free
         self._active: int | None = None
-        self._status: Status | None = None  # in this session
-        self._last: Status | None = None  # of all sessions
+        self._status: Status | None = None  # last status in this session
+        self._last: Status | None = None  # last status of all sessions
         self._triggers: list[float] = []  # without a container so far
         self._drops = 0  # triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # when Waiting for Trigger rose, and fell
-        self._open: Take | None = None  # its inspection may send more
+        self._open: Take | None = None  # take whose inspection may send more
         self._opened = 0.0  # when it sent its first container
         self._began_unasked: float | None = None  # an inspection that nobody had triggered
         self._reference = 0.0  # the next unasked one is counted from here

@@ -1,4 +1,4 @@
-"""The thesis' five calibration services at a camera's node: a face of them in messages."""
+"""The thesis' five calibration services at a camera's node: in messages."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ OWN_FRAMES = 20.0
 def calibrations_of(
     given: ThesisCalibration | str | os.PathLike[str] | None, camera: str
 ) -> ThesisCalibration | None:
-    """Return the calibrations of a camera, made where a folder is given.
+    """Return the calibrations of a camera, created if a folder is given.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
     if not isinstance(given, str | os.PathLike):
         return given
@@ -46,7 +46,7 @@ def calibrations_of(
 
 
 class RosCalibrationCamera:
-    """A node's camera as it is calibrated: what it sees is read without a calibration.
+    """A node's camera during calibration, whose results are read without a calibration.
 
     Args:
         camera: the camera.
@@ -83,7 +83,7 @@ class RosCalibrationFace:
 
     Args:
         camera: the camera.
-        calibrations: calibrations of the camera; None where there is no folder for them.
+        calibrations: calibrations of the camera; None if there is no folder for them.
     """
 
     def __init__(self, camera: Camera[Any], calibrations: ThesisCalibration | None) -> None:
@@ -96,10 +96,10 @@ class RosCalibrationFace:
         return RosCalibrationCamera(self._camera)
 
     async def answer(self, name: str, message: Any) -> dict[str, Any]:
-        """Do what a request asks for; return the fields of its answer.
+        """Carry out a request; return the fields of its answer.
 
         Raises:
-            SmartCamError: as the service ends.
+            SmartCamError: the service failed.
         """
         service = CALIBRATION[name]
         names = [one for one in service.request.model_fields if hasattr(message, one)]
@@ -112,7 +112,7 @@ class RosCalibrationFace:
 
 
 def _plain(value: Any) -> Any:
-    """Return a field of a message as a request has it."""
+    """Convert a field of a message to that of a request."""
     if hasattr(value, "frame_id"):
         return {"stamp": utc_of(value), "frame_id": value.frame_id}
     if hasattr(value, "tolist"):
@@ -125,8 +125,5 @@ def _stamped(pose: Pose) -> dict[str, Any]:
     stamp: datetime = pose.header.stamp
     return {
         "header": {"stamp": stamp_fields(stamp.timestamp()), "frame_id": pose.header.frame_id},
-        "pose": {
-            "position": pose.position._asdict(),
-            "orientation": pose.orientation._asdict(),
-        },
+        "pose": {"position": pose.position._asdict(), "orientation": pose.orientation._asdict()},
     }

@@ -31,7 +31,7 @@ DISPARITY_STEP: Final = 1 / 16
 
 
 LARGEST_VALUE: Final = 65534.0
-"""Steps of a compressed depth from the farthest, which is 1, to the nearest."""
+"""Largest number of steps of a compressed depth from the farthest, which is 1, to the nearest."""
 
 MIN_DEPTH_RANGE: Final = 1.001
 """Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""
@@ -227,12 +227,7 @@ def _column(message: Any, field: Any, kinds: str) -> NDArray[Any]:
             f"{field.count} of type {field.datatype}"
         )
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{name}")
-    height, width, step, row = (
-        message.height,
-        message.width,
-        message.point_step,
-        message.row_step,
-    )
+    height, width, step, row = (message.height, message.width, message.point_step, message.row_step)
     data = memoryview(message.data).cast("B")
     last = field.offset + dtype.itemsize
     wanted = row * (height - 1) + step * (width - 1) + last

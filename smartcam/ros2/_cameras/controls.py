@@ -1,7 +1,7 @@
 """Set the device of a camera's frames by parameters of the camera's node.
 
 The controls of a V4L2 device have the names and types that v4l2_camera gives them; the features of
-any other device have their own names, in small letters with underscores.
+any other device have their own names, in lower case with underscores.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class CameraControls:
 
 
 def _snake_case(name: str) -> str:
-    """Return a name in small letters with underscores: ``ExposureTime`` as ``exposure_time``."""
+    """Return a name in lower case with underscores: ``ExposureTime`` as ``exposure_time``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 

@@ -1,6 +1,6 @@
 """Tell a camera's health to ROS: its status, and its diagnostics.
 
-A node says it of a camera that it has, a bag of one that a recorder was told of.
+A node reports it for its camera, a bag for a recorded camera.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Characters of an error in a message; what is longer is cut."""
+"""Largest number of characters of an error in a message; what is longer is cut."""
 
 OK, WARN, ERROR, STALE = range(4)
-"""Levels, as ``diagnostic_msgs/msg/DiagnosticStatus`` has them."""
+"""Levels of ``diagnostic_msgs/msg/DiagnosticStatus``."""
 
 TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.SYSTEM_ERROR: (ERROR, "System Error: the camera needs a reboot at least"),
@@ -33,7 +33,7 @@ TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.INPUT_CONTAINER: (WARN, "Input Container: input data and inspections are out of step"),
     Status.OVERTRIGGERED: (WARN, "Overtriggered: a trigger was dropped"),
 }
-"""Bits of the status that are errors, the worst first: how bad, and in words."""
+"""Bits of the status that are errors, the worst first: level and words."""
 
 
 class KnownState(NamedTuple):
@@ -42,9 +42,9 @@ class KnownState(NamedTuple):
     Attributes:
         name: the camera's name.
         connected: whether there is a session with the camera.
-        status: status that the camera told in this session; None where it has told none.
-        application: the id of the active application; None where that is not known.
-        why: reason why there is no session; empty where nobody has tried to have one.
+        status: status that the camera sent in this session; None if it sent none.
+        application: the id of the active application; None if that is not known.
+        why: reason why there is no session; empty before the first attempt.
     """
 
     name: str
@@ -66,7 +66,7 @@ class KnownState(NamedTuple):
 
     @property
     def bits(self) -> Status:
-        """The status of the present session; no bit where none was told."""
+        """The status of the present session; no bits if none was sent."""
         return self.status if self.connected and self.status is not None else Status(0)
 
 
@@ -113,7 +113,7 @@ def status_fields(known: KnownState) -> dict[str, Any]:
         "ready": connected and Status.RUNNING in status and not bad,
         "busy": Status.BUSY in status,
         "running": Status.RUNNING in status,
-        "application_id": max(0, application or 0),  # -1 where a camera does not say it
+        "application_id": max(0, application or 0),  # -1 if a camera does not report it
         "status": status.value,
         "status_names": list(status.names),
         "error": utf8(how.text) if how.errors or not connected else "",
@@ -136,7 +136,7 @@ def diagnostic_fields(
 
 
 def hardware_id(address: Address) -> str:
-    """Return the hardware id of a camera for diagnostics: its place, without a password."""
+    """Return the hardware id of a camera for diagnostics: its address, without a password."""
     path = f"/{address.path}" if address.path else ""
     return f"{address.host}:{address.port}{path}"
 

@@ -313,7 +313,7 @@ def pixels_from(message: Any) -> NDArray[Any]:
         of Y, U and V; a view, in this machine's byte order where that differs.
 
     Raises:
-        FrameFormatError: no such encoding, or fewer bytes than the size asks for.
+        FrameFormatError: there is no such encoding, or fewer bytes than the size asks for.
     """
     kind, channels = _samples(message.encoding)
     order = ">" if message.is_bigendian else "<"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from smartcam.calibration._inside import MAX_FILE, parse_camera_info
+from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info
 from smartcam.calibration.formats import write_camera_info
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
 from smartcam.ros2._cameras.image_messages import header_fields
@@ -145,9 +145,11 @@ class CameraLens:
 
 def _read(path: Path) -> CameraInfo:
     with path.open("rb") as file:
-        said = file.read(MAX_FILE + 1)
-    if len(said) > MAX_FILE:
-        raise ConfigurationError(f"{path}: expected a camera_info of {MAX_FILE} bytes at most")
+        said = file.read(MAX_FILE_BYTES + 1)
+    if len(said) > MAX_FILE_BYTES:
+        raise ConfigurationError(
+            f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most"
+        )
     try:
         return parse_camera_info(said.decode())
     except UnicodeDecodeError as exc:

@@ -53,7 +53,7 @@ def lens_from(message: Any) -> CameraInfo | None:
     """Return the lens of a ``sensor_msgs/CameraInfo``, its rectification and projection.
 
     Returns:
-        None where it was not calibrated.
+        None if it was not calibrated.
 
     Raises:
         RosMessageError: the lens is of a model that smartcam does not have, binned or of a region.

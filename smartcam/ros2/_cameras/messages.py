@@ -31,7 +31,7 @@ RESULT: Final = "smartcam_msgs/msg/Result"
 LOCALIZATION: Final = "smartcam_msgs/msg/Localization"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Characters of an error in a message."""
+"""Largest number of characters of an error in a message."""
 
 
 def error_text(error: BaseException) -> str:
@@ -181,8 +181,8 @@ class ResultMessages:
 
         Args:
             result: result to send.
-            parts: localizations of the result, in metres; None where the result has none of that
-                kind: the message has the value as JSON then.
+            parts: localizations of the result, in metres; None if the result has none of that kind:
+                the message has the value as JSON then.
         """
         try:
             frame_id = self.frame_of(result)

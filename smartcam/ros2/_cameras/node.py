@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import inspect
 import logging
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from smartcam._server import Server
-from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._cameras.calibrations import calibrations_of
 from smartcam.ros2._cameras.controls import CameraControls
 from smartcam.ros2._cameras.lifecycle import CameraLifecycle
+from smartcam.ros2._cameras.options import CameraNodeOptions
 from smartcam.ros2._cameras.parameters import CameraParameters
 from smartcam.ros2._cameras.pictures import CameraPictures
 from smartcam.ros2._cameras.results import CameraResults
@@ -24,16 +23,11 @@ from smartcam.ros2._cameras.transforms import CameraFrames, StaticTransforms
 from smartcam.ros2._node.rosout import RosOut
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
-    from smartcam.calibration import HandEyeCalibration
     from smartcam.calibration._inside import ThesisCalibration
     from smartcam.camera import Camera
-    from smartcam.frames import FrameSource
-    from smartcam.geometry import Transform
     from smartcam.ros2._node.interface import NodeOfRos
-    from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -48,61 +42,6 @@ class CameraPart(Protocol):
     async def close(self) -> None:
         """End the part, within seconds; also where starting it failed."""
         ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraNodeOptions:
-    """The options of a camera's node.
-
-    Attributes:
-        frame_id: name of the camera's frame; empty for the camera's name.
-        parent_frame: name of the robot's frame; empty: as a calibration calls it.
-        flange_frame: name of the frame of the part of the robot that carries the camera; empty: as
-            a calibration calls it.
-        place: hand-eye calibration, which says where the camera is; None without.
-        calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
-            calibration of the camera's settings was made; None where the camera stands still.
-        autostart: whether the life cycle goes to Active by itself.
-        application: id of the application to have running and ready once configured; None: that
-            of the camera's settings.
-        diagnostics_period: seconds between two diagnostics.
-        status_rate: most messages of status a second.
-        hardware_id: id of the hardware in diagnostics; empty for the camera's address.
-        settings: what the session with the camera is told, where that is not what the camera's own
-            settings say: the agent's, of a camera of a fleet.
-        heard: whether there is any sign of the agent that has the session; None where
-            nobody is between.
-        frames: parameters that say where its frames come from, by v4l2_camera's names:
-            ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
-        controls: function that returns the open source of the frames, whose device's controls
-            become parameters; None: there are none.
-        calibrations: folder that calibrations of the camera are written to, or the calibrations
-            that other faces of the camera have, too; None: the services for them refuse.
-    """
-
-    frame_id: str = ""
-    parent_frame: str = ""
-    flange_frame: str = ""
-    place: HandEyeCalibration | None = None
-    calibrated_at: Transform | None = None
-    autostart: bool = True
-    application: int | None = None
-    diagnostics_period: float = 1.0
-    status_rate: float = 20.0
-    hardware_id: str = ""
-    settings: CameraSettings | None = None
-    heard: Callable[[], bool] | None = None
-    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    controls: Callable[[], Awaitable[FrameSource]] | None = None
-    calibrations: str | os.PathLike[str] | ThesisCalibration | None = None
-
-    def __post_init__(self) -> None:
-        for name, value in (
-            ("diagnostics_period", self.diagnostics_period),
-            ("status_rate", self.status_rate),
-        ):
-            if not 0.01 <= value <= 3600:
-                raise ConfigurationError(f"{name}: {value!r}: expected 0.01 to 3600")
 
 
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
@@ -144,7 +83,7 @@ class CameraNode(Server):
         status: publisher of the camera's status and diagnostics.
         results: publisher of the camera's results.
         services: services by which other nodes use the camera.
-        calibrations: the camera's calibrations; None where there is no folder for them.
+        calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
     def __init__(
@@ -198,7 +137,7 @@ class CameraNode(Server):
         )
 
     def controls(self) -> CameraControls | None:
-        """Return the parameters of the frames' device; None where there are none."""
+        """Return the parameters of the frames' device; None if there are none."""
         source = self.options.controls
         if self.node.parameters is None or source is None:
             return None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.camera import Camera
-    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.options import CameraNodeOptions
     from smartcam.ros2._cameras.status import CameraStatus
     from smartcam.settings import CameraSettings
 
@@ -97,7 +97,7 @@ class CameraParameters:
     def of(
         cls, camera: Camera[Any], node: Any, options: CameraNodeOptions, status: CameraStatus
     ) -> CameraParameters | None:
-        """Return the parameters of a camera; None where the node has no parameters."""
+        """Return the parameters of a camera; None if the node has no parameters."""
         if getattr(node, "parameters", None) is None:
             return None
         return cls(camera, node, options, status)

@@ -46,7 +46,7 @@ class CameraPictures:
     when it was captured. A slow subscriber gets the newest, and holds up nobody.
 
     Args:
-        camera: the camera; None where ``frames`` is all there is.
+        camera: the camera; None if ``frames`` is all there is.
         node: open node of ROS.
         frames: an open source of its pictures, which stays the caller's; None: the camera's own
             :meth:`~smartcam.Camera.frames`, where it has some.

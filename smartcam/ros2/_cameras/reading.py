@@ -38,7 +38,7 @@ def calibration_of(given: Any, application: int) -> Any:
 
 
 def frame_of_robot(calibration: Any) -> str:
-    """Return the frame that a calibration says its poses are in; empty where it says none."""
+    """Return the frame that a calibration says its poses are in; empty if it says none."""
     named = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
     return named if isinstance(named, str) else ""
 
@@ -51,7 +51,7 @@ def calibrated(camera: Camera[Any], application: int) -> bool:
 def localizations_in_metres(
     camera: Camera[Any], result: Result[Any], spec: str | None = None
 ) -> list[Localization] | None:
-    """Return a result's localizations; None where it has none, or has them in pixels.
+    """Return a result's localizations; None if it has none, or has them in pixels.
 
     Args:
         camera: the camera.

@@ -30,10 +30,10 @@ TOPICS: Final = {"results": RESULT, "localizations": POSES, "detections": DETECT
 """Names, private to the node, and types."""
 
 MAX_QUEUED_BYTES: Final = 1 << 24
-"""Bytes of the containers whose results wait for a topic with a delay."""
+"""Largest number of bytes of the containers whose results wait for a topic with a delay."""
 
 MAX_WAITING_RESULTS: Final = 4096
-"""Results that wait to be published; the oldest beyond is dropped, counted."""
+"""Largest number of results that wait to be published; the oldest beyond is dropped, counted."""
 
 
 class CameraResults:
@@ -61,12 +61,7 @@ class CameraResults:
     """
 
     def __init__(
-        self,
-        camera: Camera[Any],
-        node: Any,
-        *,
-        frame_id: str | None = None,
-        robot_frame: str = "",
+        self, camera: Camera[Any], node: Any, *, frame_id: str | None = None, robot_frame: str = ""
     ) -> None:
         self.active: bool = True
         self.taken: int = 0

@@ -38,7 +38,7 @@ class CameraGraph:
 
     Args:
         node: open node of ROS.
-        calibrations: the calibrations; None where there are none.
+        calibrations: the calibrations; None if there are none.
         owned: whether the calibrations end with the node, since no other face has them.
     """
 
@@ -61,7 +61,7 @@ class CameraGraph:
         await self._transforms.close()
 
     def check_topic(self, topic: str) -> None:
-        """Raise ConfigurationError where there can be no such topic."""
+        """Raise ConfigurationError if there can be no such topic."""
         self._full(topic)
 
     def listen(self) -> None:
@@ -105,7 +105,7 @@ class CameraGraph:
     async def lens(self, topic: str) -> CameraModel | None:
         """Return the lens that ``camera_info`` beside a topic with pictures tells.
 
-        None where nobody says it within :data:`LENS_WAIT`, or the lens was not calibrated.
+        None if nobody says it within :data:`LENS_WAIT`, or the lens was not calibrated.
 
         Raises:
             RosMessageError, CalibrationError: the message is no lens, or one that smartcam has no

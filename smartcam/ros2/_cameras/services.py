@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_RESULTS: Final = 1000
-"""Results that one answer brings."""
+"""Largest number of results that one answer brings."""
 
 MAX_INPUT_BYTES: Final = 1 << 16
 MAX_LAYOUT_CHARACTERS: Final = 10_000
@@ -51,7 +51,7 @@ class CameraServices:
         node: the camera's node.
         results: the results that the node publishes.
         life: the node's life cycle.
-        calibrations: the camera's calibrations; None where there is no folder for them.
+        calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
     def __init__(

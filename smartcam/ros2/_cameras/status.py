@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from smartcam.camera import Camera
-    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.options import CameraNodeOptions
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_EVENTS = 64
-"""Events that wait; what counts is the state after them."""
+"""Largest number of events that wait; what counts is the state after them."""
 
 RISING: Mapping[str, str] = {
     "dropped": "results were dropped: a subscriber is too slow",
@@ -68,11 +68,7 @@ class CameraStatus:
     """
 
     def __init__(
-        self,
-        camera: Camera[Any],
-        node: Any,
-        options: CameraNodeOptions,
-        state: Callable[[], str],
+        self, camera: Camera[Any], node: Any, options: CameraNodeOptions, state: Callable[[], str]
     ) -> None:
         self._camera, self._node, self._options, self._state = camera, node, options, state
         self.period: float = options.diagnostics_period

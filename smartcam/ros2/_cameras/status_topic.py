@@ -22,7 +22,7 @@ MIN_INTERVAL: Final = 0.05
 """Seconds between two messages."""
 
 MAX_WAITING_EVENTS: Final = 64
-"""Events that may wait; only the state after them is published."""
+"""Largest number of events that may wait; only the state after them is published."""
 
 
 class CameraStatusTopic:

@@ -81,7 +81,7 @@ class RosThesisFace:
 
     @property
     def application(self) -> int | None:
-        """The id of the active application; None where that is not known."""
+        """The id of the active application; None if that is not known."""
         return self._camera.active_application
 
     @property
@@ -90,7 +90,7 @@ class RosThesisFace:
         return reading_of(self._camera)
 
     def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError where results cannot be read by ``spec``."""
+        """Raise ConfigurationError if results cannot be read by ``spec``."""
         self._camera._interpretation(spec)  # noqa: SLF001 - smartcam's own
 
     def read_as(self, spec: str | None) -> None:
@@ -102,7 +102,7 @@ class RosThesisFace:
         return calibrated(self._camera, application)
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError where there can be no such topic."""
+        """Raise ConfigurationError if there can be no such topic."""
         self._status.resolve(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:

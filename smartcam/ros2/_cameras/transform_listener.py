@@ -50,13 +50,13 @@ MAX_BACK: Final = 10.0
 """Seconds that a stamp may be behind the newest one; beyond, the clock was set back."""
 
 MAX_FRAMES: Final = 2000
-"""Frames that are known at a time; others are left out, which the log tells."""
+"""Largest number of frames that are known at a time; others are left out, which the log tells."""
 
 MAX_MOMENTS: Final = 300
 """Transforms of one frame that are kept; the oldest goes first."""
 
 MAX_NAMED: Final = 20
-"""Frames that the text of an error names."""
+"""Largest number of frames that the text of an error names."""
 
 Found = TypeVar("Found")
 
@@ -96,7 +96,7 @@ class _FrameLink:
             self.came = time.monotonic()
 
     def check_new(self) -> None:
-        """Raise (BAD_TIME) where the newest transform is old."""
+        """Raise BAD_TIME if the newest transform is old."""
         silent, behind = time.monotonic() - self.came, time.time() - self.times[-1]
         if silent > MAX_AGE or abs(behind) > MAX_AGE:
             way = "behind" if behind > 0 else "ahead of"

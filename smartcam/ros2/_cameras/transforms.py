@@ -39,8 +39,8 @@ class CameraFrames:
         parent: name of the robot's frame; empty: as a calibration calls it.
         flange: name of the frame of the part of the robot that carries the camera; empty: as a
             calibration calls it.
-        calibrated_at: pose of that part in the robot's frame when ``calibration`` was made; None
-            where the camera stands still.
+        calibrated_at: pose of that part in the robot's frame when ``calibration`` was made; None if
+            the camera stands still.
 
     Attributes:
         optical: name of the frame of the camera's pictures, z ahead and y down.

@@ -43,7 +43,7 @@ def distribution() -> str:
 
 @functools.cache
 def class_of(name: str) -> Any:
-    """Return the class that rclpy has for a message or a service; None where there is none.
+    """Return the class that rclpy has for a message or a service; None if there is none.
 
     Args:
         name: name of the type, such as ``std_msgs/msg/String``.
@@ -60,7 +60,7 @@ def class_of(name: str) -> Any:
 
 
 def checked_message(kind: MessageType) -> Any:
-    """Return the class that rclpy has for a type of message; None where there is none.
+    """Return the class that rclpy has for a type of message; None if there is none.
 
     Raises:
         ConfigurationError: its fields are others than those that smartcam knows.
@@ -72,7 +72,7 @@ def checked_message(kind: MessageType) -> Any:
 
 
 def checked_service(kind: ServiceType) -> Any:
-    """Return the class that rclpy has for a type of service; None where there is none.
+    """Return the class that rclpy has for a type of service; None if there is none.
 
     Raises:
         ConfigurationError: its fields are others than those that smartcam knows.

@@ -1,4 +1,4 @@
-"""A node of ROS 2 in asyncio, through the rclpy that is installed."""
+"""A node of ROS 2 in asyncio, through the installed rclpy."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OPEN_TIMEOUT = 60.0
 """Seconds for rclpy to make a node; a busy machine takes long to import rclpy for the first one."""
 
 TELL_MISSING_AFTER = 1.0
-"""Seconds after which the log has what is missing, all at once."""
+"""Seconds after which missing packages are logged, all at once."""
 
 BILLION = 1_000_000_000
 
@@ -43,16 +43,15 @@ End = TypeVar("End")
 
 
 class NativeNode(NamedNode):
-    """A node of ROS 2 through rclpy, for the middleware that the user runs.
+    """A node of ROS 2 through rclpy, for any middleware of ROS.
 
-    As :class:`smartcam.ros2.Node`, with parameters, life cycle, graph and time of ROS' own. What
-    is published or served with a type whose package is not built for the ROS that is installed is
-    left out, and told in the log.
+    Like :class:`smartcam.ros2.Node`, with ROS' own parameters, life cycle, graph and time. Topics
+    and services whose types are not built for the installed ROS are left out, and logged.
 
     Args:
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
-        context: context shared with other nodes of this process; None for one of its own.
+        context: context shared with other nodes of this process; None for its own.
         domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``.
         managed: whether the node has a life cycle, which :meth:`manage` then has to follow.
 
@@ -126,7 +125,7 @@ class NativeNode(NamedNode):
         """Open the node.
 
         Raises:
-            RosError: rclpy makes no node.
+            RosError: rclpy cannot create the node.
 
         Cancellation: leaves it closed.
         """
@@ -201,14 +200,14 @@ class NativeNode(NamedNode):
     # ------------------------------------------------------------------ for its ends
 
     def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
-        """Have something done in the event loop; return False where the loop is gone."""
+        """Call a function in the event loop; return False if the loop is gone."""
         spun = self._spun
         return spun is not None and spun.in_loop(do, *given)
 
     def submit(
         self, work: Callable[[], Coroutine[Any, Any, None]]
     ) -> concurrent.futures.Future[None]:
-        """Return the future of a coroutine that the event loop carries out.
+        """Run a coroutine in the event loop; return its future.
 
         Raises:
             RosError: the event loop is gone.
@@ -219,15 +218,15 @@ class NativeNode(NamedNode):
         return asyncio.run_coroutine_threadsafe(work(), loop)
 
     def wake(self) -> None:
-        """Have rclpy look for what is new."""
+        """Wake rclpy, so that it notices new endpoints."""
         if self._spun is not None:
             self._spun.wake()
 
     def made(self, make: Callable[[Any], Any]) -> Any:
-        """Return an end that rclpy makes.
+        """Return an endpoint created by rclpy.
 
         Raises:
-            RosError: rclpy makes no endpoint.
+            RosError: rclpy cannot create the endpoint.
         """
         self.check_open()
         try:
@@ -236,13 +235,13 @@ class NativeNode(NamedNode):
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
     def unmade(self, what: str, end: Any) -> None:
-        """Have rclpy take an end back."""
+        """Destroy an endpoint of rclpy."""
         ros = self.ros
         if ros is not None:
             getattr(ros, f"destroy_{what}")(end)
 
     def forget(self, end: Any) -> None:
-        """Take note that an end was closed."""
+        """Note that an endpoint was closed."""
         self._ends.discard(end)
 
     def _kept(self, end: End) -> End:
@@ -270,7 +269,7 @@ class NativeNode(NamedNode):
         return self._kept(NativePublisher(self, name, kind, qos, cls))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
-        """Hear a topic; read it by ``async for``.
+        """Subscribe to a topic; read it by ``async for``.
 
         Args:
             topic: name of the topic, absolute, relative to the namespace, or private (``~/it``).
@@ -331,10 +330,10 @@ class NativeNode(NamedNode):
         return self._kept(NativeClient(self, name, kind, self._built(checked_service(kind), type)))
 
     def manage(self, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]) -> NativeLifecycle:
-        """Have ROS' own life cycle follow one of smartcam's.
+        """Make ROS' own life cycle follow one of smartcam's.
 
         Args:
-            life: life cycle that says what the state is.
+            life: life cycle that decides about the state.
             handler: coroutine function that answers ``change_state``.
 
         Raises:
@@ -377,7 +376,7 @@ class NativeNode(NamedNode):
 
 
 def how_to_build(type: str) -> str:
-    """Return the way to have the package of a type, as the end of a sentence."""
+    """Return instructions to install the package of a type, as the end of a sentence."""
     package = type.partition("/")[0]
     if package == "smartcam_msgs":
         return "; copy ros2/smartcam_msgs into a workspace, build it with colcon and source it"

@@ -15,16 +15,17 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_MESSAGES = 10_000
-"""Messages of a node that wait for the middleware; the oldest beyond is dropped and counted."""
+"""Largest number of messages of a node that wait for the middleware; the oldest beyond is dropped
+and counted."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of a node's messages that wait for the middleware."""
+"""Largest number of bytes of a node's messages that wait for the middleware."""
 
 
 class _ThreadJob(NamedTuple):
     do: Callable[[], None]
     size: int
-    dropped: Callable[[], None] | None  # None: the job is never dropped
+    dropped: Callable[[], None] | None  # function for a dropped job; None: the job is never dropped
 
 
 class MessageThread:

@@ -43,7 +43,7 @@ class NativeParameters(RosParameters):
     """
 
     def __init__(self, node: NativeNode) -> None:
-        super().__init__(node, served=False)  # type: ignore[arg-type]  # as far as it is used
+        super().__init__(node, served=False)
         self.undeclare(SIM_TIME)
         self._native = node
         self._ros: Any = None

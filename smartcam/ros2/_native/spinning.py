@@ -34,7 +34,7 @@ EXIT_TIMEOUT = 2.0
 """Seconds that the end of the program waits for a node that nobody has closed."""
 
 MAX_TOLD = 100
-"""Errors of a spinning thread that are remembered, so that each is told once."""
+"""Largest number of errors of a spinning thread that are remembered, so that each is told once."""
 
 
 class NoReplyError(Exception):

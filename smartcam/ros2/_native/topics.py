@@ -1,4 +1,4 @@
-"""The ends of topics through rclpy: who publishes, and who hears."""
+"""Publish and subscribe to topics through rclpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 def profile_of(qos: QoS) -> Any:
-    """Return a quality of service as rclpy has it."""
+    """Return a quality of service in rclpy's form."""
     kinds = rclpy("qos")
     reliable, durable = kinds.ReliabilityPolicy, kinds.DurabilityPolicy
     more: dict[str, Any] = {}
@@ -42,14 +42,14 @@ class NativePublisher:
     """Publishes on a topic through rclpy; made by :meth:`NativeNode.publisher`.
 
     Messages are encoded here and handed over as bytes, so that a picture never becomes a list of
-    numbers; a thread of the node's does that, since a middleware may wait for room.
+    numbers; a thread of the node does that, since a middleware may wait for room.
 
     Attributes:
         name: absolute name of the topic.
         type: type of the messages.
         qos: quality of service.
-        published: messages that were handed to the middleware.
-        dropped: messages for which there was no room, the oldest of those that waited.
+        published: number of messages that were passed to the middleware.
+        dropped: number of messages that were dropped for lack of room, the oldest first.
     """
 
     def __init__(self, node: NativeNode, name: str, kind: MessageType, qos: QoS, cls: Any) -> None:
@@ -65,7 +65,7 @@ class NativePublisher:
 
     @property
     def heard(self) -> bool:
-        """True if anybody hears the topic, as far as is known; a latched one counts as heard."""
+        """True if the topic has a known subscriber; a latched topic always counts as heard."""
         if self._closed or self._raw is None:
             return False
         if self.qos.latched:
@@ -79,7 +79,7 @@ class NativePublisher:
         """Publish a message; never waits.
 
         Raises:
-            RosMessageError: the message is none of the type.
+            RosMessageError: the message is not of the type.
             RosError: the publisher is closed, or rclpy is gone.
         """
         self.publish_encoded(self.type.encode(said(message, fields)))
@@ -95,10 +95,10 @@ class NativePublisher:
             self._node.outbox.put(lambda: self._say(data), len(data), self._drop)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message, and return when the middleware has it; a thread encodes it.
+        """Publish a message, and return once the middleware has it; a thread encodes it.
 
         Raises:
-            RosMessageError: the message is none of the type.
+            RosMessageError: the message is not of the type.
             RosError: the publisher is closed, or rclpy is gone.
 
         Cancellation: the message is published or not.
@@ -123,7 +123,7 @@ class NativePublisher:
             raise failed[0]
 
     def _say(self, data: bytes) -> None:
-        """Hand a message over; in the thread for it."""
+        """Pass a message to rclpy, in the node's thread."""
         if self._node.has_sim_time:
             data = self._node.stamps.moved(self.type, data)
         try:
@@ -141,7 +141,7 @@ class NativePublisher:
             raise RosError(f"{self.name}: this publisher is closed")
 
     def close(self) -> None:
-        """Publish no more; what waits is published before the topic goes. Idempotent."""
+        """Stop publishing, after the waiting messages. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -174,7 +174,7 @@ class NativeSubscription(TopicReader[bytes]):
         )
 
     def _on_message(self, data: bytes) -> None:
-        """Take a message in a thread of rclpy's; a loop that is late loses the newest."""
+        """Take a message in a thread of rclpy; if the loop is late, drop the newest."""
         with self._lock:
             if self._crossing >= self._most:
                 return
@@ -191,7 +191,7 @@ class NativeSubscription(TopicReader[bytes]):
         return self.type.decode(item, whole=False)
 
     def close(self) -> None:
-        """Hear no more; iterating ends. Idempotent."""
+        """Stop receiving; iteration ends. Idempotent."""
         if self._closed:
             return
         self._closed = True

@@ -1,7 +1,7 @@
 """Write and read the attachment of a message or request: number, time, and sender.
 
 ``AttachmentData::serialize_to_zbytes`` in ``rmw_zenoh_cpp/src/detail/attachment_helpers.cpp``: two
-int64, and 16 bytes behind their number, little-endian, as Zenoh's serializer writes them.
+int64, and 16 bytes after their number, little-endian, as Zenoh's serializer writes them.
 """
 
 from __future__ import annotations

@@ -27,9 +27,6 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 ROUTER = "tcp/localhost:7447"
 """Endpoint of the router of rmw_zenoh's nodes (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
 
-MAX_LONG_MESSAGE_BYTES = 1 << 26
-"""Bytes of long messages that wait to be said; the oldest of a topic go first."""
-
 SETTINGS: Mapping[str, Any] = {
     # who publishes latched keeps messages by their times
     "timestamping/enabled": {"router": True, "peer": True, "client": True},
@@ -51,7 +48,7 @@ priority and link under way; topics take the priorities in turn, so that the two
 do not meet in one."""
 
 PAUSE, RATE = 0.002, 5e8
-"""Seconds, and bytes a second: the time that a healthy link needs for one long message."""
+"""Seconds, and bytes per second: the time that a healthy link needs for one long message."""
 
 
 class NewestSlot:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_ENTITIES = 100_000
-"""Nodes and ends of topics and services that are kept in mind; what comes beyond is not."""
+"""Largest number of nodes and ends of topics and services that are kept in mind; what comes beyond
+is not."""
 
 
 class RosGraph:
@@ -119,7 +120,7 @@ class RosGraph:
         return iter(tuple(self._entities.values()))
 
     def by_gid(self, gid: bytes) -> Entity | None:
-        """Return the entity that has a GID; None where none has it."""
+        """Return the entity that has a GID; None if none has it."""
         return self._by_gid.get(gid)
 
     def nodes(self) -> list[str]:

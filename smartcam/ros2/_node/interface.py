@@ -92,6 +92,7 @@ class NodeOfRos(Protocol):
         type: str,
         handler: Callable[[Any], Awaitable[Any]],
         *,
+        qos: QoS = ...,
         timeout: float = ...,
     ) -> ServiceEnd:
         """Serve a service."""

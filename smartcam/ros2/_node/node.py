@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._types.types import RosTypes
 
 OPEN_TIMEOUT = 10.0
-"""Seconds for coming to a router."""
+"""Seconds for connecting to a router."""
 
 CLOSE_TIMEOUT = 5.0
 
@@ -46,11 +46,12 @@ class Node(NamedNode):
         namespace: namespace of the node, such as ``/line1``.
         connect: endpoints of the Zenoh router; default: rmw_zenoh's own.
         listen: endpoints to listen on instead, as the router.
-        domain: the number that keeps systems apart; None for the variable ``ROS_DOMAIN_ID``.
+        domain: number of the domain, which separates systems; None for the variable
+            ``ROS_DOMAIN_ID``.
         distribution: name of the ROS distribution, whose type hashes are part of all names.
         context: context shared with other nodes of this process, in place of the arguments above.
         parameters: whether other nodes see its parameters and types, by seven services and a topic.
-        open_timeout: seconds for coming to the router.
+        open_timeout: seconds for connecting to the router.
 
     Attributes:
         parameters: parameters of the node.
@@ -90,7 +91,7 @@ class Node(NamedNode):
 
     @property
     def types(self) -> RosTypes:
-        """The messages and services that it speaks."""
+        """The message and service types that the node knows."""
         return self.context.types
 
     @property
@@ -109,7 +110,7 @@ class Node(NamedNode):
         """Open the node.
 
         Raises:
-            ConnectFailedError: there is no router, or it cannot listen.
+            ConnectFailedError: there is no router, or the node cannot listen.
 
         Cancellation: leaves it closed.
         """
@@ -134,7 +135,7 @@ class Node(NamedNode):
             raise
 
     async def stop(self) -> None:
-        """Close the node, with all that it publishes, hears, serves and calls. Idempotent."""
+        """Close the node, with its publishers, subscriptions, services and clients. Idempotent."""
         token, self._token = self._token, None
         if token is None:
             return
@@ -171,7 +172,7 @@ class Node(NamedNode):
         return self._kept(RosPublisher(self.context, entity, kind, self._ends.discard))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosSubscription:
-        """Hear a topic; read it by ``async for``.
+        """Subscribe to a topic; read it by ``async for``.
 
         Args:
             topic: absolute, relative to the namespace, or private (``~/it``).
@@ -201,7 +202,7 @@ class Node(NamedNode):
             service: name of the service, resolved as that of a topic.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
-                mapping of its fields; where it raises, the response says so, if it has fields for
+                mapping of its fields; if it raises, the response says so, if it has fields for
                 that, such as ``success`` or ``error``; else the call gets no reply. The log has it.
             qos: quality of service.
             timeout: seconds that the handler may take.
@@ -242,7 +243,9 @@ class Node(NamedNode):
         Raises:
             ConfigurationError: the name is not valid.
         """
-        return ParameterClient(self, resolve(name, self.namespace, self.name, "node"), timeout)
+        return ParameterClient(
+            self.client, resolve(name, self.namespace, self.name, "node"), timeout
+        )
 
     def _kept(self, end: End) -> End:
         self._ends.add(end)

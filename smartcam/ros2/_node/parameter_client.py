@@ -14,10 +14,9 @@ from smartcam.ros2._node.parameter_values import (
 from smartcam.ros2._node.qos import PARAMETERS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from typing import Self
 
-    from smartcam.ros2._node.node import Node
     from smartcam.ros2._node.services import RosClient
 
 CALL_TIMEOUT = 15.0
@@ -32,14 +31,16 @@ class ParameterClient:
     carried out is not known.
 
     Args:
-        node: node that asks.
+        client: the asking node's ``client``, which makes the client of a service.
         name: full name of the other node.
         timeout: seconds for one call.
     """
 
-    def __init__(self, node: Node, name: str, timeout: float = CALL_TIMEOUT) -> None:
+    def __init__(
+        self, client: Callable[..., RosClient], name: str, timeout: float = CALL_TIMEOUT
+    ) -> None:
         self.name: str = name
-        self._node, self._timeout = node, timeout
+        self._client, self._timeout = client, timeout
         self._clients: dict[str, RosClient] = {}
 
     async def list(self, *prefixes: str, depth: int = 0) -> list[str]:
@@ -108,7 +109,7 @@ class ParameterClient:
     async def _call(self, service: str, type: str, **fields: Any) -> Any:
         client = self._clients.get(service)
         if client is None:
-            client = self._clients[service] = self._node.client(
+            client = self._clients[service] = self._client(
                 f"{self.name}/{service}", f"rcl_interfaces/srv/{type}", qos=PARAMETERS
             )
         return await client.call(timeout=self._timeout, **fields)

@@ -1,7 +1,7 @@
 """The services and the topic by which other nodes see a node's parameters.
 
-Names, QoS and answers as ``parameter_service.cpp`` and ``node_parameters.cpp`` of rclcpp: one name
-that is not declared leaves an answer empty.
+Names, QoS and answers are those of ``parameter_service.cpp`` and ``node_parameters.cpp`` of rclcpp:
+an undeclared name leaves the answer empty.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from smartcam.ros2._node.qos import PARAMETERS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.interface import NodeOfRos, PublisherEnd
     from smartcam.ros2._node.parameter_values import Typed
     from smartcam.ros2._node.parameters import RosParameters
-    from smartcam.ros2._node.topics import RosPublisher
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_NAMES = 1024
-"""Most names in a request; one with more is refused: list gives nothing, set gives the reason."""
+"""Largest number of names in a request; one with more is refused: list returns nothing, set returns
+the reason."""
 
 MAX_REASON_CHARACTERS = 1000
-"""Characters of the reason why parameters could not be set."""
+"""Largest number of characters of the reason why parameters could not be set."""
 
 NAMES_PER_TURN = 64
-"""Names until other things have their turn."""
+"""Number of names after which other tasks get a turn."""
 
 SEPARATOR: Final = "."
 DEPTH_RECURSIVE: Final = 0
@@ -49,12 +49,12 @@ class ParameterServices:
         parameters: parameters to serve.
     """
 
-    def __init__(self, node: Node, parameters: RosParameters) -> None:
+    def __init__(self, node: NodeOfRos, parameters: RosParameters) -> None:
         self._node, self._parameters = node, parameters
-        self._events: RosPublisher | None = None
+        self._events: PublisherEnd | None = None
 
     def open(self) -> None:
-        """Serve, and publish what there is."""
+        """Start to serve, and publish the present parameters."""
         self._events = self._node.publisher(
             "/parameter_events", "rcl_interfaces/msg/ParameterEvent", qos=PARAMETERS
         )
@@ -70,7 +70,7 @@ class ParameterServices:
         self.tell(new=self._parameters.names())
 
     def close(self) -> None:
-        """Publish no more; the node closes its ends."""
+        """Stop publishing; the node closes the endpoints."""
         self._events = None
 
     def tell(
@@ -123,7 +123,7 @@ class ParameterServices:
     async def _each(
         self, names: Sequence[str], make: Callable[[str, Typed], Answer]
     ) -> list[Answer]:
-        """Return an answer for each name; none at all where one is not declared, or too many."""
+        """Return an answer for each name; none if a name is not declared, or there are too many."""
         if self._too_many(names):
             return []
         made = []
@@ -170,7 +170,7 @@ class ParameterServices:
         return {"result": await self._result(request.parameters)}
 
     def _too_many(self, names: Sequence[Any]) -> str:
-        """Return why a request is refused for its many names, which the log gets; else ""."""
+        """Return and log why a request has too many names; "" if it does not."""
         if len(names) <= MAX_NAMES:
             return ""
         why = f"a request with {len(names)} names: expected {MAX_NAMES} at most"
@@ -187,13 +187,13 @@ class ParameterServices:
 
 
 def reason(exc: SmartCamError) -> str:
-    """Return why a set did not work, as text that a message can have."""
+    """Return why setting failed, as text that fits into a message."""
     text = "; ".join((str(exc), *getattr(exc, "__notes__", ())))
     return text[:MAX_REASON_CHARACTERS].replace("\0", " ").encode(errors="replace").decode()
 
 
 def _listed(name: str, prefixes: Sequence[str], depth: int) -> bool:
-    """Return True if a name is asked for: up to ``depth`` parts of it below a prefix."""
+    """Return True if a name is at most ``depth`` parts below a requested prefix."""
     for prefix in prefixes or ("",):
         if name == prefix:
             return True

@@ -191,7 +191,7 @@ def type_name(number: int) -> str:
 
 
 class Typed(NamedTuple):
-    """A value with the number of its type; None where it is not set. Arrays are tuples."""
+    """A value with the number of its type; None if it is not set. Arrays are tuples."""
 
     number: int
     value: Any

@@ -21,7 +21,7 @@ from smartcam.ros2._node.parameter_values import (
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.interface import NodeOfRos
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -29,7 +29,7 @@ SET_TIMEOUT = 10.0
 """Seconds that a hook may take, and that a set waits for those before it."""
 
 MAX_VALUE_SIZE = 1 << 16
-"""Characters, bytes or elements of a value."""
+"""Largest number of characters, bytes or elements of a value."""
 
 MAX_NAME_CHARACTERS = 256
 MAX_PARAMETERS = 1024
@@ -92,7 +92,9 @@ class RosParameters:
         timeout: seconds that one ``on_set`` may take, and that a set waits for those before it.
     """
 
-    def __init__(self, node: Node, *, served: bool = True, timeout: float = SET_TIMEOUT) -> None:
+    def __init__(
+        self, node: NodeOfRos, *, served: bool = True, timeout: float = SET_TIMEOUT
+    ) -> None:
         self._node, self._timeout = node, timeout
         self._declared: dict[str, _Declared] = {}
         self._turn = asyncio.Lock()
@@ -207,7 +209,7 @@ class RosParameters:
         return self._of(name).description
 
     def find(self, name: str) -> Typed | None:
-        """Return a value with its type; None where there is none of this name."""
+        """Return a value with its type; None if there is none of this name."""
         found = self._declared.get(name)
         return None if found is None else found.value
 

@@ -1,11 +1,11 @@
 """Answer a call that is not carried out, so that its caller's wait ends.
 
-rmw_zenoh drops an error reply, so its clients would wait for ever. An answer that it sees is an
-ordinary one. Many types have fields for that: ``success`` and a text, or an ``error``. The lists of
-ROS' own services say nothing by being empty, as rclcpp's do where a parameter is not declared. Any
-answer of another type, such as a sum, or of one without fields, would be a lie: such a call waits
-for its turn, and where it cannot be read it gets the error reply, so that rmw_zenoh's callers wait
-as they do for a node of ROS that cannot read a request.
+rmw_zenoh drops an error reply, so its clients would wait forever. They receive ordinary answers
+only. Many types have fields for that: ``success`` and a text, or an ``error``. Services of ROS that
+return lists return an empty one, as those of rclcpp do if a parameter is not declared. Any answer
+of another type, such as a sum, or of one without fields, would be a lie: such a call waits for its
+turn, and if it cannot be read it gets the error reply, so that rmw_zenoh's callers wait as they do
+for a node of ROS that cannot read a request.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._types.types import MessageType, RosTypes, ServiceType
 
 MAX_REASON_CHARACTERS: Final = 1000
-"""Characters of the reason in an answer; what is longer is cut."""
+"""Largest number of characters of the reason in an answer; a longer one is cut."""
 
 FLAGS: Final = ("success", "successful")
 """Names of fields that say whether a call was carried out."""
@@ -30,16 +30,16 @@ LISTING: Final = ("composition_interfaces", "lifecycle_msgs", "rcl_interfaces")
 """Packages in whose answers an empty list means that nothing is known."""
 
 UNKNOWN_STATE: Final = {"id": 0, "label": "unknown"}
-"""The state of a life cycle that nobody knows, as ``lifecycle_msgs/msg/State`` has it."""
+"""The unknown state of a life cycle, in the form of ``lifecycle_msgs/msg/State``."""
 
 
 def refusal(kind: ServiceType, why: str, types: RosTypes) -> Any:
-    """Return the response that refuses a call; None where the type has none.
+    """Return the response that refuses a call; None if the type has none.
 
     Args:
         kind: type of the service.
         why: reason, for people.
-        types: types of the messages within.
+        types: types of the nested messages.
     """
     text = why[:MAX_REASON_CHARACTERS].replace("\0", "\ufffd").encode(errors="replace").decode()
     fields = _refused(kind.response, text, types)

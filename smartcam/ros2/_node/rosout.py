@@ -22,10 +22,10 @@ ROSOUT: Final = QoS(latched=True, depth=1000, lifespan=10.0)
 """Quality of ``/rosout``, as ``rcl_qos_profile_rosout_default`` (``logging_rosout.h`` of rcl)."""
 
 MAX_WAITING_RECORDS = 1000
-"""Records that wait for the event loop; the oldest makes room."""
+"""Largest number of records that wait for the event loop; the oldest makes room."""
 
 MAX_TEXT_CHARACTERS = 8000
-"""Characters of a record's text."""
+"""Largest number of characters of a record's text."""
 
 CLOSE_TIMEOUT = 1.0
 LOOK_INTERVAL = 0.005

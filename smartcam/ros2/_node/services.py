@@ -1,4 +1,4 @@
-"""The ends of services: servers and clients.
+"""Serve and call services.
 
 As ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
 queryable, a reply repeats number and GID of its request.
@@ -36,20 +36,22 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_CONCURRENT_CALLS = 64
-"""Calls of a service that are carried out at the same time; one beyond is refused, or waits."""
+"""Largest number of calls of a service that are carried out at the same time; one beyond is
+refused, or waits."""
 
 MAX_WAITING_CALLS = 256
-"""Calls that wait for their turn, of a service whose answers cannot refuse one."""
+"""Largest number of calls that wait for their turn, of a service whose answers cannot refuse
+one."""
 
 MAX_REQUEST_BYTES = 1 << 24
-"""Bytes of a request."""
+"""Largest number of bytes of a request."""
 
 LOOK_AGAIN = 0.02
-"""Seconds between two looks whether somebody serves."""
+"""Seconds between two checks whether a server exists."""
 
 
 class _RequestedCall(NamedTuple):
-    """A call that was asked for: the engine's query, the request's bytes, and whose it is."""
+    """A call of a client: the engine's query, the request's bytes, and the caller."""
 
     query: Any
     data: bytes
@@ -61,8 +63,8 @@ class RosService(RosEnd):
 
     Attributes:
         type: type of requests and replies.
-        calls: calls that came.
-        failed: calls that were not carried out.
+        calls: number of calls that came.
+        failed: number of calls that were not carried out.
     """
 
     def __init__(
@@ -163,7 +165,7 @@ class RosService(RosEnd):
         self._context.zenoh.reply(call.query, [(self.entity.key, data)], attachment=attachment)
 
     def _refuse(self, call: _RequestedCall, why: SmartCamError) -> None:
-        """Answer by a response that says why; where the type has none, by an error."""
+        """Answer by a response that says why, or by an error if the type has no such field."""
         answer = refusal(self.type, f"{self.name}: {why}", self._context.types)
         if answer is None:
             self._fail(call.query, why)
@@ -188,7 +190,7 @@ class RosService(RosEnd):
                 task.cancel()
 
     def close(self) -> None:
-        """Serve no more; calls under way are given up. Idempotent."""
+        """Stop serving, and give up running calls. Idempotent."""
         if not self._closed:
             super().close()
             self._stop_listening()
@@ -230,7 +232,7 @@ class RosClient(RosEnd):
                 entity.key,
                 target=zenoh.QueryTarget.ALL_COMPLETE,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=86_400,  # ours is what counts
+                timeout=86_400,  # this handler's result counts
                 express=True,
             )
             return self._querier
@@ -274,14 +276,14 @@ class RosClient(RosEnd):
         """Call the service, once somebody serves it; the first reply counts.
 
         Args:
-            request: one of the type's own, or a mapping of its fields.
-            timeout: seconds, until somebody serves it and has replied.
-            **fields: the fields, where no request is given.
+            request: a request of the type, or a mapping of its fields.
+            timeout: seconds until a server exists and has replied.
+            **fields: the fields, if no request is given.
 
         Raises:
             RosMessageError: the value is no request of the type; or the reply cannot be read.
             ServiceTimeoutError: nobody serves it, or no reply came in time.
-            ServiceCallError: who serves it refused, or went away.
+            ServiceCallError: the server refused, or went away.
 
         Cancellation: leaves the client usable; whether the call is carried out is unknown.
         """
@@ -337,11 +339,11 @@ class RosClient(RosEnd):
                 zenoh.in_loop(take, len(found), found)
 
         def on_end() -> None:
-            if not came:  # else the loop is not woken again
+            if not came:  # otherwise the loop is not woken again
                 zenoh.in_loop(end, 0)
 
         self._querier.get(
-            zenoh.engine.handlers.Callback(on_reply, on_end, indirect=False),
+            direct(on_reply, on_end),
             payload=data,
             attachment=attachment.encode(),
         )
@@ -359,7 +361,7 @@ class RosClient(RosEnd):
         return False
 
     def close(self) -> None:
-        """Call no more; calls under way end. Idempotent."""
+        """Stop calling, and end running calls. Idempotent."""
         super().close()
         for reply in self._waiting:
             if not reply.done():

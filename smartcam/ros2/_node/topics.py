@@ -34,7 +34,7 @@ MAX_DIRECT_BYTES = 1 << 16
 """Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of a topic's messages that wait to be said, or to be read."""
+"""Largest number of bytes of a topic's messages that wait to be said, or to be read."""
 
 
 def said(message: object, fields: dict[str, Any]) -> object:
@@ -128,7 +128,7 @@ class RosPublisher(RosEnd):
         self._publisher: Any = None
         qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._patient: dict[str, Any] = {}  # by lane: what waits for room
+        self._patient: dict[str, Any] = {}  # messages that wait for room, by lane
         self._hasty: Any = None  # leaves out to whom one is under way
         self._slot: NewestSlot | None = None
         self._lane = "latched" if qos.latched else "short"

@@ -14,7 +14,7 @@ from smartcam.ros2._types.stores import WITHOUT_HASHES
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.interface import NodeOfRos
     from smartcam.ros2._node.tokens import Entity
     from smartcam.ros2._types.types import RosTypes
 
@@ -32,7 +32,7 @@ class TypeDescriptions:
         entities: function that returns the node's present entries in the graph.
     """
 
-    def __init__(self, node: Node, entities: Callable[[], Iterable[Entity]]) -> None:
+    def __init__(self, node: NodeOfRos, entities: Callable[[], Iterable[Entity]]) -> None:
         self._node, self._entities = node, entities
         self._said: dict[str, Any] = {}
         if served(node.types):

@@ -1,7 +1,7 @@
-"""RIHS01: the hash of a type's description, by which nodes know that they mean the same.
+"""RIHS01: the hash of a type's description, by which nodes check that they use the same type.
 
-It is SHA-256 of JSON of the fields' names, types and order, and of all the types within (REP-2016);
-neither constants nor defaults count.
+It is SHA-256 of JSON of the fields' names, types and order, and those of all nested types
+(REP-2016); neither constants nor defaults count.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 NOT_SUPPORTED: Final = "TypeHashNotSupported"
-"""Text that stands for a hash where the distribution has none."""
+"""Text in place of a hash if the distribution has none."""
 
 _NESTED: Final = 1
 _IDS: Final = {
@@ -50,7 +50,7 @@ def _described(definition: Definition) -> dict[str, Any]:
 
 
 def description(definition: Definition, find: Callable[[str], Definition]) -> dict[str, Any]:
-    """Return a type's description with those of all the types within."""
+    """Return a type's description with those of all nested types."""
     within: dict[str, Definition] = {}
     ahead = definition.needs()
     while ahead:
@@ -72,7 +72,7 @@ def hash_of_description(described: dict[str, Any]) -> str:
 
 
 def event_of(name: str) -> Definition:
-    """Return the event of a service: what introspection publishes, and a part of its hash."""
+    """Return a service's event, which introspection publishes; it is part of the hash."""
     return Definition(
         f"{name}_Event",
         (
@@ -86,7 +86,7 @@ def event_of(name: str) -> Definition:
 
 
 def service_of(name: str) -> Definition:
-    """Return a service as its hash sees it."""
+    """Return the form of a service from which its hash is made."""
     parts = ("request", "response", "event")
     fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
     return Definition(name, fields, {}, {})

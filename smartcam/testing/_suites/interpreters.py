@@ -48,7 +48,7 @@ MAX_ERROR_TEXT = 500
 """Characters of an error's text: a container's bytes are in it, 64 of them at most."""
 
 MAX_PLACES = 256
-"""Places of a container at which one thing is tried, at most."""
+"""Largest number of places of a container at which one thing is tried."""
 
 TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
 """Bytes that may stand behind a container."""
@@ -219,7 +219,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             see(interpreter, data)
 
     def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
-        """Check that bytes behind a container cause no other kind of error either."""
+        """Check that bytes after a container cause no other kind of error either."""
         interpreter = self.make(sample.layout)
         for more in TRAILING:
             see(interpreter, sample.data + more)
@@ -317,7 +317,7 @@ def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
 
 
 def outcome(interpreter: Interpreter, data: bytes) -> object:
-    """Return an interpreter's value, None where it raises an InterpretationError."""
+    """Return an interpreter's value, None if it raises an InterpretationError."""
     try:
         return interpret(interpreter, data)
     except InterpretationError:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from hypothesis.strategies import DataObject, SearchStrategy
 
-MAX_NOISE = 200
-"""Bytes of one piece of noise."""
+MAX_NOISE_BYTES = 200
+"""Largest number of bytes of one piece of noise."""
 
 
 def each_drawn(check: Callable[[DataObject], None]) -> None:
@@ -45,16 +45,16 @@ def each_drawn(check: Callable[[DataObject], None]) -> None:
 
 def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
     """Draw any bytes, and samples that are cut, repeated, or have a byte changed."""
-    some: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE)
+    some: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE_BYTES)
     if not any(samples):
         return some
     sample = st.sampled_from([one for one in samples if one])
     return st.one_of(
         some,
         sample,
-        st.builds(lambda data, end: data[:end], sample, st.integers(0, MAX_NOISE)),
-        st.builds(lambda data, begin: data[begin:], sample, st.integers(0, MAX_NOISE)),
-        st.builds(_changed, sample, st.integers(0, MAX_NOISE), st.integers(0, 255)),
+        st.builds(lambda data, end: data[:end], sample, st.integers(0, MAX_NOISE_BYTES)),
+        st.builds(lambda data, begin: data[begin:], sample, st.integers(0, MAX_NOISE_BYTES)),
+        st.builds(_changed, sample, st.integers(0, MAX_NOISE_BYTES), st.integers(0, 255)),
         st.builds(lambda data, times: data * times, sample, st.integers(2, 3)),
     )
 

@@ -35,7 +35,7 @@ BOTH_STALL = Ending("half_open", Stall.name)
 class Edit(Transmission):
     """Bytes that pass, or what is done between them."""
 
-    at: int = 0  # where in the stream the rule acts that ``faults`` names
+    at: int = 0  # place in the stream at which the rule named by ``faults`` acts
 
 
 def _gap(seconds: float) -> Edit:
@@ -59,7 +59,7 @@ class Editor:
         self.position: int = 0  # bytes that have come
         self._marks: deque[_Boundary] = deque()
         self._rules = 0
-        self._active: dict[int, RangeRule] = {}  # by their place in the list of rules
+        self._active: dict[int, RangeRule] = {}  # active rules by their index in the list of rules
         self._copies: dict[int, bytearray] = {}
         self._out = bytearray()
         self._edits: list[Edit] = []

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from smartcam.emulator._inside import DelayLine, Ending, RealClock
 from smartcam.testing.proxy._byte_edits import Edit, Editor
-from smartcam.testing.proxy._rules import MAX_HOLD, DelayBytes, Direction, Rate
+from smartcam.testing.proxy._rules import MAX_HOLD_BYTES, DelayBytes, Direction, Rate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 CHUNK = 1 << 16
 """Bytes read at once."""
 
-MAX_HELD = 1 << 18
-"""Bytes that wait in one direction before the proxy reads no more: one chunk behind the limit and
-what rules insert come on top. It leaves room for what a rule may hold back."""
+MAX_HELD_BYTES = 1 << 18
+"""Largest number of bytes that wait in one direction before the proxy reads no more: one chunk
+behind the limit and what rules insert come on top. It leaves room for what a rule may hold back."""
 
 WRITE_INTERVAL = 0.01
 """Seconds between two writes where the rate is limited."""
@@ -139,10 +139,10 @@ class Pipe:
         for edit in edits:
             edit.delay = delay
             plain = edit.end is None and edit.gather is None and not edit.pauses
-            self._line.put([edit], edit.size if plain else MAX_HOLD)
+            self._line.put([edit], edit.size if plain else MAX_HOLD_BYTES)
 
     def _read_on(self) -> None:
-        wanted = not (self._eof or self._stopped or self.held >= MAX_HELD)
+        wanted = not (self._eof or self._stopped or self.held >= MAX_HELD_BYTES)
         if wanted and not self._reading:
             self._loop.add_reader(self.source, self._receive)
         elif self._reading and not wanted:

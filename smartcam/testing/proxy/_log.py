@@ -8,18 +8,18 @@ from typing import NamedTuple
 from smartcam.emulator._inside import Tally
 
 MAX_ENTRIES = 10_000
-"""Entries kept; the oldest go first. The counts go on."""
+"""Largest number of entries kept; the oldest go first. The counts go on."""
 
 
 class Entry(NamedTuple):
     """One thing that happened.
 
     Attributes:
-        what: a rule's name in small letters, or ``connect``, ``eof`` (a side sends no more),
-            ``lost`` (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
+        what: a rule's name in lower case, or ``connect``, ``eof`` (a side sends no more), ``lost``
+            (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
             ``resume``, ``full`` and ``refused`` (a datagram that did not go out).
         connection: number of the connection, from 1; 0 where the entry is about none.
-        direction: ``up`` or ``down``; empty where the entry is about both.
+        direction: ``up`` or ``down``; empty if the entry is about both.
         at: offset in the sender's stream, or number of the datagram; None for what the proxy was
             told while it ran.
     """

@@ -158,7 +158,7 @@ class LinkProxy:
             connection: this one alone; None is all, those to come as well. On UDP only None.
 
         Raises:
-            ConfigurationError: no such direction, or one connection on UDP.
+            ConfigurationError: there is no such direction, or one connection on UDP.
         """
         if direction not in {None, *DIRECTIONS}:
             raise ConfigurationError(f"direction is 'up', 'down' or None, not {direction!r}")

@@ -53,8 +53,9 @@ class Relay(ABC, Generic[C]):
     def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
         self.rules = rules  # looked at when a connection is made
         self.log = log
-        self.family: socket.AddressFamily = socket.AF_INET  # of the target, by open()
-        self.target: Any = None  # its address, by open()
+        # address family of the target, set by open()
+        self.family: socket.AddressFamily = socket.AF_INET
+        self.target: Any = None  # address of the target, set by open()
         # directions in which nothing passes, on connections to come as well
         self.stalled: set[Direction] = set()
         self.members: dict[Any, C] = {}  # who is connected

@@ -31,11 +31,12 @@ Direction = Literal["up", "down"]
 
 DIRECTIONS: tuple[Direction, Direction] = ("up", "down")
 
-MAX_COPY = 1 << 20
-"""Bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
+MAX_COPY_BYTES = 1 << 20
+"""Largest number of bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
 
-MAX_HOLD = 1 << 16
-"""Bytes that one rule may hold back: fewer than the proxy keeps before it stops reading."""
+MAX_HOLD_BYTES = 1 << 16
+"""Largest number of bytes that one rule may hold back: fewer than the proxy keeps before it stops
+reading."""
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
@@ -46,8 +47,11 @@ _BOUNDS: Mapping[str, _Bound] = {
     "connection": ("connections count from 1", lambda number: number is None or number >= 1),
     "at": ("at must be 0 or more bytes", lambda place: place >= 0),
     "count": ("count must be 1 or more bytes", lambda count: count is None or count >= 1),
-    "size": (f"size must be 1 to {MAX_HOLD} bytes", lambda size: 1 <= size <= MAX_HOLD),
-    "data": (f"data must be 1 to {MAX_COPY} bytes", lambda data: 1 <= len(data) <= MAX_COPY),
+    "size": (f"size must be 1 to {MAX_HOLD_BYTES} bytes", lambda size: 1 <= size <= MAX_HOLD_BYTES),
+    "data": (
+        f"data must be 1 to {MAX_COPY_BYTES} bytes",
+        lambda data: 1 <= len(data) <= MAX_COPY_BYTES,
+    ),
     "mask": ("mask must be 1 to 255", lambda mask: 1 <= mask <= 0xFF),
     "pause": ("pause must be 0 or more seconds", lambda seconds: seconds >= 0),
     "seconds": ("times must be 0 or more seconds", lambda seconds: seconds >= 0),
@@ -146,7 +150,7 @@ class RangeRule(PlacedRule):
 
     @property
     def end(self) -> int | None:
-        """The place behind its last byte, None where it has none."""
+        """The place behind its last byte, None if it has none."""
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
@@ -243,8 +247,8 @@ class DuplicateBytes(RangeRule, name="duplicate"):
         super().__post_init__()
         _check(
             self,
-            self.count is not None and self.count <= MAX_COPY,
-            f"count must be at most {MAX_COPY} bytes",
+            self.count is not None and self.count <= MAX_COPY_BYTES,
+            f"count must be at most {MAX_COPY_BYTES} bytes",
         )
 
 
@@ -281,7 +285,7 @@ class DelayBytes(Pace, name="delay"):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate(Pace):
-    """Pass so many bytes a second and not more."""
+    """Pass so many bytes per second and not more."""
 
     bytes_per_second: float
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.testing")
 
 MAX_CONNECTIONS = 64
-"""Connections open at once; the one that was not answered for longest makes room."""
+"""Largest number of connections open at once; the one that was not answered for longest makes
+room."""
 
 CONNECT_TIMEOUT = 5.0
 """Seconds that the target has to take a connection."""

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._log import LinkLog
     from smartcam.testing.proxy._rules import Rule
 
-MAX_SIZE = 1 << 16
-"""Bytes read of a datagram; none is longer."""
+MAX_SIZE_BYTES = 1 << 16
+"""Largest number of bytes read of a datagram; none is longer."""
 
 MAX_CLIENTS = 64
 """Client addresses that are known; the one that was not answered for longest makes room."""
@@ -39,7 +39,7 @@ ANSWERED_GRACE = 60.0
 """Seconds that a client keeps its place for certain after the target has answered it."""
 
 MAX_WAITING_DATAGRAMS = 1024
-"""Datagrams that rules hold back; more are lost and counted as ``full``."""
+"""Largest number of datagrams that rules hold back; more are lost and counted as ``full``."""
 
 
 class _Peer(Proxied):
@@ -144,7 +144,7 @@ class _Peer(Proxied):
 
     def _receive(self) -> None:
         try:
-            data = self._sock.recv(MAX_SIZE)
+            data = self._sock.recv(MAX_SIZE_BYTES)
         except (BlockingIOError, InterruptedError):
             return
         except OSError:  # the system says that nothing listens there
@@ -215,7 +215,7 @@ class DatagramRelay(Relay[_Peer]):
 
     def _receive(self, sock: socket.socket) -> None:
         try:
-            data, address = sock.recvfrom(MAX_SIZE)
+            data, address = sock.recvfrom(MAX_SIZE_BYTES)
         except OSError:  # nothing there, or a client's socket is shut, which is not for us to know
             return
         peer = self.members.get(address) or self._newcomer(address)
@@ -223,7 +223,7 @@ class DatagramRelay(Relay[_Peer]):
             peer.take("up", data)
 
     def _newcomer(self, address: Any) -> _Peer | None:
-        """Return a client that was not known; None where there is no room for it."""
+        """Return a client that was not known; None if there is no room for it."""
         self._number += 1
         try:
             peer = _Peer(self, self._number, address)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Code, RobotSigmas, calibrate_hand_eye, fit_plane
-from smartcam.calibration._homography import fit_homography
+from tests.calibration.inside import fit_homography
 from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:

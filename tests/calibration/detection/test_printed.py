@@ -13,7 +13,7 @@ import pytest_asyncio
 
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Sheet, find_target, make_sheet
 from smartcam.calibration._inside import Target
-from smartcam.calibration._printing.sheets import Rays
+from tests.calibration.inside import Rays
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

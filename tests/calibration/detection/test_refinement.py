@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Checkerboard, CircleGrid, Code, find_target
-from smartcam.calibration._detection.corners import UNREFINED, refine_corners
-from smartcam.calibration._detection.dots import UNREFINED as UNREFINED_DOT
+from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_corners
+from smartcam.calibration._detection.dots import UNREFINED_SIGMA_PX as UNREFINED_DOT
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.image import grey_image
-from smartcam.calibration._homography import apply_homography, fit_homography
+from tests.calibration.inside import apply_homography, fit_homography
 from tests.calibration.scenes import BENT, STRAIGHT, drawn, facing, refused
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)
@@ -69,7 +69,7 @@ def test_refine_corners_where_none_is_keeps_its_start_with_a_large_covariance() 
     cv2.rectangle(picture.image, (int(u) - 20, int(v) - 20), (int(u) + 20, int(v) + 20), 128, -1)
     corners = refine_corners(grey_image(picture.image), picture.pixels, WAYS)
     assert np.flatnonzero(~corners.fitted).tolist() == [4]
-    np.testing.assert_array_equal(corners.covariance[4], UNREFINED**2 * np.eye(2))
+    np.testing.assert_array_equal(corners.covariance[4], UNREFINED_SIGMA_PX**2 * np.eye(2))
     assert np.linalg.norm(corners.points[4] - picture.pixels[4]) < 6
 
 

@@ -13,8 +13,8 @@ from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_t
 from smartcam.calibration._detection import boards, charucos, circle_grids, corners
 from smartcam.calibration._detection.grid_growing import MAX_SEEDS_TRIED, _Grown
 from smartcam.calibration._detection.markers import (
-    MANY_OUTLINES,
     MAX_OUTLINES,
+    MAX_OUTLINES_OF_ALL_WINDOWS,
     WINDOWS_PX,
     _outlines,
     marker_finder,
@@ -290,7 +290,7 @@ def test_many_squares_are_few_outlines_to_opencv(step: int, side: int) -> None:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     without = cv2.aruco.DetectorParameters()
     windows = {window: len(_outlines(image, window, without)) for window in WINDOWS_PX}
-    assert sum(windows.values()) > len(windows) * MANY_OUTLINES
+    assert sum(windows.values()) > len(windows) * MAX_OUTLINES_OF_ALL_WINDOWS
     given = marker_finder(image, dictionary).getDetectorParameters()
     window = given.adaptiveThreshWinSizeMin
     assert window == given.adaptiveThreshWinSizeMax

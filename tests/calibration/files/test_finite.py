@@ -25,11 +25,10 @@ from smartcam.calibration import (
     fit_corners,
     fit_plane,
 )
-from smartcam.calibration._files.store import write
-from smartcam.calibration._solvers import CameraPosition2D
-from smartcam.calibration.simulation import _scenes as scenes
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization
+from tests.calibration.inside import CameraPosition2D, write
+from tests.calibration.inside import _scenes as scenes
 from tests.calibration.lenskit import pairs
 from tests.calibration.scenes import CAMERA as ROBOT_CAMERA
 from tests.calibration.scenes import scene

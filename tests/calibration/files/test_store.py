@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.calibration._files import store
-from smartcam.calibration._files.store import keep_backup, read, read_document, replace_file, write
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import keep_backup, read, read_document, replace_file, store, write
 
 
 def files(folder: Path) -> list[str]:
@@ -76,7 +75,7 @@ def test_write_of_what_json_lacks_is_refused_and_leaves_the_file(
 
 def test_write_of_too_much_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="expected 16777216 at most"):
-        write(tmp_path / "a.json", "plane", {"x": "x" * store.MAX_FILE})
+        write(tmp_path / "a.json", "plane", {"x": "x" * store.MAX_FILE_BYTES})
 
 
 def test_read_of_another_kind_is_refused(tmp_path: Path) -> None:
@@ -95,7 +94,7 @@ def test_read_of_another_kind_is_refused(tmp_path: Path) -> None:
         (b'{"a": 1}', "schema None, expected 'smartcam.calibration'"),
         (b'{"schema": "smartcam.calibration"}', "schema_version None"),
         (b'{"schema": "smartcam.calibration", "schema_version": "1.0"}', "its hash is another"),
-        (b" " * (store.MAX_FILE + 1), "more than 16777216 bytes"),
+        (b" " * (store.MAX_FILE_BYTES + 1), "more than 16777216 bytes"),
     ],
 )
 def test_read_of_no_calibration_is_refused(tmp_path: Path, body: bytes, text: str) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from smartcam import _whole_files
-from smartcam.calibration._files.store import keep_backup, read, replace_file, write
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import keep_backup, read, replace_file, write
 
 WRITER = """
 import sys

@@ -19,7 +19,7 @@ from smartcam.calibration.formats import (
     read_trajectory,
     read_transform,
 )
-from smartcam.calibration.formats._cameras import CameraForm
+from tests.calibration.inside import CameraForm
 from tests.calibration.scenes import refused
 
 EIGHT = [-0.31, 0.12, 2e-4, -3e-4, 0.02, 0.05, -0.06, 0.01]

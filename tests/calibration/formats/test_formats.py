@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from smartcam.calibration import Chain, PlaneCalibration, PlaneProjection, Transform, fit_plane
-from smartcam.calibration._files.store import write
 from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration.formats import (
     SAMPLES,
@@ -42,6 +41,7 @@ from smartcam.calibration.formats._opencv import compose_matrix
 from smartcam.calibration.formats._plain import real
 from smartcam.calibration.wizards import CalibrationService
 from tests import ROOT
+from tests.calibration.inside import write
 from tests.geometry.rigid import (
     FEW,
     NOON,

@@ -24,10 +24,11 @@ from smartcam.calibration.formats import (
     read_transform,
     write_transform,
 )
-from smartcam.calibration.formats._file_format import MAX_TEXT
+from smartcam.calibration.formats._file_format import MAX_TEXT_BYTES
 from smartcam.calibration.formats._plain import load_json, load_yaml
 from smartcam.exceptions import CalibrationError, MissingExtraError
 from tests.geometry.rigid import FEW, refused
+from tests.layout.bombs import laughs, merges
 
 PARSED = ["ros2", "ros_industrial", "easy_handeye", "easy_handeye2", "opencv"]
 """One format of a transform for each reader; the others share theirs."""
@@ -122,7 +123,7 @@ def test_changed_file_gives_a_transform_or_an_error_with_a_code(
 
 
 def test_file_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"#" * (MAX_TEXT + 1))
+    (tmp_path / "file").write_bytes(b"#" * (MAX_TEXT_BYTES + 1))
     with refused("MALFORMED", "easy_handeye, ROS 1", "expected 65536 bytes at most"):
         read(tmp_path / "file", "easy_handeye")
 
@@ -135,7 +136,7 @@ def test_line_that_is_too_long_is_refused(tmp_path: Path) -> None:
 
 def test_launch_file_of_nothing_but_beginnings_is_refused_in_no_time(tmp_path: Path) -> None:
     begin = '<launch><node type="static_transform_publisher" '
-    (tmp_path / "file").write_text((begin + "<!-- ") * (MAX_TEXT // 60))
+    (tmp_path / "file").write_text((begin + "<!-- ") * (MAX_TEXT_BYTES // 60))
     with refused("MALFORMED", "file: expected XML"):
         read(tmp_path / "file", "ros2")
 
@@ -324,3 +325,10 @@ def test_yaml_without_pyyaml_says_what_to_install(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[yaml\]"'):
         load_yaml("a: 1")
+
+
+def test_calibration_formats_bombs_are_refused() -> None:
+    for text in (laughs(30), merges(40)):
+        with pytest.raises(CalibrationError) as told:
+            load_yaml(text)
+        assert told.value.code == "MALFORMED"

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.calibration import CameraModel, RobotSigmas
-from smartcam.calibration._hand_eye.closed_forms import LINEAR, check_motion, solve_linear
+from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
 from smartcam.calibration._hand_eye.equations import (
     Observations,
     PixelObservations,
@@ -28,6 +28,7 @@ from smartcam.calibration._hand_eye.equations import (
 )
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
 from smartcam.geometry._inside import Rigid, exp_rotation
+from tests.calibration.inside import LINEAR
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)

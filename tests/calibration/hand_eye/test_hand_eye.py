@@ -27,11 +27,10 @@ from smartcam.calibration import (
     calibrate_stereo,
     locate,
 )
-from smartcam.calibration._hand_eye.equations import Setup
-from smartcam.calibration._lens.poses import half_turned
 from smartcam.calibration.simulation import hand_eye_scene, view
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import exp_rotation
+from tests.calibration.inside import Setup, half_turned
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]

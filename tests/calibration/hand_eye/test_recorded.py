@@ -20,7 +20,7 @@ from smartcam.calibration import (
     calibrate_hand_eye_from_poses,
     calibrate_intrinsics,
 )
-from smartcam.calibration._hand_eye.closed_forms import LINEAR
+from tests.calibration.inside import LINEAR
 
 pytestmark = pytest.mark.long
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import PoseHistory, Transform, estimate_time_offset
-from smartcam.calibration._hand_eye.equations import Setup
 from smartcam.geometry._inside import Rigid
+from tests.calibration.inside import Setup
 from tests.calibration.scenes import refused
 
 NOON = datetime(2026, 3, 4, 12, tzinfo=UTC)

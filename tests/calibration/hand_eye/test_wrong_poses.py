@@ -21,7 +21,7 @@ from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:
     from smartcam.calibration import TargetView
-    from smartcam.calibration._hand_eye.equations import Setup
+    from tests.calibration.inside import Setup
 
 TRUTH = scene("eye-in-hand", poses=6)
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
@@ -157,3 +157,22 @@ def test_hand_eye_names_points_that_are_off_and_leaves_them_out() -> None:
 def test_matrices_in_place_of_transforms_are_refused(make: Any, text: str) -> None:
     with refused("SHAPE", text):
         make()
+
+
+def test_poses_visited_thrice_tell_no_more_than_once() -> None:
+    robot, seen = TRUTH.measured(
+        pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(1)
+    )
+    options: dict[str, Any] = {"setup": "eye-in-hand", "camera": TRUTH.camera, "method": "robot"}
+    once = calibrate_hand_eye(robot, seen, **options)
+    again = [view for number in (2, 3) for view in more_views(number)]
+    thrice = calibrate_hand_eye(3 * robot, [*seen, *again], **options)
+    assert thrice.translation_error > 0.6 * once.translation_error
+    (few,) = [one.text for one in thrice.warnings if one.code == Code.TOO_FEW]
+    assert few.endswith("got 6 that are different, of 18")
+    assert thrice.verdict.level == "unknown"
+
+
+def more_views(seed: int) -> list[TargetView]:
+    random = np.random.default_rng(seed)
+    return TRUTH.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)[1]

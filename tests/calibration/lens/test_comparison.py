@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Code, Transform, compare
-from smartcam.calibration._inside import compare_lenses, rig_difference
-from smartcam.calibration._lens.comparison import Lens
+from smartcam.calibration._inside import Lens, compare_lenses, rig_difference
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import IDENTITY, exp_rotation
 from tests.calibration import lenskit

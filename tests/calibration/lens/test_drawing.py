@@ -30,7 +30,7 @@ from tests.calibration.lens.estimates import Bench, spread_poses
 from tests.calibration.scenes import SHEET, scene
 
 if TYPE_CHECKING:
-    from smartcam.calibration._hand_eye.equations import Setup
+    from tests.calibration.inside import Setup
 
 BENCH = Bench(lenskit.LEFT, spread_poses(lenskit.LEFT, 12))
 LENS = BENCH.calibration()

@@ -25,14 +25,13 @@ from smartcam.calibration._lens.bundle import (
     adjust,
     adjust_weighted,
     leave_out,
-    lens_values,
     residuals,
-    with_lens,
 )
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, choose_shape
 from smartcam.calibration._lens.start import fit_lens, lens_basis, parameter_names
 from smartcam.geometry._inside import Rigid
+from tests.calibration.inside import lens_values, with_lens
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, RIG, RIGHT, WIDE, pairs, poses, seen
 
 if TYPE_CHECKING:

@@ -142,7 +142,7 @@ def test_linearize_of_each_model_gives_the_derivatives(camera: CameraModel) -> N
 
 @pytest.mark.parametrize("camera", [LEFT, WIDE, FISHEYE], ids=lambda one: one.distortion_model)
 def test_linearize_of_each_model_gives_the_derivatives_by_the_lens(camera: CameraModel) -> None:
-    from smartcam.calibration._lens.bundle import lens_values, with_lens
+    from tests.calibration.inside import lens_values, with_lens
 
     found, values = linearize(POINTS, camera).by_lens, lens_values(camera)
     for number, step in enumerate(STEP * np.eye(len(values))):

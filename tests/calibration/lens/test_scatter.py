@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Code, calibrate_intrinsics, compare
-from smartcam.calibration._inside import compare_lenses
-from smartcam.calibration._lens.bundle import lens_values, with_lens
-from smartcam.calibration._lens.comparison import Lens
+from smartcam.calibration._inside import Lens, compare_lenses
+from tests.calibration.inside import lens_values, with_lens
 from tests.calibration.lens.estimates import spread_poses
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, poses, seen
 

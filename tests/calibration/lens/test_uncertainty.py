@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Code, calibrate_intrinsics
-from smartcam.calibration._inside import compare_lenses
-from smartcam.calibration._lens.comparison import Lens
+from smartcam.calibration._inside import Lens, compare_lenses
 from smartcam.calibration._lens.uncertainty import figures, uncertainty
 from smartcam.exceptions import CalibrationError
 from tests.calibration import lenskit

@@ -129,3 +129,33 @@ def test_option_that_is_no_positive_number_is_refused(name: str, value: Any) -> 
     options: dict[str, Any] = {name: value}
     with refused("NOT_FINITE", f"{name}: expected a positive number of"):
         fit_plane(marks, np.pad(marks, ((0, 0), (0, 1))), **options)
+
+
+@pytest.mark.parametrize("sigma", [None, SIGMA])
+def test_rows_of_a_grid_touched_one_further_are_told_though_most_points_agree(
+    sigma: float | None,
+) -> None:
+    marks = np.array([(0.15 * i, 0.12 * j) for j in range(3) for i in range(3)])
+    touches = np.roll(SCENE.touched(marks, 1), 3, axis=0)  # two rows agree with each other
+    found = fit_plane(marks, touches, touch_sigma=sigma, tool_z=DOWN, robust=True)
+    assert "WRONG_ORDER" in {one.code for one in found.warnings}
+    assert found.verdict.level == "poor"
+
+
+def test_exchanged_touches_that_are_left_out_are_not_told_twice() -> None:
+    marks = layout(12, np.random.default_rng(2))
+    touches = SCENE.touched(marks, 1)[[1, 0, *range(2, 12)]]
+    found = fit_plane(marks, touches, touch_sigma=SIGMA, tool_z=DOWN, robust=True)
+    assert found.outliers == (0, 1)
+    assert {one.code for one in found.warnings} == {"OUTLIER"}
+    assert found.verdict.level == "good"
+
+
+def test_touches_in_millimetres_are_refused_with_the_question() -> None:
+    marks = layout(9, np.random.default_rng(4))
+    with refused("UNIT_UNKNOWN", "are they millimetres?"):
+        fit_plane(marks, 1000 * SCENE.touched(marks, 1), tool_z=DOWN)
+    touches = SCENE.touched(marks, 1)
+    touches[3] *= 1000
+    with refused("UNIT_UNKNOWN", "are they millimetres?"):
+        fit_plane(marks, touches, tool_z=DOWN)

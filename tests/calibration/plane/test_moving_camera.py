@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import Chain, MovingCamera, PoseHistory, Transform, chain_of, fit_plane
 from smartcam.calibration._plane.moving_camera import Moved
-from smartcam.calibration._solvers import Poses, RealWorldPosition
+from smartcam.calibration._solvers import Poses
+from tests.calibration.inside import RealWorldPosition
 from tests.geometry.rigid import (
     NOON,
     after,

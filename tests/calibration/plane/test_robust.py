@@ -16,7 +16,7 @@ from smartcam.calibration import Code, PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
 from smartcam.calibration._plane.fitting import Fit, fit
 from smartcam.calibration._plane.robust import (
-    FITTED_PROPOSALS,
+    MAX_FITTED_PROPOSALS,
     MAX_SUBSETS_TRIED,
     PROPOSALS,
     agreeing,
@@ -312,5 +312,5 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
     assert len(proposed) == 2
     assert max(proposed) <= MAX_SUBSETS_TRIED
     assert (
-        len(fitted) <= 2 * FITTED_PROPOSALS * 3
+        len(fitted) <= 2 * MAX_FITTED_PROPOSALS * 3
     )  # a round of each, one that judges anew, and one that confirms

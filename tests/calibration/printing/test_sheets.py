@@ -25,10 +25,11 @@ from smartcam.calibration import (
 )
 from smartcam.calibration._inside import Target, on_paper
 from smartcam.calibration._printing.page import Disc, Label, Polygon
-from smartcam.calibration._printing.page_layout import BORDER
-from smartcam.calibration._printing.sheets import Rays, page_size
+from smartcam.calibration._printing.page_layout import BORDER_MM
+from smartcam.calibration._printing.sheets import page_size
 from smartcam.exceptions import CalibrationError
 from tests import ROOT
+from tests.calibration.inside import Rays
 
 GOLDEN = ROOT / "docs" / "sheet.svg"
 
@@ -89,7 +90,7 @@ def test_sheet_is_inside_the_border_and_nothing_overlaps_the_pattern(target: Tar
     sheet = make_sheet(target)
     boxes = [bounds(shape) for shape in sheet.shapes]
     for left, low, right, high in boxes:
-        assert min(left, low, sheet.width - right, sheet.height - high) >= BORDER - 1e-9
+        assert min(left, low, sheet.width - right, sheet.height - high) >= BORDER_MM - 1e-9
     count = pattern_length(sheet)
     pattern = np.array(boxes[:count])
     whole = (*pattern[:, :2].min(axis=0), *pattern[:, 2:].max(axis=0))

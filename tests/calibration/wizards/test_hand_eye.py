@@ -15,7 +15,7 @@ from smartcam.calibration.formats import ROBOTS, pose_to
 from smartcam.calibration.simulation import render
 from smartcam.calibration.wizards import WizardSession, hand_eye_wizard
 from smartcam.calibration.wizards._hand_eye import SUGGESTIONS
-from smartcam.calibration.wizards._journal import Journal
+from tests.calibration.inside import Journal
 from tests.calibration.scenes import SHEET, scene
 from tests.calibration.wizards.bench import say
 from tests.processes import printed_by

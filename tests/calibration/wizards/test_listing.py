@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Folder, PlaneCalibration, fit_plane
-from smartcam.calibration._files.store import read_document, write
+from smartcam.calibration._files.directory import MAX_NAME_LENGTH
+from smartcam.calibration._files.store import BACKUPS
 from smartcam.calibration._inside import listing
+from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration.wizards import CalibrationService
+from smartcam.calibration.wizards._services import MAX_EARLIER_JOURNALS
+from tests import ROOT
+from tests.calibration.inside import read_document, write
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,3 +87,14 @@ def test_listing_names_what_cannot_be_read_and_goes_on(tmp_path: Path) -> None:
         None,
         None,
     )
+
+
+def test_wizards_bounds_are_those_of_the_code() -> None:
+    said = {
+        f"Names have up to {MAX_NAME_LENGTH} letters",
+        f"`NAME.json.1` to `.{BACKUPS}`",
+        f"`NAME.journal.1` to `.{MAX_EARLIER_JOURNALS}`",
+        f"printed {RULER_MM:g} mm ruler",
+    }
+    page = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
+    assert {text for text in said if text not in page} == set()

@@ -55,7 +55,7 @@ def test_picture_that_is_none_is_refused(data: bytes) -> None:
 
 
 def test_picture_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "MAX_PICTURE", 100)
+    monkeypatch.setattr(pictures, "MAX_PICTURE_BYTES", 100)
     with refused("BAD_PICTURE", "expected 100 bytes at most, got"):
         decode_picture(encoded())
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import PlaneCalibration
-from smartcam.calibration._files.store import read_document
 from smartcam.calibration.wizards import WizardSession, plane_wizard
-from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._marks import MAX_MARKS
+from tests.calibration.inside import Journal, read_document
 from tests.calibration.wizards.bench import GRID, OFFSET, Bench, say, where
 from tests.processes import printed_by
+
+MAX_MARKS = 25
 
 
 def begin(
@@ -515,3 +515,33 @@ async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
     printed = printed_by(result["use"]["python"])
     told = [float(one) for one in printed.strip("[]\n").split()]
     assert told == pytest.approx(where(*GRID[0]), abs=0.001)
+
+
+async def test_side_that_was_not_said_is_asked_for_before_it_is_called_good(
+    tmp_path: Path,
+) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2, "side": "unknown"})
+    view = await touch_all(session, bench)
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("unknown", "side")
+    view = await say(session)
+    assert view["step"] == "side"
+    view = await say(session, {"side": "-z"})
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("good", "accept")
+    await say(session)
+    await say(session)
+    found = PlaneCalibration.load(tmp_path / "table.json")
+    assert found.tool_z is not None
+    assert found.tool_z.tolist() == [0.0, 0.0, -1.0]
+
+
+async def test_side_that_contradicts_the_touches_is_told_as_mirrored(tmp_path: Path) -> None:
+    bench = Bench()
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2, "side": "unknown"})
+    await touch_all(session, bench)
+    await say(session)
+    view = await say(session, {"side": "+z"})
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("poor", "more")
+    assert view["notes"][0].startswith("MIRRORED: ")

@@ -14,8 +14,9 @@ import pytest
 
 from smartcam.calibration.wizards import Step, Wizard, WizardSession, ask
 from smartcam.calibration.wizards import _journal as module
-from smartcam.calibration.wizards._journal import MAX_LINE, Journal
+from smartcam.calibration.wizards._journal import MAX_LINE_BYTES
 from smartcam.exceptions import CalibrationError, NotRunningError
+from tests.calibration.inside import Journal
 from tests.calibration.wizards import wizards
 from tests.calibration.wizards.wizards import ANSWERS, Trigger, answer_all, survey
 
@@ -525,7 +526,7 @@ def test_journal_in_use_is_refused_until_it_is_closed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(float("nan"), "cannot be stored"), ("x" * MAX_LINE, "expected 1048576 at most")],
+    [(float("nan"), "cannot be stored"), ("x" * MAX_LINE_BYTES, "expected 1048576 at most")],
 )
 def test_entry_that_cannot_be_kept_is_refused(tmp_path: Path, value: object, text: str) -> None:
     with Journal(tmp_path / "a.journal") as journal:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from smartcam.calibration.wizards import Number, Step, Wizard, WizardSession, ask
-from smartcam.calibration.wizards._journal import Journal
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import Journal
 
 LENGTH = 6
 

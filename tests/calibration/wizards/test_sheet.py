@@ -13,10 +13,20 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Checkerboard, SheetCalibration
-from smartcam.calibration._files.store import read_document
 from smartcam.calibration.simulation import render
 from tests.calibration import sheetkit
-from tests.calibration.sheetkit import CAMERA, LIES, TARGET, Cell, begin, field, next_answer, truth
+from tests.calibration.inside import read_document
+from tests.calibration.sheetkit import (
+    CAMERA,
+    LIES,
+    SEEN,
+    TARGET,
+    Cell,
+    begin,
+    field,
+    next_answer,
+    truth,
+)
 from tests.calibration.wizards.bench import say
 
 
@@ -38,7 +48,7 @@ async def test_corners_touched_give_a_calibration_as_good_as_predicted(tmp_path:
         view = await say(session, {"next": "more"})
         view = await say(session, cell.corner(view))
     assert len(view["preview"]["points"]) == 9
-    await say(session)
+    await say(session, {"next": "accept"})
     view = await say(session)
     assert (view["type"], view["result"]["seen"], view["result"]["points"]) == ("result", 54, 9)
     found = SheetCalibration.load(tmp_path / "table.json")
@@ -342,3 +352,27 @@ def test_process_killed_with_a_picture_under_way_takes_the_step_or_leaves_it(
     with start(tmp_path) as process:
         assert says(process)["number"] in {4, 5}
         process.kill()
+
+
+async def test_one_of_five_touches_that_is_off_is_named_and_not_the_print(tmp_path: Path) -> None:
+    cell = Cell(sigma=0.0)
+    session = begin(tmp_path, cell, side="-z")
+    view = await go_to(session, cell, "touch-2")
+    off = cell.corner(view)
+    view = await say(session, {**off, "x": off["x"] + 5})
+    for _ in range(2):
+        view = await say(session, cell.corner(view))
+    await say(session, {"next": "more"})
+    view = await say(session, cell.corner(session.current))
+    assert view["verdict"]["text"] == "Not good enough: touch point 2 again"
+    assert (view["defaults"]["next"], view["defaults"]["point"]) == ("redo", 2)
+
+
+async def test_direction_of_the_pictures_right_side_is_told(tmp_path: Path) -> None:
+    cell = Cell(sigma=0.0)
+    session = begin(tmp_path, cell, side="-z")
+    view = await go_to(session, cell, "review")
+    right = (LIES.rotation @ SEEN.rotation.T)[:, 0]
+    (note,) = [one for one in view["notes"] if "to the right in the picture" in one]
+    told = [float(one) for one in re.findall(r"-?\d\.\d\d", note)]
+    assert np.allclose(told, right, atol=0.18)  # the sheet is tilted before the camera

@@ -19,11 +19,12 @@ import pytest
 from smartcam.calibration import Checkerboard, Code, PlaneCalibration, TargetView, fit_plane
 from smartcam.calibration._inside import LOOKS
 from smartcam.calibration.wizards._marks import Mark
-from smartcam.calibration.wizards._target_drawing import MAX_SIDE, cell_counts, draw
-from smartcam.calibration.wizards._touch_previews import CELLS, before, compared, plain
+from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw
+from smartcam.calibration.wizards._touch_previews import HEAT_MAP_CELLS, before, compared, plain
 from smartcam.calibration.wizards._touches import Touch
-from smartcam.calibration.wizards._view_suggestions import Look, outline
+from smartcam.calibration.wizards._view_suggestions import Look
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import outline
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene
 
 if TYPE_CHECKING:
@@ -96,8 +97,8 @@ def test_preview_has_the_camera_s_picture_under_it() -> None:
 def test_preview_of_a_large_image_is_bounded(size: tuple[int, int]) -> None:
     random = np.random.default_rng(1)
     drawn = draw(random.integers(0, 255, size, dtype=np.uint8))
-    assert max(picture_in(drawn).shape) == MAX_SIDE
-    assert len(drawn) < 1.5 * MAX_SIDE**2 + 5000
+    assert max(picture_in(drawn).shape) == MAX_SIDE_PX
+    assert len(drawn) < 1.5 * MAX_SIDE_PX**2 + 5000
 
 
 def test_preview_draws_points_where_the_picture_has_them() -> None:
@@ -233,7 +234,7 @@ def test_compared_heat_is_the_predicted_error_at_each_cell() -> None:
     assert preview["worst"] == 2
     assert json.loads(json.dumps(preview, allow_nan=False)) == preview
     cells = middles(preview)
-    assert max(cells.shape[:2]) == CELLS
+    assert max(cells.shape[:2]) == HEAT_MAP_CELLS
     across, centre = found.rotation, found.robot_points.mean(axis=0)
     places = cells.reshape(-1, 2) @ across[:, :2].T + centre
     expected = 1e3 * found.predicted_error(found.inverse(places))

@@ -58,6 +58,8 @@ def test_verdict_is_not_good_beyond_what_is_allowed() -> None:
 def test_verdict_is_not_known_where_all_may_be_mirrored() -> None:
     judged = judge(0.1, [(Code.SIDE_UNKNOWN, "not checked")], worst=1, allowed=ALLOWED)
     assert (judged.verdict.level, judged.good_for) == ("unknown", None)
+    assert judged.chosen(["accept", "more", "redo", "side"]) == "side"
+    assert judged.chosen(["accept", "more", "redo"]) == "redo"
     assert "say where the tool points" in judged.verdict.text
 
 

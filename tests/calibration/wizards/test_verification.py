@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Folder, PlaneCalibration, fit_plane, fit_touches
-from smartcam.calibration._files.store import write
 from smartcam.calibration.wizards import WizardSession, drift_wizard
-from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._verification import MAX_TOUCHES, touches_needed
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
+from tests.calibration.inside import Journal, write
 from tests.calibration.wizards.bench import GRID, Bench, say, where
 
 SIGMA = 0.0002

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from smartcam.calibration._inside import LOOKS, suggestion
-from smartcam.calibration.wizards._view_suggestions import outline
 from tests.calibration import lenskit
+from tests.calibration.inside import outline
 from tests.calibration.lens.estimates import spread_poses
 
 VIEWS = lenskit.seen(lenskit.LEFT, spread_poses(lenskit.LEFT, 3))

@@ -15,9 +15,9 @@ from smartcam.emulator._insight.commands import InSightCommands
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._insight.image import bitmap, check_image, grey_pattern
 from smartcam.emulator._insight.job import Control, make_job, shown
-from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._inside import StatusCode
-from smartcam.protocols._insight.words import COMMANDS
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.frames._inside import read_bitmap
+from smartcam.protocols._inside import StatusCode, words
 
 SECOND = 1_000_000_000
 
@@ -198,7 +198,7 @@ def test_operator_s_word_is_kept_when_a_client_asks_for_online() -> None:
 LINES = st.builds(
     "".join,
     st.tuples(
-        st.sampled_from([*COMMANDS, *map(str.lower, COMMANDS), "QQ"]),
+        st.sampled_from([*words.COMMANDS, *map(str.lower, words.COMMANDS), "QQ"]),
         st.sampled_from(
             ["", "0", "1", "8", "7", "A001", "B0025", "C0031.5", "D004", "name 5", "a"]
         ),
@@ -229,3 +229,13 @@ def test_every_line_has_exactly_one_answer(lines: list[str], online: bool) -> No
         assert int(first) in {code.value for code in StatusCode}
         assert said[-1][0].endswith(b"\r\n")
         assert not device.busy
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 1 << 30))
+def test_grey_bitmap_comes_back(width: int, height: int, seed: int) -> None:
+    pixels = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
+    data = bitmap(pixels)
+    assert (read_bitmap(data) == pixels).all()
+    for length in (0, 20, 53, len(data) - 1):
+        with pytest.raises(FrameFormatError):
+            read_bitmap(data[:length])

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from smartcam.emulator import EmulatedInSight, InSightQuirks, ManualClock
-from smartcam.emulator._insight.connection import MAX_SESSIONS
-from smartcam.emulator._line_camera import MAX_INPUT_BYTES
-from smartcam.emulator._line_codec import MAX_LOGGED
-from smartcam.emulator._links import _TcpLink
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
+from tests.emulator.inside import _TcpLink
 from tests.emulator.insight import insight_wire as wire
 from tests.emulator.insight.insight_wire import TelnetClient
 from tests.handmade import until
+
+MAX_INPUT_BYTES = 64 << 10
+MAX_LOGGED = 4 << 10
+MAX_SESSIONS = 16
+
 
 JOB = {"file": "1.job", "cells": {"A1": 5}, "acquisition_time": 0.1, "processing_time": 0.1}
 

@@ -15,7 +15,7 @@ import numpy as np
 import smartcam.frames
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameAddress
-from smartcam.frames._gige.driver import GigEDriver
+from smartcam.frames._inside import GigEDriver
 
 PROGRAM = "arv-fake-gv-camera-0.8"
 

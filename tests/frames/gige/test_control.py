@@ -14,12 +14,11 @@ from smartcam.frames import FrameAddress
 from smartcam.frames._gige import driver
 from smartcam.frames._gige import force_address as force
 from smartcam.frames._gige import places as _places
-from smartcam.frames._gige.control import ControlChannel, RequestRefusedError
+from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._gige.discovery import AnsweringCamera as Found
 from smartcam.frames._gige.discovery import Network, find, networks
-from smartcam.frames._gige.driver import GigEDriver
-from smartcam.frames._gige.force_address import checked_mac, force_address
 from smartcam.frames._gige.gvcp import DeviceInfo
+from smartcam.frames._inside import ControlChannel, GigEDriver, checked_mac, force_address
 from tests.frames.gige.camera import camera
 
 Answers = Callable[[int, bytes], list[bytes]]

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameSourceError, MessageError
 from smartcam.frames._gige import description as _description
-from smartcam.frames._gige.description import locate, parse, unpack
+from smartcam.frames._gige.description import locate, unpack
 from smartcam.frames._gige.event_channel import decode_events
 from smartcam.frames._gige.expressions import evaluate
-from smartcam.frames._gige.features import GenicamFeatures
 from smartcam.frames._gige.messages import MAX_CHUNKS, MessageFeatures, cut_chunks
+from smartcam.frames._inside import GenicamFeatures
 from tests.frames.gige.camera import DESCRIPTION, HEAD
+from tests.frames.inside import parse
 
 
 def described(inside: str) -> str:
@@ -468,3 +469,24 @@ def test_event_values_are_those_of_emvas_genapi(block: int, ticks: int, more: by
     adapter.detach_node_map()
     assert values == expected
     assert not problems
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_description_packed_by_other_than_deflate_is_refused(method: int) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", method) as archive:
+        archive.writestr("a.xml", b"<RegisterDescription/>")
+    with pytest.raises(MessageError, match=rf"expected DEFLATE .* got method {method}"):
+        _description.unpack(packed.getvalue())
+
+
+def test_description_in_a_large_archive_is_refused() -> None:
+    with pytest.raises(MessageError, match="ZIP archive: expected at most"):
+        _description.unpack(b"PK" + bytes(_description.MAX_PACKED_BYTES))
+
+
+def test_description_of_a_structure_with_many_entries_is_refused() -> None:
+    text = "<Sign/>" * 1000 + '<StructEntry Name="e"/>' * 1000
+    text = f"<RegisterDescription><StructReg>{text}</StructReg></RegisterDescription>"
+    with pytest.raises(MessageError, match="StructReg counted for each entry"):
+        _description.parse(text.encode())

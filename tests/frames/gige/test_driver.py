@@ -14,7 +14,7 @@ from smartcam.exceptions import (
     FrameTimeoutError,
 )
 from smartcam.frames import Frame, FrameAddress, FrameSink, Moment
-from smartcam.frames._gige.driver import GigEDriver
+from smartcam.frames._inside import GigEDriver
 from tests.frames.gige import camera as cameras
 from tests.frames.gige.camera import Camera, Mischief, camera, number_in
 

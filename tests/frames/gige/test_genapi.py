@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import SmartCamError
-from smartcam.frames._gige.description import parse
-from smartcam.frames._gige.features import GenicamFeatures
+from smartcam.frames._inside import GenicamFeatures
 from tests.frames.gige.camera import HEAD
+from tests.frames.inside import parse
 
 genapi = pytest.importorskip("genicam.genapi", reason="needs PyPI's genicam")
 

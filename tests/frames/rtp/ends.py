@@ -14,7 +14,7 @@ import time
 from smartcam import frames
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames._inside import read_stamp
-from smartcam.frames._streaming.rtp.driver import RtpDriver
+from tests.frames.inside import RtpDriver
 
 
 def say(what: object) -> None:

@@ -8,7 +8,7 @@ import secrets
 import socket
 from typing import TYPE_CHECKING, Any
 
-from smartcam.frames._streaming.rtp.packets import RtpPacket, is_rtcp
+from tests.frames.inside import RtpPacket, is_rtcp
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.frames import find_format
 from smartcam.frames._inside import read_stamp
-from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
-from smartcam.frames._streaming.rtp.packets import RtpPacket
+from tests.frames.inside import Depacketizer, RtpPacket
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
 
 if TYPE_CHECKING:

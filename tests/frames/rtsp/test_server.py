@@ -13,13 +13,6 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames import RtspServer
-from smartcam.frames._streaming.rtsp.connection import (
-    IDLE_TIMEOUT,
-    MAX_STRAY_PACKETS,
-    REQUEST_TIMEOUT,
-)
-from smartcam.frames._streaming.rtsp.session import TIMEOUT
-from smartcam.frames._streaming.shared_stream import LINGER
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.rtsp.client import TCP, Client, digest
 from tests.frames.rtsp.test_shared_stream import drawn
@@ -30,6 +23,13 @@ if TYPE_CHECKING:
 
     from tests.frames.drivers import ScriptedDriver
     from tests.frames.rtsp.client import Reply
+
+IDLE_TIMEOUT = 60.0
+LINGER = 2.0
+MAX_STRAY_PACKETS = 64
+REQUEST_TIMEOUT = 10.0
+TIMEOUT = 60
+
 
 pytestmark = pytest.mark.usefixtures("no_leaks")
 

@@ -18,7 +18,6 @@ from smartcam.frames._streaming.rtp.packets import (
     Goodbye,
     PictureLost,
     ReceiverReport,
-    RtpPacket,
     SenderReport,
     SourceDescription,
     compound,
@@ -33,9 +32,9 @@ from smartcam.frames._streaming.rtsp.session import (
     TIMEOUT,
 )
 from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER
-from smartcam.frames._synthetic import write_stamp
 from tests.frames.drivers import GoneError, scripted
-from tests.frames.pictures import frame_of, stamped
+from tests.frames.inside import RtpPacket
+from tests.frames.pictures import frame_of, stamped, write_stamp
 from tests.frames.rtsp.client import Client, Watcher
 from tests.handmade import until
 

@@ -60,6 +60,7 @@ class Request:
     method: str
     url: str
     headers: dict[str, str]
+    body: str = ""
 
     @property
     def cseq(self) -> str:
@@ -86,6 +87,8 @@ class Camera:
         default=lambda data, sequence, stamp: numbered(data, sequence, stamp)
     )
     channel: int = 0
+    sender: str = "127.0.0.1"
+    source: str = ""
     session: str = "17;timeout=60"
     base: bool = True
     every: float = 0.01
@@ -152,7 +155,9 @@ class Session:
         start, *lines = text.strip().split("\r\n")
         headers = dict(line.split(": ", 1) for line in lines)
         method, url, *_ = start.split()
-        return Request(method, url, {key.lower(): value for key, value in headers.items()})
+        headers = {key.lower(): value for key, value in headers.items()}
+        body = await self.reader.readexactly(int(headers.get("content-length", "0")))
+        return Request(method, url, headers, body.decode())
 
     def answer(self, request: Request, status: str = "200 OK", body: str = "") -> None:
         camera, method = self.camera, request.method
@@ -177,10 +182,11 @@ class Session:
             channels = f"{self.camera.channel}-{self.camera.channel + 1}"
             return f"RTP/AVP/TCP;unicast;interleaved={channels}"
         made = socket.socket(type=socket.SOCK_DGRAM)
-        made.bind(("127.0.0.1", 0))
+        made.bind((self.camera.sender, 0))
         self.udp = (made, int(found[1]))
         port = made.getsockname()[1]
-        return f"{said};server_port={port}-{port + 1};ssrc=00000007"
+        source = f";source={self.camera.source}" if self.camera.source else ""
+        return f"{said}{source};server_port={port}-{port + 1};ssrc=00000007"
 
     async def play(self) -> None:
         camera = self.camera

@@ -111,6 +111,16 @@ ODD: dict[str, dict[str, Any]] = {
     "two videos, one unknown": sdp(
         "m=video", "m=video 0 RTP/AVP 97\r\na=rtpmap:97 VP9/90000\r\na=control:track0\r\nm=video"
     ),
+    "small letters, blanks and tabs": sdp(
+        "m=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000",
+        " M=video  0  RTP/AVP  96 \r\n\ta=RTPMAP: 96\th264/90000 ",
+    ),
+    "lines of nothing": {"sdp": "\r\n" + SDP.replace("\r\n", "\r\n\r\n") + "\0\r\n=\r\nx"},
+    "a port with a count": sdp("m=video 0", "m=video 49170/2"),
+    "AVPF": sdp("RTP/AVP 96", "RTP/AVPF 96"),
+    "the controls end with a slash": sdp("a=control:track1", "a=control:track1/"),
+    "the source told is of another network": {"source": "10.9.8.7"},
+    "the source told is none": {"source": "camera.local"},
     "two types in a line": sdp("RTP/AVP 96", "RTP/AVP 97 96"),
     "another channel than asked for": {"channel": 6},
     "a session without a timeout": {"session": "abc"},
@@ -135,6 +145,28 @@ async def test_an_odd_camera_gives_all_its_pictures(camera: Camera, name: str, h
     assert in_a_row(got)
     assert sum(frame.lost for frame in got) == 0
     assert "TEARDOWN" in camera.methods
+
+
+async def test_a_camera_may_send_from_another_address_that_its_server_says(
+    camera: Camera,
+) -> None:
+    camera.sender = camera.source = "127.0.0.2"  # as behind a recorder
+    assert in_a_row(await read(camera, how="&transport=udp"))
+    camera.source = ""
+    with pytest.raises(FrameSourceError, match="expected a whole picture, got none"):
+        await read(camera, how="&transport=udp")
+
+
+@pytest.mark.parametrize("between", [" \r\n ", '"'])
+async def test_parameters_may_stand_in_several_lines(encoded: list[bytes], between: str) -> None:
+    camera = Camera([without_sets(one) for one in encoded])
+    sets = sprop(encoded[0])
+    if between == '"':
+        more = f'a=fmtp:96 sprop-parameter-sets="{sets}"\r\n'
+    else:
+        more = f"a=fmtp:96 profile-level-id=42c01f\r\na=fmtp:96 sprop-parameter-sets={sets};\r\n"
+    camera.sdp = SDP.replace("a=control:track1", f"{more}a=control:track1")
+    assert in_a_row(await read(camera))
 
 
 async def test_parameters_may_stand_in_the_description_alone(encoded: list[bytes]) -> None:

@@ -15,8 +15,9 @@ import threading
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from smartcam.frames._v4l2 import abi, system
+from smartcam.frames._v4l2 import abi
 from smartcam.frames._v4l2.abi import Ioctl
+from tests.frames.inside import system
 
 TABLE = Path(__file__).with_name("vivid.json")
 WRAPPED = ("open", "close", "ioctl", "pages", "nodes", "now")

@@ -9,7 +9,7 @@ import asyncio
 from pathlib import Path
 
 import smartcam.frames
-from smartcam.frames._v4l2 import discovery, system
+from tests.frames.inside import discovery, system
 from tests.frames.v4l2.conversations import WRAPPED, Recorder
 from tests.frames.v4l2.scenarios import FEW, SCENARIOS
 

@@ -1,4 +1,4 @@
-"""Encoded frames of payloads: whole ones, or none."""
+"""Assemble encoded frames from payloads: whole ones, or none."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ START, END = 0x80, 0x40
 START_CODE: Final = b"\0\0\0\1"
 
 MAX_ACCESS_UNIT_BYTES: Final = 16 << 20
-"""Bytes of an access unit: one that is larger is damaged."""
+"""Largest number of bytes of an access unit: one that is larger is damaged."""
 
 
 class AccessUnit(NamedTuple):
@@ -24,10 +24,10 @@ class AccessUnit(NamedTuple):
     Attributes:
         data: bytes as in a file (annex B, or a JPEG).
         timestamp: ticks of 90 kHz.
-        lost: packets that were lost since the last one that came whole.
-        damaged: frames since then of which some packets came, but not all.
+        lost: number of packets lost since the last whole frame.
+        damaged: number of frames since then of which only a part came.
         arrived: time of arrival of its first packet; 0.0 where that is not known.
-        begins: whether the packet is the first one of a stream: nothing before it belongs to that.
+        begins: whether its first packet is the first one of a stream.
     """
 
     data: bytes
@@ -39,12 +39,12 @@ class AccessUnit(NamedTuple):
 
 
 class OpenUnit(ABC):
-    """An access unit that packets are still to come for.
+    """An access unit that is still incomplete.
 
     Attributes:
-        whole: nothing of it is missing so far.
-        has_picture: whether a part of the picture came, and not parameters alone.
-        parts: what came, in order.
+        whole: whether nothing is missing so far.
+        has_picture: whether a part of the picture came, and not only parameters.
+        parts: bytes that came, in order.
     """
 
     def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
@@ -54,7 +54,7 @@ class OpenUnit(ABC):
         self.has_picture = False
 
     def add(self, payload: bytes) -> None:
-        """Take a packet's payload; one that is not valid makes the unit damaged."""
+        """Take a packet's payload; an invalid one makes the unit damaged."""
         if self.whole:
             self.size += len(payload) + len(START_CODE)
             self.whole = self.size <= MAX_ACCESS_UNIT_BYTES and (
@@ -68,7 +68,7 @@ class OpenUnit(ABC):
         return self.whole and bool(self.parts)
 
     def data(self) -> bytes:
-        """Return the encoded frame."""
+        """Return the bytes of the encoded frame."""
         return b"".join(self.parts)
 
     @abstractmethod
@@ -77,19 +77,19 @@ class OpenUnit(ABC):
 
 
 class UnitKind(Protocol):
-    """The kind of unit that is made of a stream's payloads."""
+    """The kind of unit that a stream's payloads form."""
 
     def open(self, timestamp: int, whole: bool, arrived: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
     def begins(self, payload: bytes, /) -> bool:
-        """Return True if a packet is surely the first one of a frame."""
+        """Return True if a packet is certainly the first one of a frame."""
         ...
 
 
 class NalUnit(OpenUnit):
-    """An access unit of H.264's kind: of units, several in a packet or one in parts."""
+    """An access unit like H.264's: it has units, several in a packet or one in parts."""
 
     HEAD: ClassVar[int]
     """Bytes before a unit's content."""
@@ -100,7 +100,7 @@ class NalUnit(OpenUnit):
 
     def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
         super().__init__(timestamp, whole, arrived)
-        self._part_of = -1  # kind of the unit whose parts come
+        self._part_of = -1  # kind of the unit whose parts are coming
 
     @staticmethod
     @abstractmethod
@@ -115,20 +115,22 @@ class NalUnit(OpenUnit):
     @classmethod
     @abstractmethod
     def whole_head(cls, payload: bytes) -> bytes:
-        """Return the head of the unit that a packet has a part of."""
+        """Return the head of the unit whose part is in a packet."""
 
     @classmethod
     def leading(cls, access_unit: bytes) -> Iterator[bytes]:
-        """Yield the units before a frame's picture and the first of the picture, without codes."""
+        """Yield the units before a frame's picture, without codes, and the head of the picture."""
         place = access_unit.find(b"\0\0\1")
         while place >= 0:
-            after = access_unit.find(b"\0\0\1", place + 3)
-            unit = access_unit[place + 3 : after if after >= 0 else len(access_unit)].rstrip(b"\0")
-            kind = cls.kind_of(unit[0]) if len(unit) >= cls.HEAD else -1
-            if kind >= 0:
-                yield unit
-            if cls.is_picture(kind):
+            head = access_unit[place + 3 : place + 3 + cls.HEAD]
+            kind = cls.kind_of(head[0]) if len(head) == cls.HEAD else -1
+            if cls.is_picture(kind):  # its end is far away, and nobody asks for it
+                yield head
                 return
+            after = access_unit.find(b"\0\0\1", place + 3)
+            if kind >= 0:
+                end = after if after >= 0 else len(access_unit)
+                yield access_unit[place + 3 : end].rstrip(b"\0")
             place = after
 
     def ended(self) -> bool:

@@ -1,4 +1,4 @@
-"""The codings of streams: their payloads, their parameters and their decoders."""
+"""Define the codings of streams: their payloads, parameters and decoders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class H265Decoder(H264Decoder):
-    """One stream of H.265: as of H.264, but whole pictures come from key frames on alone."""
+    """One stream of H.265: like H.264, but whole pictures come only from key frames on."""
 
     CODEC: ClassVar = "hevc"
     NAME: ClassVar = "H265"
@@ -28,7 +28,7 @@ class H265Decoder(H264Decoder):
 
 
 class JpegDecoder(H264Decoder):
-    """One stream of JPEGs, none of which needs another one."""
+    """One stream of JPEGs, which do not depend on each other."""
 
     CODEC: ClassVar = "mjpeg"
     NAME: ClassVar = "JPEG"
@@ -43,9 +43,9 @@ class Coding(NamedTuple):
     Attributes:
         name: name of the codec.
         format: name of its encoded frames' format.
-        kind: makes the kind of its payloads.
-        size_in: returns the size of the pictures where an encoded frame tells it.
-        decoder: decodes a stream.
+        kind: function that returns the kind of its payloads.
+        size_in: function that returns the size of the pictures, if an encoded frame has it.
+        decoder: function that returns a decoder for a stream.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Encoded frames of a stream become frames of a source, with an account of the others."""
+"""Decode the encoded frames of a stream into frames of a source; count the others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._codecs.threads import Codecs, StreamRuns, at_once
-from smartcam.frames._frame import Frame, Moment, changed
+from smartcam.frames._frame import Frame, Moment, amend
 from smartcam.frames._pixels.formats import find_format
 
 if TYPE_CHECKING:
@@ -23,27 +23,30 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_FRAMES: Final = 16
-"""Encoded frames that wait for the decoder; what comes beyond ends with a key frame."""
+"""At most this many encoded frames wait for the decoder; further ones are dropped until a key
+frame."""
 
 MAX_UNDECODABLE_FRAMES: Final = 10
-"""Encoded frames in a row that cannot be decoded, from which on it may end with the reason."""
+"""After this many encoded frames in a row that cannot be decoded, the stream may end with the
+reason."""
 
 FAILURE_GRACE: Final = 3.0
-"""Seconds for which they must come before it ends: they may be a stranger's, who was first."""
+"""Seconds for which such frames must come before the stream ends: the first sender may have been a
+stranger."""
 
 
 DRAIN_TIMEOUT: Final = 5.0
-"""Seconds that frames which wait may take to be decoded when a stream has ended."""
+"""Seconds for decoding the waiting frames after a stream has ended."""
 
 DRAIN_LOOK_INTERVAL: Final = 0.005
-"""Seconds between two looks whether what waits at a stream's end was decoded."""
+"""Seconds between two checks whether all frames were decoded after a stream's end."""
 
 
 class UnitSource(Protocol):
-    """The source of encoded frames, as their decoding sees it."""
+    """The part of a receiver that decoding uses."""
 
     def utc(self, timestamp: int, /) -> float | None:
-        """Return a time on the sender's wall clock, where it told."""
+        """Return a time on the sender's wall clock, if the sender has reported it."""
         ...
 
     def want_picture(self) -> None:
@@ -56,16 +59,16 @@ class UnitSource(Protocol):
 
 
 class DecodingPlan(NamedTuple):
-    """The plan by which frames are made of a stream.
+    """The options for decoding a stream.
 
     Attributes:
         name: name of the source.
         coding: coding of the stream.
         delay: longest time from exposure to arrival, seconds.
         size: size that the pictures must have; None: any.
-        sets: parameters of the codec that were told beside the stream, as in a file.
-        to: pixel format of FFmpeg that pictures are converted to; "": as they are.
-        passed_on: whether encoded frames are handed on as they came.
+        sets: parameters of the codec from the stream's description, as in a file.
+        to: pixel format of FFmpeg that pictures are converted to; "": no conversion.
+        passed_on: whether encoded frames are passed on as they came.
     """
 
     name: str
@@ -78,11 +81,11 @@ class DecodingPlan(NamedTuple):
 
 
 class UnitDecoding:
-    """The decoding of a stream while a driver streams.
+    """Decodes a stream while a driver streams.
 
     Args:
-        plan: how.
-        sink: takes the frames, and what it ends with.
+        plan: options for decoding.
+        sink: receiver of the frames and of the final error.
     """
 
     def __init__(self, plan: DecodingPlan, sink: FrameSink) -> None:
@@ -93,29 +96,29 @@ class UnitDecoding:
         self._came = asyncio.Event()
         self.overflows = 0
         self._source: UnitSource | None = None
-        self._skipped = 0  # units that were thrown away since the last one was decoded
-        self._anew = True  # that what comes is another stream than what was decoded
+        self._skipped = 0  # number of units that were dropped since the last decoded one
+        self._anew = True  # whether the next unit belongs to another stream than the last one
         self._reorders = False
         self._pace = _UnitPace()
         self._missed = self._number = 0
-        self._failed = 0  # frames in a row that could not be decoded
+        self._failed = 0  # number of frames in a row that could not be decoded
         self._failing_since = 0.0
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
         self._run = StreamRuns(self._codecs)
         self._decoder: H264Decoder | None = None
-        self._idle = False  # that nothing is being decoded, nor waits
+        self._idle = False  # set while nothing is being decoded or waits
         self._task: asyncio.Task[None] | None = None
 
     async def begin(self, source: UnitSource) -> None:
-        """Decode what comes from a source."""
+        """Begin to decode the frames of a source."""
         self._source = source
         await self._codecs.__aenter__()
         self._task = asyncio.create_task(self._decode(), name=f"frames of {self._name}")
 
     async def end(self) -> None:
-        """End all; the sink hears no more."""
+        """End everything; the sink gets nothing more."""
         self._ended = True
         task, self._task = self._task, None
         if task is not None:
@@ -127,7 +130,7 @@ class UnitDecoding:
             await self._codecs.close()
 
     def over(self, error: FrameSourceError) -> None:
-        """Tell the sink that nothing more comes, once."""
+        """Report the end to the sink, once."""
         if not self._ended:
             self._ended = True
             error.source = self._name
@@ -136,9 +139,9 @@ class UnitDecoding:
             self._sink.ended(error)
 
     async def finish(self, error: FrameSourceError) -> None:
-        """Tell the sink that nothing more comes, when the frames that wait were decoded.
+        """Report the end to the sink, after the waiting frames were decoded.
 
-        It waits for them no longer than :data:`DRAIN_TIMEOUT`.
+        The wait is bounded by :data:`DRAIN_TIMEOUT`.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DRAIN_TIMEOUT):
@@ -147,7 +150,7 @@ class UnitDecoding:
         self.over(error)
 
     def take(self, units: list[AccessUnit]) -> None:
-        """Have encoded frames wait for the decoder, all or none."""
+        """Queue encoded frames for the decoder, all or none."""
         source = self._source
         assert source is not None  # noqa: S101 - nothing comes before it begins
         self._units += [(one, source.utc(one.timestamp)) for one in units]
@@ -166,7 +169,7 @@ class UnitDecoding:
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
-        """Tell the sink of an error, whatever it is."""
+        """Report any error to the sink."""
         try:
             yield
         except FrameSourceError as error:
@@ -177,7 +180,7 @@ class UnitDecoding:
             self.over(failed)
 
     async def _decode(self) -> None:
-        """Decode what cannot be decoded as soon as it comes."""
+        """Decode queued frames, which could not be decoded at once."""
         with self._told():
             while not self._ended:
                 if not self._units:
@@ -187,7 +190,7 @@ class UnitDecoding:
                 self._idle = False
                 if self._units:
                     await self._decode_next()
-                    await asyncio.sleep(0)  # pictures that came together do not hold up the loop
+                    await asyncio.sleep(0)  # pictures that came together must not block the loop
 
     async def _decode_next(self) -> None:
         unit, device_time = self._units.popleft()
@@ -223,7 +226,7 @@ class UnitDecoding:
             frame = await self._decoded(decoder, frame)
         if frame is not None:
             self._show(frame)
-        elif not (self._reorders and decoder.whole):  # there it waits for another one
+        elif not (self._reorders and decoder.whole):  # the coroutine waits there for another frame
             self._missed += 1
             if self._source is not None:
                 self._source.want_picture()
@@ -258,7 +261,8 @@ class UnitDecoding:
     async def _decoded(self, decoder: H264Decoder, frame: Frame) -> Frame | None:
         try:
             decoded = await decoder.decode(frame)
-        except FrameFormatError as exc:  # one may be damaged; if all are it is something else
+        # one frame may be damaged; if all are, the cause is another
+        except FrameFormatError as exc:
             self._failed += 1
             if self._failed == 1:
                 self._failing_since = self._loop.time()
@@ -276,25 +280,25 @@ class UnitDecoding:
         self._shown = True
         self._number += 1 + lost
         if not self._ended:
-            self._sink.frame(changed(picture, sequence=self._number, lost=lost))
+            self._sink.frame(amend(picture, sequence=self._number, lost=lost))
 
 
 class _UnitPace:
-    """The distance of encoded frames, which tells how many a gap had."""
+    """The pace of encoded frames, from which the number of frames in a gap follows."""
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._step = 0  # ticks between the last two that followed each other
+        self._step = 0  # ticks between the last two frames that followed each other
 
     def goes_back(self, unit: AccessUnit) -> bool:
-        """Return True if a frame is to be shown before one that came before it."""
+        """Return True if a frame must be shown before one that came earlier."""
         return self._last is not None and -STEP_MOST < self._since(unit) < 0
 
     def lost(self, unit: AccessUnit) -> int:
         """Return the number of frames lost before this one, as far as that can be known.
 
-        Of a gap in which whole frames vanished it is as many as fit into the time, at the pace of
-        the frames before, and no more than packets are missing.
+        For a gap in which whole frames vanished it is the number that fit into the time at the pace
+        of the frames before, but at most the number of missing packets.
         """
         since = 0 if self._last is None or unit.begins else self._since(unit)
         least = max(unit.damaged, 1 if unit.lost or unit.begins else 0)
@@ -311,7 +315,7 @@ class _UnitPace:
 
 
 STEP_MOST: Final = 60 * 90_000
-"""Ticks between two frames: further apart they are not of one pace."""
+"""Frames that are more ticks apart do not define a pace."""
 
 
 def _shown(size: tuple[int, int] | None) -> str:

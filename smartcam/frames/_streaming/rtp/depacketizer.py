@@ -1,4 +1,4 @@
-"""Encoded frames of one stream's packets: in order, each once, with an account of gaps."""
+"""Assemble the packets of one stream into encoded frames, in order and each once."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 64
-"""Packets that may wait for an earlier one that is missing."""
+"""Largest number of packets that may wait for an earlier one that is missing."""
 
 MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
-"""Packets: a sequence number further off is a stream that began anew, if a second one follows."""
+"""A sequence number that is further ahead, or behind, by this many packets shows a restarted
+stream, if a second one follows it."""
 
 MARKER_PROOFS: Final = 2
-"""Frames behind whose marker another timestamp followed, after which markers are believed."""
+"""Markers are trusted after this many frames whose marker was followed by another timestamp."""
 
 
 class Depacketizer:
-    """Makes encoded frames of one stream's packets: whole ones, in order, each once.
+    """Assembles whole encoded frames from one stream's packets, in order and each once.
 
-    Packets may come late, twice, or not at all. One that is missing is waited for until ``window``
-    packets came after it, or until it is told that it took too long: :meth:`give_up`.
-    Another SSRC is a new stream.
+    Packets may come late, twice, or not at all. A missing packet is awaited until ``window``
+    packets came after it, or until the caller gives it up by :meth:`give_up`. Another SSRC is a new
+    stream.
 
-    A frame ends with the packet that has the marker. Some senders put markers on each slice or
-    unit: a wary reader waits until :data:`MARKER_PROOFS` frames showed that the marker is right, or
-    until :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters
-    without a picture belong to the next frame, whatever their marker and timestamp.
+    A frame ends with the packet that has the marker. Some senders mark each slice or unit: a wary
+    reader waits until :data:`MARKER_PROOFS` frames have shown that markers are right, or until
+    :meth:`end_marked`; after a wrong marker frames end with the next timestamp. Parameters without
+    a picture belong to the next frame, whatever their marker and timestamp.
 
     Args:
-        window: packets.
+        window: largest number of packets after a missing one.
         kind: kind of the payloads.
-        wary: whether the marker is to prove itself first.
+        wary: whether markers are trusted only after proofs.
 
     Attributes:
-        lost: packets that never came.
+        lost: number of packets that never came.
         duplicates: packets that came more than once, or too late.
-        damaged: frames that something was seen of, and that did not come whole.
-        streams: how often a stream began.
-        proofs: frames whose marker was right; :data:`MARKER_PROOFS` of them are enough.
+        damaged: number of frames of which only a part came.
+        streams: number of times that a stream began.
+        proofs: number of frames whose marker was right; :data:`MARKER_PROOFS` are enough.
     """
 
     def __init__(
@@ -57,28 +58,29 @@ class Depacketizer:
         self.proofs = 0 if wary else MARKER_PROOFS
         self.lost = self.duplicates = self.damaged = self.streams = 0
         self._ssrc: int | None = None
-        self._told = (0, 0)  # what of lost and damaged the last unit said
+        self._told = (0, 0)  # counts of lost and damaged in the last unit
         self._begin()
 
     def _begin(self) -> None:
-        self._next: int | None = None  # with the wraps counted
+        self._next: int | None = None  # next expected number, with the wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
         self._open: OpenUnit | None = None
-        self._sure = False  # that the next packet is the first one of a frame
+        self._sure = False  # whether the next packet is the first one of a frame
         self._closed: int | None = None  # timestamp of the last frame that ended
-        self._begins = True  # until a frame is whole
-        self._odd: int | None = None  # what would follow a sequence number that was far off
-        self._marked_at: float | None = None  # when the open frame's marker came, while that waits
+        self._begins = True  # whether no frame of the stream was whole yet
+        self._odd: int | None = None  # number that would follow a sequence number that was far off
+        # time of the open frame's marker, while the frame waits
+        self._marked_at: float | None = None
         self._marked = False  # whether the last frame that ended had a marker
         self._marks_lie = False
-        self._parameters: OpenUnit | None = None  # that came without a picture
+        self._parameters: OpenUnit | None = None  # parameters that came without a picture
 
     def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
-        """Take a packet, and return the frames that are whole with it.
+        """Take a packet, and return the frames that it completes.
 
         Args:
             packet: packet of the stream.
-            now: when the packet arrived.
+            now: time of the packet's arrival.
         """
         if packet.ssrc != self._ssrc:
             self._damage_open()
@@ -95,16 +97,16 @@ class Depacketizer:
         return self._ready(len(self._held) > self._window)
 
     def missing(self) -> list[int]:
-        """Return the sequence numbers that are waited for."""
+        """Return the sequence numbers of missing packets."""
         if not self._held or self._next is None:
             return []
         gone = (one for one in range(self._next, max(self._held)) if one not in self._held)
         return [one & 0xFFFF for one in gone]
 
     def tail(self) -> int | None:
-        """Return the sequence number that a frame goes on with whose end did not come yet.
+        """Return the next sequence number of a frame whose end has not come yet.
 
-        None: none is begun, or others are missing before that.
+        It is None if no frame is open, or if earlier packets are missing.
         """
         if self._open is None or not self._open.whole or self._held or self._next is None:
             return None
@@ -114,27 +116,27 @@ class Depacketizer:
 
     @property
     def marked_at(self) -> float | None:
-        """Time of a frame's marker that is not believed yet; None: no frame waits for that."""
+        """Time of a frame's marker that is not trusted yet; None if no frame waits for that."""
         return None if self._held else self._marked_at
 
     def end_marked(self, before: float) -> list[AccessUnit]:
-        """Return the frame whose marker came before a moment, and nothing else after that."""
+        """Return the frame whose marker came before a moment, with no packet after it."""
         marked = self.marked_at
         return list(self._end()) if marked is not None and marked < before else []
 
     def waits_since(self) -> float | None:
-        """Return when the first packet came that waits for another; None: none does."""
+        """Return the time of the first packet that waits for another one; None without one."""
         return min((now for _, now in self._held.values()), default=None)
 
     def give_up(self, before: float) -> list[AccessUnit]:
-        """Return the frames completed by no longer waiting for packets overdue since a moment."""
+        """Give up packets overdue since a moment, and return the frames that are complete then."""
         made: list[AccessUnit] = []
         while (since := self.waits_since()) is not None and since < before:
             made += self._ready(True)
         return made
 
     def _place(self, sequence: int) -> int | None:
-        """Return a packet's number with the wraps counted; None: it came before, or too late."""
+        """Return a packet's number with the wraps counted; None for a duplicate or late packet."""
         if self._next is None:
             self._next = sequence
         off = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
@@ -151,7 +153,7 @@ class Depacketizer:
         return None if off < 0 or place in self._held else place
 
     def _ready(self, at_once: bool) -> list[AccessUnit]:
-        """Return the frames of the packets that nothing is missing before."""
+        """Return the frames of the packets before the first missing one."""
         made: list[AccessUnit] = []
         while self._held and self._next is not None:
             if self._next not in self._held:

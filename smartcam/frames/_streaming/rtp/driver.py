@@ -1,4 +1,4 @@
-"""H.264 over RTP as a source of frames."""
+"""Use H.264 over RTP as a source of frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KNOWN: Final = ("delay", "from", "name", "payload", "repair", "size", "timeout")
 
 
 class RtpDriver(FrameDriver):
-    """H.264 that somebody sends here by RTP: ``rtp://0.0.0.0:5004?size=640x480``.
+    """H.264 that is sent to this machine by RTP: ``rtp://0.0.0.0:5004?size=640x480``.
 
     The address is one of this machine, or a multicast group, which is joined. RTCP is on the next
     port.
@@ -40,12 +40,13 @@ class RtpDriver(FrameDriver):
     ``name``     of the camera
     ============ =================================================================================
 
-    Only whole pictures come. What is lost is asked for again (generic NACK), and if it does not
-    come a key frame is (PLI); a sender that knows neither is waited for until its next refresh.
-    ``frame.lost`` counts what was seen to be missing: of a gap in which whole frames vanished, one.
+    Only whole pictures are returned. Lost packets are requested again (generic NACK), and if they
+    do not come, a key frame (PLI); a sender that supports neither is awaited until its next
+    refresh. ``frame.lost`` counts frames that are known to be missing: for a gap in which whole
+    frames vanished, one.
 
-    ``captured`` is when a frame's first packet arrived. As soon as the sender told what its clock
-    says (RTCP sender reports), ``device_time`` is the frame's time on it, in seconds since 1970.
+    ``captured`` is the arrival of a frame's first packet. Once the sender has reported its clock
+    (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -69,7 +70,7 @@ class RtpDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """The address, or as the URL says."""
+        """Address, or the name in the URL."""
         return self._plan.name
 
     def statistics(self) -> RtpStatistics:
@@ -77,10 +78,11 @@ class RtpDriver(FrameDriver):
         return RtpStatistics() if self._stream is None else self._stream.statistics()
 
     async def open(self) -> StreamFormat:
-        """See that it can be listened to; without a ``size`` wait for a first picture, too.
+        """Check that the port is free; without a ``size``, also wait for a first picture.
 
         Raises:
-            FrameSourceError: the port is in use, no such address, or nothing comes in time.
+            FrameSourceError: the port is in use, the address is not valid here, or nothing comes in
+                time.
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
@@ -118,7 +120,7 @@ class RtpDriver(FrameDriver):
             ) from exc
 
     async def start(self, sink: FrameSink) -> None:
-        """Listen.
+        """Start listening.
 
         Raises:
             FrameSourceError: the port is in use.
@@ -131,18 +133,18 @@ class RtpDriver(FrameDriver):
         await stream.begin()
 
     async def stop(self) -> None:
-        """Listen no longer."""
+        """Stop listening."""
         stream, self._stream = self._stream, None
         if stream is not None:
             await stream.end()
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
 
 class FirstPicture(FrameSink):
-    """Takes one picture."""
+    """A sink that takes one picture."""
 
     def __init__(self) -> None:
         self.came: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
@@ -157,7 +159,7 @@ class FirstPicture(FrameSink):
     def ended(self, error: FrameSourceError | None) -> None:
         if error is not None and not self.came.done():
             self.came.set_exception(error)
-            self.came.exception()  # nobody may wait any longer
+            self.came.exception()  # the waiting task may have gone
 
 
 class _RtpPlan(NamedTuple):
@@ -168,7 +170,7 @@ class _RtpPlan(NamedTuple):
     repair: float
     timeout: float
     delay: float
-    only: str = ""  # address of the sender's host; "": anybody's
+    only: str = ""  # address of the sender's host; "" for any host
 
 
 class _RtpStream:
@@ -185,7 +187,12 @@ class _RtpStream:
         self._decoding = UnitDecoding(DecodingPlan(plan.name, H264, plan.delay, size), sink)
         self._watching: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
-            pair, plan.payload, plan.repair, self._decoding.take, self._gone, plan.only
+            pair,
+            plan.payload,
+            plan.repair,
+            self._decoding.take,
+            self._gone,
+            (plan.only,) * bool(plan.only),
         )
 
     async def begin(self) -> None:
@@ -196,7 +203,7 @@ class _RtpStream:
             self._watching = asyncio.create_task(self._watch(), name=name)
 
     async def end(self) -> None:
-        """End all; the sink hears no more."""
+        """End everything; the sink gets nothing more."""
         self._receiver.close()
         watching, self._watching = self._watching, None
         if watching is not None:

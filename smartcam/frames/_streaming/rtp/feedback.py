@@ -1,4 +1,4 @@
-"""Read and write a receiver's reports: its name, its losses, the packets that it wants again."""
+"""Read and write a receiver's reports: its name, its losses, its requests for packets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ RECEIVER_TIMEOUT: Final = 10.0
 MAX_RECEIVERS: Final = 64
 
 MAX_KEPT_PACKETS: Final = 1024
-"""Packets that are kept to be sent again on request."""
+"""Largest number of packets that are kept to be sent again on request."""
 
 MAX_RESEND_AGE: Final = 0.2
 """Seconds after which a packet is not sent again: its picture would be late."""
 
 MAX_RESENDS: Final = 5
-"""Times that one packet is sent again at most."""
+"""Largest number of times that one packet is sent again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class RtpReceiver:
     Attributes:
         address: address that the receiver reports from, ``HOST:PORT``.
         loss: share of the packets lost since the report before, 0 to 1.
-        lost: packets lost since the beginning, less those that came when sent again.
+        lost: packets lost since the beginning, minus those that came when sent again.
         jitter: jitter of the arrival, seconds.
-        round_trip: seconds there and back; None: not known.
+        round_trip: round-trip time, seconds; None: not known.
         age: seconds since the receiver was last heard.
     """
 
@@ -58,7 +58,7 @@ class Audience:
     """The receivers of a stream.
 
     Args:
-        ssrc: the stream's.
+        ssrc: SSRC of the stream.
     """
 
     def __init__(self, ssrc: int) -> None:
@@ -74,7 +74,7 @@ class Audience:
             return False
         known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
         block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
-        if block is not None:  # what is asked for in a hurry comes without
+        if block is not None:  # urgent requests come without it
             known = _HeardReceiver(address, block, _round_trip(block), now)
         self._heard[report.ssrc] = known._replace(at=now)
         return new
@@ -106,11 +106,11 @@ class Audience:
 
 
 def _round_trip(block: ReportBlock) -> float | None:
-    """Return RFC 3550's round-trip time, seconds, where a sender report came back."""
+    """Return RFC 3550's round-trip time, seconds, if the block refers to a sender report."""
     if not block.last_report:
         return None
     ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
-    return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 by a clock that was set
+    return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 if a clock was set
 
 
 class _SentPacket:
@@ -133,7 +133,7 @@ class PacketHistory:
             self._sent.popitem(last=False)
 
     def again(self, sequence: int) -> bytes | None:
-        """Return a packet that is to be sent again; None: it is too old, or was too often."""
+        """Return a packet to send again; None if it is too old, or was sent too often."""
         found = self._sent.get(sequence)
         if (
             found is None

@@ -48,7 +48,7 @@ def units(access_unit: bytes) -> list[bytes]:
 
 
 def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
-    """Return the sequence's and the picture's parameters; None where one of them is not in it.
+    """Return the sequence's and the picture's parameters; None if one of them is not in it.
 
     Raises:
         FrameFormatError: as :func:`units`.

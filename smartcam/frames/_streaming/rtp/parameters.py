@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_PICTURE_PIXELS: Final = 1 << 27
-"""Pixels of a picture at most; parameters with more count as wrong."""
+"""Largest number of pixels of a picture; parameters with more count as wrong."""
 
 CLOCK_RATE: Final = 90_000
-"""Ticks a second of the clock of video streams."""
+"""Ticks per second of the clock of video streams."""
 
 _HIGH: Final = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
-"""Profiles whose parameters have a format of colours (ITU-T H.264, 7.3.2.1.1)."""
+"""Numbers of the profiles whose parameters have a format of colours (ITU-T H.264, 7.3.2.1.1)."""
 
 _SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
-"""Columns and rows that share a colour, by the format of colours: cropping counts in them."""
+"""Columns and rows that share a colour, by the format of colours: the units of cropping."""
 
 
 class FieldBits:
@@ -32,18 +32,18 @@ class FieldBits:
         self._bits = iter("".join(f"{byte:08b}" for byte in plain))
 
     def fixed(self, count: int) -> int:
-        """u(n)."""
+        """Read a field u(n)."""
         return int("".join(next(self._bits) for _ in range(count)) or "0", 2)
 
     def unsigned(self) -> int:
-        """ue(v)."""
+        """Read a field ue(v)."""
         zeros = 0
         while next(self._bits) == "0":
             zeros += 1
         return (1 << zeros) - 1 + (self.fixed(zeros) if zeros else 0)
 
     def signed(self) -> int:
-        """se(v)."""
+        """Read a field se(v)."""
         number = self.unsigned()
         return (number + 1) // 2 if number % 2 else -(number // 2)
 
@@ -52,7 +52,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
     """Return the width and the height of the pictures, in pixels.
 
     Args:
-        sps: the sequence's parameters, as of
+        sps: parameters of the sequence, as returned by
             :func:`~smartcam.frames._streaming.rtp.h264.parameter_sets`.
 
     Raises:
@@ -107,7 +107,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
 
 
 def _high(bits: FieldBits) -> int:
-    """Return the format of colours; 0 where the planes are separate ones."""
+    """Return the format of colours; 0 if the planes are separate."""
     colours = bits.unsigned()
     separate = bits.fixed(1) if colours == 3 else 0
     bits.unsigned()
@@ -129,7 +129,7 @@ def _skip_list(bits: FieldBits, count: int) -> None:
 
 
 def size_in(access_unit: bytes) -> tuple[int, int] | None:
-    """Return the size of the pictures where an encoded frame has the parameters.
+    """Return the size of the pictures, if an encoded frame has the parameters.
 
     Raises:
         FrameFormatError: the parameters are not valid.
@@ -158,7 +158,7 @@ def description(
         payload_type: payload type of the packets.
         session: number of the session.
         ttl: number of networks that multicast passes; None: no multicast.
-        sets: parameters of the sequence and of the picture, where they are known.
+        sets: parameters of the sequence and of the picture, if they are known.
         name: name of the session, one line.
     """
     return "".join(

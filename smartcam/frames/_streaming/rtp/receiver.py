@@ -1,4 +1,4 @@
-"""Receives one stream: packets in, whole encoded frames out, reports back."""
+"""Receive one stream: packets in, whole encoded frames out, reports back."""
 
 from __future__ import annotations
 
@@ -22,29 +22,30 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 1024
-"""Packets that may wait for missing ones."""
+"""Largest number of packets that may wait for missing ones."""
 
 LOOK_INTERVAL: Final = 0.005
-"""Seconds between two looks at what is missing."""
+"""Seconds between two checks for missing packets."""
 
 RESEND_INTERVAL: Final = 0.02
-"""Seconds after which a packet is asked for once more."""
+"""Seconds after which a packet is requested again."""
 
 PAUSE: Final = 0.008
-"""Seconds without a packet in the midst of a frame, after which its next one counts as missing:
-else that is only seen when the next frame comes."""
+"""Seconds without a packet in the middle of a frame after which its next one counts as missing:
+otherwise that is only noticed when the next frame comes."""
 
 MAX_PACKETS_REQUESTED: Final = 256
-"""Packets requested at a time; if more are missing, a key frame is requested instead."""
+"""Largest number of packets requested at a time; if more are missing, a key frame is requested
+instead."""
 
 REORDER_GRACE: Final = 0.02
-"""Seconds that a packet is waited for where the sender sends none again."""
+"""Seconds to wait for a packet if the sender does not repeat packets."""
 
 IN_VAIN: Final = 4
-"""Times that asking brought nothing, from which on the sender counts as one that does not."""
+"""After this many requests in vain, the sender counts as one that does not repeat packets."""
 
 MARKER_GRACE: Final = 0.05
-"""Seconds for which the rest of a frame may follow a marker that is not believed yet."""
+"""Seconds for which the rest of a frame may follow a marker that is not trusted yet."""
 
 REPORT_INTERVAL: Final = 1.0
 """Seconds between two receiver reports."""
@@ -53,11 +54,11 @@ KEY_FRAME_REQUEST_INTERVAL: Final = 0.2
 """Seconds between two requests for a key frame."""
 
 NEW_STREAM_DELAY: Final = 1.0
-"""Seconds after which another stream is taken: of silence where it comes from the same host, and of
-packets without a picture that could be decoded from whichever host."""
+"""Seconds after which another stream is accepted: after silence if it comes from the same host, and
+from any host after packets without a decodable picture."""
 
 NEW_HOST_DELAY: Final = 5.0
-"""Seconds of silence after which the stream of another host is taken."""
+"""Seconds of silence after which the stream of another host is accepted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +66,12 @@ class RtpStatistics:
     """Counts of a receiver of RTP since it last began to stream.
 
     Attributes:
-        packets: packets that came, duplicates included.
+        packets: number of packets that came, duplicates included.
         lost: packets that never came.
-        repaired: packets that came after they were asked for again.
+        repaired: packets that came after a request.
         duplicates: packets that came twice, or too late.
         damaged: encoded frames that did not come whole.
-        overflows: times that decoding was too slow, and frames were thrown away.
+        overflows: number of times that decoding was too slow and frames were dropped.
         strange: datagrams that do not belong to the stream: from other senders, or no RTP.
         jitter: jitter of the arrival, seconds.
     """
@@ -86,7 +87,7 @@ class RtpStatistics:
 
 
 class PacketWays(Protocol):
-    """The two ways of a stream, such as a pair of sockets: packets, and reports beside them."""
+    """The two channels of a stream, such as a pair of sockets: one for packets, one for reports."""
 
     def read(
         self,
@@ -95,35 +96,35 @@ class PacketWays(Protocol):
         read: Callable[[], None],
         /,
     ) -> None:
-        """Call for each packet and report, with its sender, and after those that came together."""
+        """Call functions for each packet and report, with its sender, and after each batch."""
         ...
 
     def report(self, data: bytes, to: tuple[Any, ...], /) -> None:
-        """Send a report; one that cannot be sent now is left out."""
+        """Send a report, or drop it if it cannot be sent now."""
         ...
 
     def close(self) -> None:
-        """Call no more."""
+        """Stop calling."""
         ...
 
 
 class StreamReceiver:
-    """One stream from a pair of ways, until :meth:`close`, which closes them.
+    """One stream from a pair of channels, until :meth:`close`, which closes them.
 
     Args:
-        pair: ways, not read yet.
+        pair: channels, not read yet.
         payload_type: payload type of the stream's packets.
-        repair: seconds that a missing packet is waited for, and asked for again.
-        done: takes the encoded frames that came whole.
-        gone: takes that the sender said goodbye.
-        only: address of the host whose packets count; "": any.
+        repair: seconds to wait for a missing packet, which is requested again.
+        done: function that takes the whole encoded frames.
+        gone: function that is called when the sender says goodbye.
+        only: addresses of the hosts whose packets count; none: any.
         kind: kind of the payloads; None: H.264.
-        agreed: whether the stream was asked for, so that another one of the same host takes its
-            place at once, and packets that are missing are waited for without asking.
-        proofs: frames of the sender whose marker was right before.
+        agreed: whether the stream was negotiated: then another one from the same host replaces it
+            at once, and missing packets are awaited without requests.
+        proofs: number of the sender's frames whose marker was right before.
 
     Attributes:
-        heard: when a packet of the stream last came, on the loop's clock.
+        heard: time of the stream's last packet, on the loop's clock.
     """
 
     def __init__(
@@ -133,7 +134,7 @@ class StreamReceiver:
         repair: float,
         done: Callable[[list[AccessUnit]], None],
         gone: Callable[[str], None],
-        only: str = "",
+        only: tuple[str, ...] = (),
         kind: UnitKind | None = None,
         *,
         agreed: bool = False,
@@ -163,7 +164,7 @@ class StreamReceiver:
         pair.read(self._packet, self._report_came, self._read)
 
     def close(self) -> None:
-        """Say goodbye and receive no more. Idempotent."""
+        """Say goodbye and stop receiving. Idempotent."""
         for timer in (self._tick, self._next_report):
             if timer is not None:
                 timer.cancel()
@@ -188,15 +189,15 @@ class StreamReceiver:
 
     @property
     def proofs(self) -> int:
-        """Frames of the sender whose marker was right."""
+        """Number of the sender's frames whose marker was right."""
         return self._depacketizer.proofs
 
     def utc(self, timestamp: int) -> float | None:
-        """Return a time on the sender's wall clock, where it told."""
+        """Return a time on the sender's wall clock, if the sender has reported it."""
         return None if self._reception is None else self._reception.utc(timestamp)
 
     def want_picture(self) -> None:
-        """Ask for a key frame, unless that was just done."""
+        """Request a key frame, unless that was just done."""
         now = self._loop.time()
         if self._reception is not None and now - self._picture_asked >= KEY_FRAME_REQUEST_INTERVAL:
             self._picture_asked = now
@@ -227,7 +228,7 @@ class StreamReceiver:
         self._made += self._depacketizer.take(packet, now)
 
     def _stream_of(self, packet: RtpPacket, sender: tuple[Any, ...]) -> Reception | None:
-        """Return the stream that it is of: the first one is ours, until that is silent."""
+        """Return the stream of a packet: the first stream is accepted until it is silent."""
         if packet.payload_type != self._payload_type or not self._may_speak(sender):
             return None
         now = self._loop.time()
@@ -251,9 +252,9 @@ class StreamReceiver:
         return ours
 
     def _holds_against(self, sender: tuple[Any, ...], now: float) -> bool:
-        """Return True if the stream keeps its place although another sender sends packets.
+        """Return True if the stream stays although another sender sends packets.
 
-        A stream without a decoded picture has no right to its place: anybody can send packets.
+        A stream without a decoded picture may be replaced, since anybody can send packets.
         """
         if self._agreed:
             return (
@@ -267,10 +268,10 @@ class StreamReceiver:
         )
 
     def _may_speak(self, sender: tuple[Any, ...]) -> bool:
-        return not self._only or str(sender[0]).partition("%")[0] == self._only
+        return not self._only or str(sender[0]).partition("%")[0] in self._only
 
     def _read(self) -> None:
-        """Hand on what is whole, and have a look later where something is missing."""
+        """Pass on whole frames, and check again later if packets are missing."""
         made, self._made = self._made, []
         taken = self._depacketizer
         waits = taken.waits_since() is not None or taken.marked_at is not None
@@ -344,7 +345,7 @@ class StreamReceiver:
         self._next_report = self._loop.call_later(REPORT_INTERVAL, self._report)
 
     def _say(self, *more: wire.Report) -> None:
-        """Send a compound of reports: what came, who we are, and what else there is."""
+        """Send a compound report: reception, name, and further requests."""
         if self._reception is None:
             return
         full = not more or not isinstance(more[0], wire.PacketsMissing | wire.PictureLost)

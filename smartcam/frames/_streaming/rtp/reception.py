@@ -1,4 +1,4 @@
-"""Keep a receiver's account of a stream: its losses, its jitter, and the sender's clock."""
+"""Keep a receiver's counts of a stream: its losses, its jitter, and the sender's clock."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ SECONDS_FROM_1900_TO_1970: Final = 2_208_988_800
 
 
 def ntp_time(utc: float) -> int:
-    """Return seconds since 1970 as RTCP has them."""
+    """Convert seconds since 1970 to RTCP's form."""
     return int((utc + SECONDS_FROM_1900_TO_1970) * (1 << 32)) & 0xFFFF_FFFF_FFFF_FFFF
 
 
 def middle(ntp: int) -> int:
-    """Return the 32 bits of an NTP time that reports come back with."""
+    """Return the 32 bits of an NTP time that reports refer to."""
     return ntp >> 16 & 0xFFFF_FFFF
 
 
 class Reception:
-    """The account of one stream (RFC 3550, appendices A.1, A.3 and A.8)."""
+    """The counts of one stream (RFC 3550, appendices A.1, A.3 and A.8)."""
 
     def __init__(self, ssrc: int) -> None:
         self.ssrc = ssrc
@@ -49,7 +49,7 @@ class Reception:
             self._first = self._highest = packet.sequence
         ahead = (packet.sequence - self._highest + 0x8000 & 0xFFFF) - 0x8000
         if ahead < 0 or (ahead == 0 and self.packets > 1):
-            return  # late or sent again: its way says nothing
+            return  # late or sent again, so its delay says nothing
         self._highest += ahead
         transit = int(now * CLOCK_RATE) - packet.timestamp
         if self._transit is not None:
@@ -58,7 +58,7 @@ class Reception:
         self._transit = transit
 
     def sender(self, report: SenderReport, now: float) -> None:
-        """Take what the sender said at a moment."""
+        """Take a sender report that came at a moment."""
         self._heard = (report, now)
 
     def block(self, now: float) -> ReportBlock:
@@ -85,7 +85,7 @@ class Reception:
     def utc(self, timestamp: int) -> float | None:
         """Return a packet's time on the sender's wall clock, seconds since 1970.
 
-        None: the sender did not say yet.
+        It is None if the sender has not reported its clock yet.
         """
         if self._heard is None:
             return None

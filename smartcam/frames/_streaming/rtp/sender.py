@@ -1,4 +1,4 @@
-"""A source's pictures as H.264 over RTP, to one receiver or a group."""
+"""Send a source's pictures as H.264 over RTP, to one receiver or a group."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ BEGINS_SPS: Final = b"\0\0\1\x67"
 """Start code and head of a sequence's parameters, as x264 writes them."""
 
 FULL_SOCKET_TIMEOUT: Final = 1.0
-"""Seconds that a full socket is waited for before the next frame is tried all the same."""
+"""Seconds to wait for a full socket before the next frame is tried nevertheless."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class RtpSenderStatistics:
         frames: frames that were sent whole.
         packets: packets sent for the first time.
         bytes: bytes of these packets, with the headers of RTP.
-        cut: frames whose rest was thrown away, since the socket was full.
+        cut: frames whose rest was dropped, since the socket was full.
         resent: packets that were sent again to a receiver that missed them.
         anew: key frames made for a receiver that joined or lost packets, or after a cut frame.
         receivers: last reports of the receivers.
@@ -82,30 +82,30 @@ class _RtpOutlet(NamedTuple):
 
 
 class RtpSender:
-    """Sends what a source shows as H.264 over RTP (RFC 6184); ``async with`` sends.
+    """Sends a source's pictures as H.264 over RTP (RFC 6184), inside of ``async with``.
 
     ::
 
         async with smartcam.frames.RtpSender(source, "192.168.0.20:5004", crf=20) as sender:
             await sender.wait()
 
-    It is a reader like any other: the newest frame is encoded and sent at once, and what comes
-    meanwhile is skipped. RTCP goes to the next port. Packets that a receiver asks for (generic
-    NACK, RFC 4585) are sent again; one that joins, or asks for a picture (PLI), is sent a key
-    frame.
+    It is a reader like any other: the newest frame is encoded and sent at once, and frames that
+    come meanwhile are skipped. RTCP goes to the next port. Packets that a receiver asks for
+    (generic NACK, RFC 4585) are sent again; one that joins, or asks for a picture (PLI), is sent a
+    key frame.
 
     Args:
-        source: open.
-        to: ``HOST:PORT``, or a multicast group's.
-        fps: frames a second, for the bit rate; None: the source's, or 30.
+        source: open source of frames.
+        to: ``HOST:PORT`` of the receiver, or of a multicast group.
+        fps: frames per second, for the bit rate; None: the source's, or 30.
         crf: quality, 0 (best) to 51.
-        bitrate: bits a second that it keeps to instead of a quality.
-        keyint: frames in which every part of the picture is sent anew.
+        bitrate: bits per second to keep to, instead of a quality.
+        keyint: number of frames within which every part of the picture is refreshed.
         payload_type: 96 to 127.
         ttl: networks that multicast passes.
 
     Raises:
-        ConfigurationError: a number out of its range, or ``to`` is no address.
+        ConfigurationError: a number is out of range, or ``to`` is no address.
         MissingExtraError: the extra ``video`` is not installed.
     """
 
@@ -131,7 +131,7 @@ class RtpSender:
         self._codecs = Codecs(threads=1)
         self._encoder = self._made_encoder(fps or 30.0)
         self._packetizer = H264Packetizer(payload_type)
-        self._first = secrets.randbits(32)  # timestamp at the clock's 0
+        self._first = secrets.randbits(32)  # RTP timestamp at the clock's 0
         self._ticks = 0
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
         self._history = PacketHistory()
@@ -139,7 +139,7 @@ class RtpSender:
         self._sets: tuple[bytes, bytes] | None = None
         self._frames = self._packets = self._bytes = self._cut = self._resent = self._anew = 0
         self._octets = 0
-        self._wanted = False  # a key frame
+        self._wanted = False  # whether the next frame must be a key frame
         self._made_anew = float("-inf")
         self._endpoint: Endpoint | None = None
         self._link: _RtpOutlet | None = None
@@ -153,7 +153,7 @@ class RtpSender:
     def sdp(self) -> str:
         """The stream's description for ``ffplay``, VLC and others, who save it as a file.
 
-        The parameter sets stand in it from the first frame on; they are in the stream, too.
+        It has the parameter sets from the first frame on; they are in the stream, too.
 
         Raises:
             LocalProtocolError: the sender was not entered.
@@ -189,7 +189,7 @@ class RtpSender:
             FrameSourceError: there is no such host, or no port is free.
             LocalProtocolError: the sender was entered before, or the source is not open.
 
-        Cancellation: nothing is sent, nothing stays open.
+        Cancellation: nothing is sent or stays open.
         """
         if self._entered:
             raise LocalProtocolError("RtpSender: entered before; make a new one")
@@ -221,9 +221,9 @@ class RtpSender:
         await self.close()
 
     async def close(self) -> None:
-        """Say goodbye and send no more. Idempotent.
+        """Say goodbye and stop sending. Idempotent.
 
-        Cancellation: it ends all the same; a picture that is being encoded is thrown away.
+        Cancellation: it ends nevertheless; a picture that is being encoded is thrown away.
         """
         link, self._link = self._link, None
         if link is None:
@@ -234,7 +234,7 @@ class RtpSender:
             await asyncio.wait(self._tasks)
             for task in self._tasks:
                 if not task.cancelled():
-                    task.exception()  # it was told, and stands in the log
+                    task.exception()  # the error was reported, and is in the log
         finally:
             link.pair.close()
             await self._codecs.close()
@@ -243,7 +243,7 @@ class RtpSender:
         """Return when the source ended, or the sender was closed.
 
         Raises:
-            FrameSourceError: what the source ended with, or its frames cannot be encoded.
+            FrameSourceError: the source ended with this error, or its frames cannot be encoded.
             LocalProtocolError: the sender was not entered.
 
         Cancellation: safe; it goes on sending.
@@ -296,7 +296,7 @@ class RtpSender:
         for packet in self._packetizer.packets(data, self._first + self._ticks):
             try:
                 link.pair.rtp.sendto(packet, to)
-            except OSError:  # it is full, or there is no way there just now
+            except OSError:  # the socket is full, or there is no route at present
                 return False
             self._history.sent(sequence, packet)
             sequence = sequence + 1 & 0xFFFF
@@ -319,12 +319,12 @@ class RtpSender:
         name = wire.SourceDescription(self._packetizer.ssrc, self._cname)
         link.pair.report(wire.compound(report, name, *more), link.to.reports)
 
-    # what receivers say
+    # receivers' reports
 
     def _reported(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
         if not link.to.multicast and sender[0] != link.to.host:
             return
-        with contextlib.suppress(MessageError):  # anybody may send anything
+        with contextlib.suppress(MessageError):  # packets may come from anybody
             for report in wire.parse_rtcp(data):
                 self._take(link, report, f"{sender[0]}:{sender[1]}")
 
@@ -339,7 +339,7 @@ class RtpSender:
                 self._audience.left(ssrc)
         elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
             self._wanted = True
-            self._say(link)  # it wants to know our clock
+            self._say(link)  # the receiver needs the sender's clock
 
     def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:

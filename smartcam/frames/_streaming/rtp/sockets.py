@@ -1,4 +1,4 @@
-"""Two sockets side by side: RTP, and RTCP on the next port."""
+"""Open two sockets on neighbouring ports: RTP, and RTCP on the next one."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ if TYPE_CHECKING:
 
 
 MAX_DATAGRAMS_PER_TURN: Final = 64
-"""Datagrams that are read before other tasks of the event loop have a turn."""
+"""Largest number of datagrams that are read before other tasks of the event loop have a turn."""
 
 RECEIVE_BUFFER: Final = 4 << 20
 SEND_BUFFER: Final = 128 << 10
-"""Bytes that may wait in the system, a twentieth of a second on a link of 20 Mbit/s."""
+"""Number of bytes that may wait in the system: a twentieth of a second on a link of 20 Mbit/s."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
-"""asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
+"""Socket option from asm-generic/socket.h that exceeds rmem_max, for processes that may administer
+the network."""
 
 MAX_TRIES: Final = 32
-"""Tries to find two free ports side by side."""
+"""Largest number of tries to find two free ports side by side."""
 
 
 class Endpoint(NamedTuple):
@@ -35,7 +36,7 @@ class Endpoint(NamedTuple):
 
     Attributes:
         family: family of the sockets.
-        host: a number, not a name.
+        host: numeric address.
         port: port of RTP; RTCP has the next one.
     """
 
@@ -89,11 +90,11 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 
 class SocketPair:
-    """RTP and RTCP.
+    """A pair of sockets for RTP and RTCP.
 
     Args:
-        rtp: bound.
-        rtcp: bound to the next port.
+        rtp: bound socket.
+        rtcp: socket bound to the next port.
     """
 
     def __init__(self, rtp: socket.socket, rtcp: socket.socket) -> None:
@@ -106,7 +107,7 @@ class SocketPair:
         """Return the sockets of a receiver; a multicast group is joined.
 
         Raises:
-            OSError: the port is in use, or there is no such address here.
+            OSError: the port is in use, or this machine has no such address.
         """
         with contextlib.ExitStack() as stack:
             made = []
@@ -124,7 +125,7 @@ class SocketPair:
 
     @classmethod
     def waiting(cls, at: Endpoint) -> SocketPair:
-        """Return sockets to be sent to: an even port of an address, and the next one.
+        """Return sockets that can be sent to: on an even port of an address, and the next one.
 
         Raises:
             OSError: no ports are free.
@@ -172,12 +173,12 @@ class SocketPair:
         rtcp: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call for each datagram, with its sender, until :meth:`close`.
+        """Call functions for each datagram, with its sender, until :meth:`close`.
 
         Args:
             rtp: receiver of the stream's packets; None: they are not read.
             rtcp: receiver of reports.
-            read: after those that came together.
+            read: function that is called after each batch.
         """
         for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
             if take is not None:
@@ -196,14 +197,14 @@ class SocketPair:
                 data, sender = one.recvfrom(65536)
             except BlockingIOError:
                 break
-            except OSError:  # of an earlier datagram of ours; the next ones come
+            except OSError:  # an error of an earlier datagram that was sent; the next ones come
                 continue
             take(data, sender)
         if not self._closed:
             read()
 
     def report(self, data: bytes, to: tuple[Any, ...]) -> None:
-        """Send RTCP; what the system does not take is left out, since the next one comes soon."""
+        """Send RTCP, or drop it if the system does not take it, since the next one comes soon."""
         with contextlib.suppress(OSError):
             self.rtcp.sendto(data, to)
 
@@ -239,7 +240,7 @@ def _socket(family: socket.AddressFamily) -> socket.socket:
 
 def _grown(one: socket.socket) -> None:
     for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
-        with contextlib.suppress(OSError):  # the second one is for the privileged
+        with contextlib.suppress(OSError):  # the second option is for privileged processes
             one.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
 
 

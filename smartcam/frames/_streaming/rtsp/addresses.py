@@ -1,4 +1,4 @@
-"""URLs, transports and ports as RTSP's clients say them."""
+"""Parse URLs, transports and ports in requests of RTSP clients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 from smartcam.frames._streaming.rtsp.messages import RtspError
 
 TRACK: Final = "track1"
-"""The one track that each stream has."""
+"""Name of the only track of each stream."""
 
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
 """The names that a stream may have, which need no escapes in a URL."""
@@ -52,11 +52,11 @@ def target_of(url: str) -> RtspTarget:
 
 
 class TransportWish(NamedTuple):
-    """A transport that we offer: over the connection's own channels, or from ports to ports.
+    """A transport that the server offers: channels of the connection, or pairs of ports.
 
     Attributes:
         tcp: True for channels of the connection, False for ports.
-        rtp: channel or port of the client; None: a channel that we choose.
+        rtp: channel or port of the client; None: a channel that the server chooses.
         rtcp: channel or port of the client.
     """
 
@@ -66,14 +66,14 @@ class TransportWish(NamedTuple):
 
 
 def wish_of(header: str, client: str) -> TransportWish:
-    """Return the first transport in a client's list that we offer.
+    """Return the first transport in a client's list that the server offers.
 
     Args:
         header: value of the header ``Transport``.
         client: address of the client, the only one that packets go to.
 
     Raises:
-        RtspError: the list has no transport that we offer.
+        RtspError: the list has no transport that the server offers.
     """
     for said in header.split(","):
         wish = _read(said, client)

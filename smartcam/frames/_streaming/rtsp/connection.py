@@ -38,7 +38,7 @@ IDLE_TIMEOUT: Final = 60.0
 """Seconds that a connection may be without a session, whatever it asks meanwhile."""
 
 MAX_STRAY_PACKETS: Final = 64
-"""Packets accepted without a session, such as RTCP behind a TEARDOWN."""
+"""Largest number of packets accepted without a session, such as RTCP behind a TEARDOWN."""
 
 CLOSE_TIMEOUT: Final = 1.0
 """Seconds for the last bytes to be taken; then a connection is cut off."""

@@ -11,54 +11,55 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 CATCH_UP_TIME: Final = 0.5
-"""Seconds for a key frame, which is large, in which others may wait behind it. At other times a
-frame is skipped where anything of an earlier one still waits."""
+"""Seconds for which frames may wait after a key frame, which is large. At other times a frame is
+skipped while part of an earlier one waits."""
 
 MAX_WAITING_BYTES: Final = 4 << 20
-"""Bytes that may wait behind a key frame."""
+"""Largest number of bytes that may wait after a key frame."""
 
 STALL_TIMEOUT: Final = 10.0
-"""Seconds in which nothing is taken; then a connection is cut off."""
+"""A connection is cut off if the client takes nothing for this many seconds."""
 
 SEND_BUFFER: Final = 64 << 10
-"""Bytes of a connection that wait in the system, where they cannot be skipped any longer."""
+"""Number of bytes of a connection that may wait in the system, where frames can no longer be
+skipped."""
 
 DATAGRAMS: Final = 1 << 20
-"""Bytes of datagrams that the system may hold: a key frame's, at once."""
+"""Number of bytes of datagrams that the system may hold: enough for a whole key frame."""
 
 MAX_TRIES: Final = 32
-"""Tries to find two ports, an even one and the next."""
+"""Largest number of tries to find two ports, an even one and the next."""
 
 
 class PacketDelivery(Protocol):
-    """A way for the packets of one viewer."""
+    """The channel for one viewer's packets."""
 
     transport: str
     """The header Transport in the answer to SETUP."""
 
     def ready(self, now: float) -> bool:
-        """Return True if a frame's packets would go without waiting."""
+        """Return True if a frame's packets would be sent without waiting."""
         ...
 
     def send(self, packets: list[bytes], key: bool, now: float) -> bool:
-        """Send a frame; return whether all of it went."""
+        """Send a frame; return whether all of it was sent."""
         ...
 
     def report(self, data: bytes) -> None:
-        """Send RTCP, if it goes at once."""
+        """Send RTCP, if that is possible at once."""
         ...
 
     def alive(self, now: float) -> bool | None:
-        """Return True if the client takes what is sent; None if this cannot be known."""
+        """Return True if the client takes the data; None if this is unknown."""
         ...
 
     def close(self) -> None:
-        """Have nothing left of it."""
+        """Release the sockets."""
         ...
 
 
 class ChannelDelivery:
-    """Over the RTSP connection itself (section 10.12); whole frames, or nothing of one."""
+    """Over the RTSP connection itself (section 10.12); only whole frames."""
 
     def __init__(self, connection: asyncio.Transport, rtp: int, rtcp: int) -> None:
         self.transport = f"RTP/AVP/TCP;unicast;interleaved={rtp}-{rtcp}"
@@ -66,7 +67,7 @@ class ChannelDelivery:
         self._connection = connection
         self._patient_until = -1.0
         self._waited = 0  # bytes at the last look
-        self._progress: float | None = None  # when it last took something
+        self._progress: float | None = None  # time at which the client last took bytes
 
     def ready(self, now: float) -> bool:
         waiting = self._connection.get_write_buffer_size()
@@ -95,15 +96,15 @@ class ChannelDelivery:
         return now - self._progress < STALL_TIMEOUT
 
     def close(self) -> None:
-        pass  # the connection is its owner's
+        pass  # the connection is closed by its owner
 
 
 class DatagramDelivery:
-    """Sends packets from two ports of ours to two of the client, or drops packets that would wait.
+    """Sends packets from two own ports to two of the client; drops those that would wait.
 
     Args:
         sockets: bound sockets for RTP and RTCP.
-        client: address of the client, as the RTSP connection has it.
+        client: address of the client, from the RTSP connection.
         ports: ports of the client for RTP and RTCP.
         heard: function that is called with the RTCP from the client.
     """
@@ -124,7 +125,7 @@ class DatagramDelivery:
         self._heard = heard
 
     async def open(self) -> None:
-        """Hear what the client says.
+        """Receive the client's reports.
 
         Cancellation: closes it.
         """
@@ -144,7 +145,7 @@ class DatagramDelivery:
         try:
             for one in packets:
                 self._socket.sendto(one, self._to)
-        except OSError:  # no room for it, or no way there at this time
+        except OSError:  # the socket is full, or there is no route at present
             return False
         return True
 
@@ -164,7 +165,7 @@ class DatagramDelivery:
 
 
 class _ControlPort(asyncio.DatagramProtocol):
-    """Hands on what comes from one host."""
+    """Passes on the datagrams of one host."""
 
     def __init__(self, host: str, heard: Callable[[bytes], None]) -> None:
         self._host, self._heard = host, heard
@@ -174,7 +175,7 @@ class _ControlPort(asyncio.DatagramProtocol):
             self._heard(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Leave what ICMP says: it may be anybody's."""
+        """Ignore ICMP errors, which anybody can send."""
 
 
 def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, socket.socket]:

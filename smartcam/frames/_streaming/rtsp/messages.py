@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 
 MAX_LINE_BYTES: Final = 4096
-"""Bytes of a line."""
+"""Largest number of bytes of a line."""
 
 MAX_HEADERS: Final = 64
 
 MAX_BODY_BYTES: Final = 8192
-"""Bytes of a request's body at most; none of the requests served needs a body."""
+"""Largest number of bytes of a request's body; none of the requests served needs a body."""
 
 MAX_DIGITS: Final = 9
-"""Digits of CSeq and Content-Length at most."""
+"""Largest number of digits of CSeq and Content-Length."""
 
 _REQUEST: Final = re.compile(rb"([A-Z_]{1,32}) ([\x21-\x7e]{1,2048}) RTSP/(\d\.\d)")
 _HEADER: Final = re.compile(rb"([A-Za-z0-9!#$%&'*+.^_`|~-]{1,64}):[ \t]*([\t\x20-\x7e\x80-\xff]*)")
@@ -60,7 +60,7 @@ class RtspError(Exception):
 
 
 class RtspRequest(NamedTuple):
-    """A request; the names of its headers are in small letters."""
+    """A request; the names of its headers are in lower case."""
 
     method: str
     url: str
@@ -115,7 +115,7 @@ class RequestParser:
         return self._start is not None or bool(self._data)
 
     def next(self) -> RtspRequest | ChannelData | None:
-        """Return the next whole message; None: it is not there yet.
+        """Return the next whole message; None if it is not complete yet.
 
         Raises:
             RtspError: the bytes can be no request; the error is fatal.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 MAX_SESSIONS: Final = 8
-"""Sessions of one connection at most."""
+"""Largest number of sessions of one connection."""
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
 """Seconds for the frame that a description is made of; FFmpeg waits longer for an answer."""

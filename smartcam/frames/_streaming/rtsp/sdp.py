@@ -18,7 +18,7 @@ def describe(
         session: a number, another one for another description.
         sets: the sequence's and the picture's parameters.
         payload_type: payload type of its packets.
-        rate: frames a second.
+        rate: frames per second.
     """
     kind = "IP6" if ":" in host else "IP4"
     nothing = "::" if kind == "IP6" else "0.0.0.0"  # noqa: S104 - "any", to SDP

@@ -1,4 +1,4 @@
-"""Sources that VLC, FFmpeg and GStreamer can look at."""
+"""Serve sources by RTSP, for VLC, FFmpeg and GStreamer."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PORT: Final = 8554
 
 DEFAULT_FRAME_RATE: Final = 30.0
-"""Frames a second of a source that does not say."""
+"""Frames per second of a source that reports none."""
 
 _ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
@@ -41,33 +41,33 @@ class RtspServer(Server):
             print(server.url("left"))
 
     A source is encoded once, however many look at it, and streams while somebody looks, and for two
-    seconds after. A viewer that is too slow is sent whole frames only, skips those in between, and
-    goes on with a key frame; one that takes nothing for 10 s is cut off, and so is one over UDP of
-    which nothing was heard for 60 s. Datagrams go to the address that the connection comes from,
-    and nowhere else. When a source ends, its viewers are told and their connections closed; who
-    asks then is answered 503 with the reason, and the source is tried again.
+    seconds after. A viewer that is too slow gets only whole frames, misses those in between, and
+    goes on with a key frame; one that takes nothing for 10 s is cut off, and so is one over UDP
+    that sends no report for 60 s. Datagrams go to the address that the connection comes from, and
+    nowhere else. When a source ends, its viewers are informed and their connections closed; a later
+    request is answered 503 with the reason, and the source is tried again.
 
-    Whoever reaches the port may look, unless there is a password. Neither it nor the pictures are
-    encrypted: with Digest the password itself does not go over the network.
+    Everybody who reaches the port may view, unless there is a password. Neither it nor the pictures
+    are encrypted: with Digest the password itself does not go over the network.
 
     Args:
         sources: sources by name; a request for one that is not open is answered 503. A name has 1
             to 64 letters, digits and ``. _ ~ -``, the first a letter or digit.
         host: address to listen on.
         port: port to listen on; 0: any.
-        user: name of the user who may look; None: everybody may.
+        user: name of the user who may view; None: everybody may.
         password: password of the user.
         basic: also accept the bare password, from clients that do not know Digest.
-        bitrate: bits a second that an encoder keeps to instead of a quality.
+        bitrate: bits per second that an encoder keeps to instead of a quality.
         crf: quality, 0 (best) to 51.
-        fps: frames a second, for the bit rate; None: as each source says, else 30.
-        keyint: frames in which every part of the picture is sent anew.
-        max_connections: connections at a time.
-        max_viewers: sessions of all connections at a time.
+        fps: frames per second, for the bit rate; None: as each source says, else 30.
+        keyint: number of frames within which every part of the picture is refreshed.
+        max_connections: largest number of connections at a time.
+        max_viewers: largest number of sessions of all connections at a time.
 
     Raises:
         ConfigurationError: no sources, a name that is not valid, user without password, or a number
-            out of its range.
+            is out of range.
     """
 
     def __init__(
@@ -117,13 +117,13 @@ class RtspServer(Server):
 
     @property
     def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
+        """The port that the server listens on; the given one until it is started."""
         return self._port
 
     def url(self, name: str) -> str:
         """Return a stream's URL, without the password.
 
-        It has this machine's name where the server listens on all addresses.
+        It has this machine's name if the server listens on all addresses.
 
         Raises:
             ConfigurationError: there is no such stream.
@@ -144,7 +144,7 @@ class RtspServer(Server):
         """Open the port; does nothing if it is started already.
 
         Raises:
-            ConfigurationError: the server cannot listen there, or a number is out of its range.
+            ConfigurationError: the server cannot listen there, or a number is out of range.
             MissingExtraError: the extra ``video`` is not installed.
 
         Cancellation: leaves it stopped.
@@ -169,7 +169,7 @@ class RtspServer(Server):
     async def stop(self) -> None:
         """Say goodbye to the viewers and close everything; does nothing if stopped.
 
-        Cancellation: takes effect when all is closed, which a second or two take at most.
+        Cancellation: takes effect once everything is closed, within two seconds.
         """
         serving, self._serving = self._serving, None
         if serving is None:
@@ -190,7 +190,7 @@ class RtspServer(Server):
 
 
 def _rate(source: FrameSource) -> float:
-    """Return the frames a second that a source says, or the usual where it is not open yet."""
+    """Return a source's frames per second, or the default if it is not open yet."""
     try:
         rates = source.format.rates
     except LocalProtocolError:

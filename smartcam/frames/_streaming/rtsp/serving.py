@@ -44,7 +44,7 @@ class RtspServing:
         max_viewers: int,
     ) -> None:
         self.authentication = authentication
-        self.number: int = secrets.randbits(31)  # of its descriptions
+        self.number: int = secrets.randbits(31)  # session number of its descriptions
         self._streams, self._codecs = streams, codecs
         self._max_viewers = max_viewers
         self._viewers: list[str] = []  # the addresses of those who look

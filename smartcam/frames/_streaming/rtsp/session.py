@@ -91,7 +91,7 @@ class RtspSession:
         self.stream.shared.leave(self)
 
     def close(self, why: str = "") -> None:
-        """Have nothing left. Idempotent.
+        """Release everything. Idempotent.
 
         Args:
             why: the client is told so; "": it knows.

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Bytes of an answer's lines at most."""
+"""Largest number of bytes of an answer's lines."""
 
 MAX_BODY_BYTES: Final = 64 << 10
-"""Bytes of an answer's body at most, such as a description's."""
+"""Largest number of bytes of an answer's body, such as a description's."""
 
 MAX_STRAY_BYTES: Final = 256 << 10
 """Bytes in a row that belong to no message, after which the connection is given up."""
@@ -31,14 +31,14 @@ _BEGINS: Final = re.compile(
 )
 
 MAX_BEGIN_BYTES: Final = 16
-"""Bytes by which it is known that a message begins, at most."""
+"""Largest number of bytes by which it is known that a message begins."""
 
 USUAL_CHANNELS: Final = range(4)
 """Channels that packets are believed to be of when they follow bytes that belong to no packet."""
 
 
 class ServerAnswer(NamedTuple):
-    """An answer; the names of its headers are in small letters, with all values of each."""
+    """An answer; the names of its headers are in lower case, with all values of each."""
 
     status: int
     reason: str
@@ -93,7 +93,7 @@ class AnswerParser:
         self._data += data
 
     def next(self) -> Received | None:
-        """Return the next whole message; None: it is not there yet.
+        """Return the next whole message; None if it is not complete yet.
 
         Raises:
             MessageError: too many bytes that belong to no message, or more than there is room for.

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 MAX_CHALLENGES: Final = 8
-"""Challenges of one answer that are looked at."""
+"""Largest number of challenges of one answer that are looked at."""
 
 _HASHES: Final = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
 """Hashes by the names that challenges have for them; the last one is the best."""
@@ -25,8 +25,8 @@ class Challenge(NamedTuple):
     """The way in which a server wants the password.
 
     Attributes:
-        scheme: name in small letters.
-        parts: what it says, by names in small letters.
+        scheme: name in lower case.
+        parts: what it says, by names in lower case.
     """
 
     scheme: str
@@ -94,7 +94,7 @@ class Credentials:
         return before is None or stale or found.parts != before.parts
 
     def header(self, method: str, uri: str) -> str:
-        """Return the value of ``Authorization``; "" where nobody asked for one."""
+        """Return the value of ``Authorization``; "" if nobody asked for one."""
         challenge = self._challenge
         if challenge is None:
             return ""

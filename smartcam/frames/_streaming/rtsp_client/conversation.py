@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import unquote, urljoin, urlsplit
 
-from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
 from smartcam.frames._streaming.rtp.packets import ReceiverReport, RtpPacket
 from smartcam.frames._streaming.rtp.sockets import Endpoint, SocketPair
 from smartcam.frames._streaming.rtsp_client.authorization import Credentials
@@ -36,6 +37,7 @@ MIN_SESSION_TIMEOUT: Final = 1.0
 """Seconds: where a server says less, it is asked as often as if it had said so."""
 
 GONE_SESSION: Final = 454
+NOT_IN_THIS_STATE: Final = 455
 UNSUPPORTED_TRANSPORT: Final = 461
 INVALID_RANGE: Final = 457
 
@@ -88,6 +90,7 @@ class RtspConversation:
         self._parameters = False  # whether the server takes GET_PARAMETER
         self._doing = "the connection"
         self._sockets: SocketPair | None = None
+        self._source = ""  # another host that sends the packets, as the server says
         self._alive: asyncio.Task[None] | None = None
 
     @property
@@ -96,6 +99,16 @@ class RtspConversation:
         if self._link is None:
             raise self._plan.wrong("it is not connected")
         return self._link
+
+    @property
+    def senders(self) -> tuple[str, ...]:
+        """Addresses that packets may come from: the server's, and the one that it says.
+
+        Behind a recorder the camera itself may send, and behind a router the address that a camera
+        says of itself means nothing here.
+        """
+        peer = str(self.link.peer[0]).partition("%")[0]
+        return (peer, self._source) if self._source else (peer,)
 
     async def set_up(self) -> None:
         """Ask for the stream, and have its packets come to us once it plays.
@@ -116,6 +129,47 @@ class RtspConversation:
             raise self._silent() from None
         except OSError as exc:
             raise plan.wrong(f"cannot be read: {why(exc)}") from None
+
+    async def parameter(self, method: str, body: bytes) -> ServerAnswer:
+        """Read or set a parameter, in the session or, where nothing plays, without one.
+
+        Raises:
+            FrameSourceError: there is no such server, or it is silent.
+        """
+        plan = self._plan
+        try:
+            async with asyncio.timeout(plan.timeout):
+                if self._link is not None:
+                    return await self._parameter(method, body, self._aggregate)
+                answer = await self._introduced(method, body)
+                if answer.status in (GONE_SESSION, NOT_IN_THIS_STATE):
+                    self.link.abort()
+                    await self._describe()
+                    await self._choose_transport()
+                    answer = await self._parameter(method, body, self._aggregate)
+                return answer
+        except FrameSourceError:
+            raise
+        except TimeoutError:
+            text = f"expected an answer to {method}, got none within {plan.timeout:g} s"
+            raise FrameTimeoutError(f"{plan.name}: {text}", source=plan.name) from None
+        except OSError as exc:
+            raise plan.wrong(f"cannot be asked: {why(exc)}") from None
+
+    async def _introduced(self, method: str, body: bytes) -> ServerAnswer:
+        """Connect, and ask without a session."""
+        for _ in range(MAX_REDIRECTS):
+            await self._connect()
+            answer = await self._parameter(method, body, self._plain())
+            location = answer.header("location")
+            if answer.status not in REDIRECTS or not location:
+                return answer
+            self._redirected(location)
+        raise self._plan.wrong(f"more than {MAX_REDIRECTS} redirects")
+
+    async def _parameter(self, method: str, body: bytes, url: str) -> ServerAnswer:
+        kind = {"Content-Type": "text/parameters", "Content-Length": str(len(body))}
+        return await self.link.ask(method, url, kind | self._headers(), body)
 
     async def play(self) -> None:
         """Have the camera play, and keep the session alive until :meth:`close`.
@@ -263,6 +317,7 @@ class RtspConversation:
             said = options_of(answer.header("transport"))
             self._check_transport(said, "RTP/AVP")
             self.ways = pair
+            self._source = _address(said.get("source", ""))
             ports = pair_of(said.get("server_port", ""), 65535)
             if ports is not None:
                 _open_firewall(pair, str(link.peer[0]), ports)
@@ -344,6 +399,15 @@ class RtspConversation:
     def _expect_ok(self, method: str, answer: ServerAnswer) -> None:
         if answer.status != 200:
             raise self._plan.wrong(f"{method}: {answer.status} {answer.reason}".rstrip())
+
+
+def _address(text: str) -> str:
+    """Return the address of one host, or "" if the text is not such an address."""
+    try:
+        found = ipaddress.ip_address(text)
+    except ValueError:
+        return ""
+    return "" if found.is_multicast or found.is_unspecified else str(found)
 
 
 def _open_firewall(pair: SocketPair, host: str, ports: tuple[int, int]) -> None:

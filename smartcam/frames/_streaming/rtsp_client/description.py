@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAX_LINES: Final = 1000
-"""Lines of a description that are read."""
+"""Largest number of lines of a description that are read."""
 
 CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
 """The encodings that can be received, by their names."""
@@ -32,7 +32,7 @@ class VideoTrack(NamedTuple):
         payload_type: payload type of its packets.
         encoding: name of the encoding, in capital letters; "": none.
         control: where to ask for it, as it stands there; "": where one asked for the description.
-        parameters: parameters of its encoding (fmtp), by names in small letters.
+        parameters: parameters of its encoding (fmtp), by names in lower case.
         size: size of the pictures where the description says so; None: it does not.
         secure: whether its packets are encrypted (SRTP).
     """
@@ -51,7 +51,7 @@ class VideoTrack(NamedTuple):
 
     @property
     def sets(self) -> bytes:
-        """The parameters that a decoder needs, as in a file; b"" where the description has none."""
+        """The parameters that a decoder needs, as in a file; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
         units = [one for name in names for one in self.parameters.get(name, "").split(",")]
         return b"".join(START_CODE + unit for one in units if (unit := _decoded(one)))
@@ -80,10 +80,10 @@ def described(body: bytes) -> StreamDescription:
     """Read a description; what cannot be understood is left out."""
     lines = body.decode("utf-8", "replace").replace("\r", "\n").split("\n")[:MAX_LINES]
     sections: list[list[str]] = [[]]
-    for line in lines:
-        if line.startswith("m="):
+    for line in map(str.strip, lines):
+        if line[:2].lower() == "m=":
             sections.append([])
-        sections[-1].append(line.strip())
+        sections[-1].append(line)
     session, *media = sections
     kinds = [one[0][2:].split() for one in media]
     tracks = [
@@ -109,7 +109,7 @@ def _track(kind: list[str], lines: list[str]) -> VideoTrack:
 
 def _encoding(number: int, lines: list[str]) -> str:
     said = _of_type(lines, "rtpmap", number)
-    return said.partition("/")[0].strip().upper() or STATIC.get(number, "")
+    return said.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
 
 
 def _attribute(lines: list[str], name: str) -> str:
@@ -119,17 +119,14 @@ def _attribute(lines: list[str], name: str) -> str:
 
 
 def _of_type(lines: list[str], name: str, number: int) -> str:
-    """Return the text of an attribute about a payload type."""
-    for line in lines:
-        found = re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line)
-        if found is not None and int(found[1]) == number:
-            return found[2]
-    return ""
+    """Return the text of an attribute about a payload type; of several ones all of them."""
+    said = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
+    return ";".join(one[2] for one in said if one is not None and int(one[1]) == number)
 
 
 def _parameters(text: str) -> dict[str, str]:
     parts = (one.partition("=") for one in text.split(";"))
-    return {key.strip().lower(): value.strip() for key, equals, value in parts if equals}
+    return {key.strip().lower(): value.strip(' \t"') for key, equals, value in parts if equals}
 
 
 def _size(lines: list[str]) -> tuple[int, int] | None:
@@ -142,7 +139,7 @@ def _size(lines: list[str]) -> tuple[int, int] | None:
 
 
 def _decoded(text: str) -> bytes:
-    text = text.strip()
+    text = "".join(text.split())
     try:
         return base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
     except (binascii.Error, ValueError):

@@ -6,6 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from smartcam._extras import load
+from smartcam.exceptions import UnsupportedError
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
 from smartcam.frames._streaming.rtp.driver import FirstPicture
@@ -16,13 +17,16 @@ from smartcam.frames._streaming.rtsp_client.conversation import (
     OtherEncodingError,
     RtspConversation,
 )
+from smartcam.frames._streaming.rtsp_client.parameters import RtspParameters
 from smartcam.frames._video.driver import VideoDriver, one_of, tls_of, wanted_format
 from smartcam.frames._video.frames import CONVERTIBLE
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
+    from smartcam.frames._features import DeviceFeatures
     from smartcam.frames._streaming.rtp.assembling import UnitKind
+    from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
     from smartcam.frames._streaming.rtsp_client.description import VideoTrack
 
 
@@ -55,7 +59,11 @@ class RtspDriver(FrameDriver):
 
     ``captured`` is when a frame's first packet arrived. As soon as the camera told what its clock
     says (RTCP sender reports), ``device_time`` is the frame's time on it, in seconds since 1970.
+
+    Its features are parameters of RTSP, by the names that its maker tells.
     """
+
+    lists_features = False
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
@@ -86,6 +94,25 @@ class RtspDriver(FrameDriver):
     def name(self) -> str:
         """The address without password, query and fragment, or as the URL says."""
         return self._name
+
+    @property
+    def features(self) -> DeviceFeatures:
+        """The parameters of the camera, which RTSP reads and sets by name, and does not list."""
+        return RtspParameters(self._name, self._ask)
+
+    async def _ask(self, method: str, body: bytes) -> ServerAnswer:
+        """Ask on the connection that plays, or on one for this request."""
+        if self._other is not None:
+            raise UnsupportedError(
+                f"{self._name}: FFmpeg reads this stream, and asks for no parameters"
+            )
+        if self._playing is not None:
+            return await self._playing.conversation.parameter(method, body)
+        conversation = RtspConversation(self._plan)
+        try:
+            return await conversation.parameter(method, body)
+        finally:
+            await conversation.close()
 
     def statistics(self) -> RtpStatistics:
         """Return the counts of packets since the driver last began to stream."""
@@ -166,7 +193,7 @@ class RtspDriver(FrameDriver):
             await playing.end()
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()
 
 
@@ -187,7 +214,7 @@ class _Playing:
         watched: bool,
         proofs: int,
     ) -> None:
-        self._plan, self._conversation, self._watched = plan, conversation, watched
+        self._plan, self.conversation, self._watched = plan, conversation, watched
         track = conversation.track
         kind: UnitKind = decoding.coding.kind()
         if isinstance(kind, JpegUnits):
@@ -196,7 +223,7 @@ class _Playing:
         self._watching: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
             *(conversation.ways, track.payload_type, 0.0, self._decoding.take, self._said_goodbye),
-            only=str(conversation.link.peer[0]).partition("%")[0],
+            only=conversation.senders,
             kind=kind,
             agreed=True,
             proofs=proofs,
@@ -206,7 +233,7 @@ class _Playing:
     async def begin(self) -> None:
         """Have the camera play, and decode its packets."""
         await self._decoding.begin(self._receiver)
-        await self._conversation.play()
+        await self.conversation.play()
         if self._watched:
             watching = self._watch()
             self._watching = asyncio.create_task(watching, name=f"silence of {self._plan.name}")
@@ -220,7 +247,7 @@ class _Playing:
             if watching is not None:
                 await asyncio.wait([watching])
             self._receiver.close()
-            await self._conversation.close()
+            await self.conversation.close()
         finally:
             self._receiver.close()
             await self._decoding.end()

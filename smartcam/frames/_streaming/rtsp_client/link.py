@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
 
 MAX_UNSENT_BYTES: Final = 64 << 10
-"""Bytes that may wait for a server; what would come on top, such as a report, is left out."""
+"""Largest number of bytes that may wait for a server; what would come on top, such as a report, is
+left out."""
 
 MAX_REFUSALS: Final = 3
-"""Refusals of one request for its password, such as by a nonce that is too old."""
+"""Largest number of refusals of one request for its password, such as by a nonce that is too
+old."""
 
 MAX_UNANSWERED: Final = 32
 """Unanswered requests that are remembered, since their answers may come late."""
@@ -106,7 +108,7 @@ class RtspLink(asyncio.Protocol):
         return found
 
     async def ask(
-        self, method: str, url: str, headers: dict[str, str] | None = None
+        self, method: str, url: str, headers: dict[str, str] | None = None, body: bytes = b""
     ) -> ServerAnswer:
         """Send a request, and return its answer; a password is shown where it is asked for.
 
@@ -115,7 +117,7 @@ class RtspLink(asyncio.Protocol):
         """
         async with self._turn:
             for refusals in range(1, MAX_REFUSALS + 1):
-                answer = await self._asked(method, url, headers or {})
+                answer = await self._asked(method, url, headers or {}, body)
                 if answer.status != 401:
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
@@ -133,7 +135,9 @@ class RtspLink(asyncio.Protocol):
             cure = "wrong user or password"
         return self._error(f"{method}: 401 Unauthorized: {cure}")
 
-    async def _asked(self, method: str, url: str, headers: dict[str, str]) -> ServerAnswer:
+    async def _asked(
+        self, method: str, url: str, headers: dict[str, str], body: bytes
+    ) -> ServerAnswer:
         self._cseq += 1
         lines = [f"{method} {url} RTSP/1.0", f"CSeq: {self._cseq}", "User-Agent: smartcam"]
         shown = self._credentials.header(method, url)
@@ -142,7 +146,7 @@ class RtspLink(asyncio.Protocol):
         answered: asyncio.Future[ServerAnswer] = asyncio.get_running_loop().create_future()
         self._waiting = (self._cseq, answered)
         try:
-            if not self.write("\r\n".join((*lines, "", "")).encode()):
+            if not self.write("\r\n".join((*lines, "", "")).encode() + body):
                 raise self._error(self.ended or "it takes nothing any more")
             return await answered
         finally:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def options_of(transport: str) -> dict[str, str]:
-    """Return the options of the first transport of a header, by names in small letters."""
+    """Return the options of the first transport of a header, by names in lower case."""
     protocol, *rest = transport.partition(",")[0].split(";")
     parts = (one.strip().partition("=") for one in rest)
     options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
@@ -22,7 +22,7 @@ def options_of(transport: str) -> dict[str, str]:
 
 
 def pair_of(text: str, most: int) -> tuple[int, int] | None:
-    """Return a pair of channels or ports; the second one is the next where it is not there."""
+    """Return a pair of channels or ports; the second one is the next where it does not exist."""
     found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
     if found is None:
         return None
@@ -34,8 +34,8 @@ def pair_of(text: str, most: int) -> tuple[int, int] | None:
 class ChannelWays:
     """Packets on two channels of a connection.
 
-    Some servers use other channels than they say: as long as none came on those, a packet of the
-    stream's type on another one shows which it is.
+    Some servers use other channels than they announce: as long as no packet came on these, a packet
+    of the stream's type on another channel shows the right one.
 
     Args:
         link: the connection.
@@ -74,7 +74,7 @@ class ChannelWays:
             take(data, self._from)
 
     def report(self, data: bytes, _: tuple[Any, ...]) -> None:
-        """Send a report; where too much waits already it is left out, since the next comes soon."""
+        """Send a report, or leave it out if too much waits already, since the next comes soon."""
         head = bytes((0x24, self._channels[1])) + len(data).to_bytes(2, "big")
         self._link.write(head + data)
 

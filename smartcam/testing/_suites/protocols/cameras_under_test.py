@@ -9,7 +9,7 @@ On each camera stand the same applications, by their ids:
 * ``COUNTER`` and ``OTHER`` wait for a trigger and send the number of the run, from 0, at once;
 * ``SLOW`` does so after ``SLOW_TIME``;
 * ``ECHO`` sends the number that it was given as input data, where the camera takes any;
-* ``FREE`` runs free, some 200 times a second, and sends the number of the run, where the camera
+* ``FREE`` runs free, some 200 times per second, and sends the number of the run, where the camera
   sends unasked.
 """
 
@@ -90,10 +90,10 @@ class CameraKind:
             number.
         numbers_with_sequence: ``numbers`` with the number marked as the sequence number, where
             that can be set.
-        raw_request: id of a request that is answered by something, None where there is none.
+        raw_request: id of a request that is answered by something, None if there is none.
         foreign_request: an id of another kind than the protocol's.
-        silent_request: id of a request that the camera leaves without an answer, None where there
-            is not valid; unused where there are result codes.
+        silent_request: id of a request that the camera leaves without an answer, None if there is
+            not valid; unused where there are result codes.
         datagrams: True if messages may be lost, and nobody is told that the camera is gone.
         exclusive: True if a second client takes the camera from the first.
         has_zero: True if an application may have the id 0.

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
 
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
-"""The beginning of a URL (RFC 3986, 3.1), in small letters."""
+"""The beginning of a URL (RFC 3986, 3.1), in lower case."""
 
 CODES = (*range(-300, 301), -(1 << 31), (1 << 16) - 1, (1 << 32) - 1)
 """Result codes that a dialect is asked the meaning of."""
@@ -293,7 +293,7 @@ _TOPS: Mapping[tuple[m.Wire, str], int] = {
 def _refusal(
     error: type[SmartCamError], call: Callable[[Any], object], given: object
 ) -> str | None:
-    """Return the text of the error that a call raises, None where it raises none."""
+    """Return the text of the error that a call raises, None if it raises none."""
     try:
         call(given)
     except error as exc:

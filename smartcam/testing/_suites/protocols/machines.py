@@ -1,5 +1,5 @@
-"""Checks of a machine: what a link relies on, shown with the bytes of conversations."""
-# ruff: noqa: S101 - they are tests, in a package so that others can run them
+"""Check the properties of a machine that a link relies on, with the bytes of conversations."""
+# ruff: noqa: S101 - these are tests, which are in the package so that others can run them
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Conversation, Step
 
 MAX_CUTS = 64
-"""Places at which one delivery is cut in two, at most."""
+"""Largest number of places at which one delivery is cut in two."""
 
-MAX_ERROR_TEXT = 500
-"""Characters of an error's text: a peer's bytes are in it, 64 of them at most."""
+MAX_ERROR_CHARACTERS = 500
+"""Largest number of characters of an error's text, with at most 64 bytes of a peer."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 """Bytes of a camera that sends one of them without an end."""
@@ -45,18 +45,18 @@ FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
 ENOUGH = 1000
-"""Messages after which bytes without an end are messages."""
+"""Bytes without an end count as messages after this many messages."""
 
 MAX_HIDDEN_FACTOR = 2
-"""Largest memory of a machine for bytes that wait, in multiples of the bound, events apart."""
+"""Largest memory of a machine for waiting bytes, without events, in multiples of the bound."""
 
 
 class MachineChecks(Parameters):
     """The checks of every protocol's machine, without a socket.
 
     Attributes:
-        max_waiting: bytes that a machine may keep of what is not whole yet, where 4 KiB of payload
-            are accepted.
+        max_waiting: largest number of bytes of incomplete messages that a machine may keep, if it
+            accepts payloads of 4 KiB.
     """
 
     max_waiting: ClassVar[int] = 1 << 16
@@ -70,7 +70,7 @@ class MachineChecks(Parameters):
         assert m.Connect in kinds, f"{conversation}: nobody sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
-        """Check any cut of a stream: each piece may come by itself, or with what follows."""
+        """Check any cut of a stream: each piece may come alone, or with the next."""
         for room in (True, False):
             for cuts in (_bytewise, _whole):
                 player = Player(self.protocol, stream)
@@ -116,7 +116,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ anything
 
     def test_any_bytes_tell_messages_or_one_failure(self, conversation: Conversation) -> None:
-        """Whatever comes, whenever requests are sent: events, and a failure is the last."""
+        """Check that any bytes and requests give events, of which a failure is the last."""
         from smartcam.testing._suites import strategies
 
         places = range(len(conversation.steps) + 1)
@@ -189,7 +189,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ requests
 
     def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
-        """Check that it is a LocalProtocolError, and that everything then goes as written."""
+        """Check that it is a LocalProtocolError; then the conversation goes as written."""
         player = Player(self.protocol, conversation)
         dialect = player.machine.dialect
         for kind in REQUESTS:
@@ -205,7 +205,7 @@ class MachineChecks(Parameters):
         player.play()
 
     def test_message_that_it_has_not_is_refused(self, conversation: Conversation) -> None:
-        """Check the refusal at any time, and that everything then goes as written."""
+        """Check the refusal at any time, and that the conversation then goes as written."""
         for place in range(len(conversation.steps) + 1):
             player = Player(self.protocol, conversation).play(place)
             dialect = player.machine.dialect
@@ -217,7 +217,7 @@ class MachineChecks(Parameters):
     def test_second_request_while_the_answer_is_owed_is_refused(
         self, conversation: Conversation
     ) -> None:
-        """Check the refusal, since answers do not say what they answer; a status serves two."""
+        """Check the refusal, since answers do not name their request; a status answers two."""
         for place, step in enumerate(conversation.steps):
             if isinstance(step, Sent) and isinstance(step.message, m.Request):
                 player = Player(self.protocol, conversation).play(place + 1)
@@ -238,7 +238,7 @@ class MachineChecks(Parameters):
             assert not found, f"at step {place}, nobody had asked, but it told {found}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
-        """Check that Disconnect can be said in any session, and closes the way out."""
+        """Check that Disconnect can be sent in any session, and that nothing is sent after it."""
         for place in range(len(conversation.steps) + 1):
             player = Player(self.protocol, conversation).play(place)
             machine = player.machine
@@ -260,7 +260,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ what it says of itself
 
     def test_machine_says_what_it_is(self, conversation: Conversation) -> None:
-        """Dialect, transport and state are what the client looks at; lists are the caller's."""
+        """Check dialect, transport and state, which the client uses, and that lists are copies."""
         player = Player(self.protocol, conversation)
         machine, group = player.machine, player.group
         assert machine.state is State.IDLE, f"at first it is {machine.state}"
@@ -281,7 +281,7 @@ class MachineChecks(Parameters):
         assert list(machine.kin) == [machine.dialect], f"adopt() left {machine.kin}"
 
     def test_state_follows_the_session(self, conversation: Conversation) -> None:
-        """Connecting with Connect, connected with its answer, failed with the failure."""
+        """Check the states: connecting after Connect, connected after its answer, then failed."""
         player = Player(self.protocol, conversation)
         machine = player.machine
         for place, step in enumerate(conversation.steps):
@@ -301,7 +301,7 @@ class MachineChecks(Parameters):
                     assert state is State.FAILED, f"{where}: it is {state}"
 
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
-        """Check the counter of bytes, which an attempt's error tells."""
+        """Check the counter of bytes, which is in an attempt's error."""
         player = Player(self.protocol, conversation).play()
         came = sum(len(one.data) for one in conversation.steps if isinstance(one, Came))
         counted = player.machine.counters.bytes_received
@@ -335,7 +335,7 @@ class MachineChecks(Parameters):
 
 
 class _Judge:
-    """Feeds a machine and sees that its events are what a link can bear."""
+    """Feeds a machine and checks that a link can process its events."""
 
     def __init__(self, machine: LinkMachine) -> None:
         self.machine = machine
@@ -345,11 +345,11 @@ class _Judge:
 
     @property
     def over(self) -> bool:
-        """True if the link's end was told."""
+        """True if the machine reported the link's end."""
         return isinstance(self.last, (LinkFailed, LinkEnded, State))
 
     def let(self, action: bytes | m.Message) -> None:
-        """Let bytes come, or a request be sent."""
+        """Pass bytes to the machine, or send a request."""
         if isinstance(action, m.Message):
             try:
                 self.machine.send(action)
@@ -363,7 +363,7 @@ class _Judge:
         self._look()
 
     def end(self) -> None:
-        """Let the camera close the link, twice, and something come after that."""
+        """Close the link twice as the camera, and pass bytes after that."""
         before = self.over
         for _ in range(2):
             self.machine.receive_eof()
@@ -391,17 +391,18 @@ class _Judge:
     def _see_error(self, error: RemoteProtocolError) -> None:
         assert isinstance(error, RemoteProtocolError), f"LinkFailed with {error!r}"
         assert str(error), f"{error!r} says nothing"
-        assert len(str(error)) <= MAX_ERROR_TEXT, f"a text of {len(str(error))}: {error!r:.200}"
+        length = len(str(error))
+        assert length <= MAX_ERROR_CHARACTERS, f"a text of {length}: {error!r:.200}"
         copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
         assert str(copy) == str(error), f"{error!r} is {copy!r} behind pickle"
         assert self.machine.state is State.FAILED, f"after {error!r} it is {self.machine.state}"
 
 
 def see_refused(player: Player, message: m.Message, where: str) -> None:
-    """See that a machine refuses a message, and that nothing has changed.
+    """Check that a machine refuses a message, and that nothing has changed.
 
     Raises:
-        AssertionError: the machine takes it, or says or tells something.
+        AssertionError: the machine takes it, or sends bytes or reports an event.
     """
     machine = player.machine
     state = machine.state
@@ -430,7 +431,7 @@ def _whole(_: Step) -> None:
 
 
 def _joined(steps: Sequence[Step]) -> list[Step]:
-    """Return the steps with what comes in a row, unanswered, in one delivery."""
+    """Return the steps with consecutive deliveries joined."""
     found: list[Step] = []
     for step in steps:
         last = found[-1] if found else None
@@ -442,9 +443,9 @@ def _joined(steps: Sequence[Step]) -> list[Step]:
 
 
 def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield each place of a conversation that is not failed there, and the middle of each answer.
+    """Yield each place of a conversation before its failure, and the middle of each answer.
 
-    With it come the bytes of the half that has come.
+    For the middle of an answer the first half's bytes are included.
     """
     failed = False
     for place, step in enumerate(conversation.steps):

@@ -1,4 +1,4 @@
-"""One message of each kind, and what a client of any protocol needs of them."""
+"""Provide an example of each message, and list those that a client of any protocol needs."""
 
 from __future__ import annotations
 

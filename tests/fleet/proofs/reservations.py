@@ -14,7 +14,7 @@ The camera does what it is told by the agent whose session is the newest. Wrong 
 * ``behind``: a command of a block is done after another program's command in this block;
 * ``twice``: a call is done twice.
 
-``python -m tests.proofs.reservations`` visits each variant and prints what was found.
+``python -m tests.fleet.proofs.reservations`` visits each variant and prints what was found.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from typing import Any, Literal
 
 from smartcam.exceptions import ReservationLostError
 from smartcam.fleet._agent.agent import CallNumbers
-from smartcam.fleet._agent.gate import Gate, InLine
-from smartcam.fleet._program.caller import Caller, Lease, Met
+from smartcam.fleet._agent.gate import InLine
+from smartcam.fleet._program.caller import Lease, Met
+from tests.fleet.inside import Caller, Gate
 
 Move = tuple[Any, ...]
 Wrong = Literal["between", "behind", "twice"]

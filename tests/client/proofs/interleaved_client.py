@@ -28,18 +28,19 @@ from smartcam._client._inside import (
     Interpretation,
     Listeners,
 )
-from smartcam._client.correlation import (
-    Correlation,
-    EvidenceByAnswer,
-    EvidenceByFence,
-    EvidenceByStatus,
-    TriggerEvidence,
-)
-from smartcam._client.results import PendingTrigger, Results
 from smartcam.exceptions import CameraBusyError
 from smartcam.models import Result
 from smartcam.observers import Observers
 from smartcam.protocols import messages as m
+from tests.client.inside import (
+    Correlation,
+    EvidenceByAnswer,
+    EvidenceByFence,
+    EvidenceByStatus,
+    PendingTrigger,
+    Results,
+    TriggerEvidence,
+)
 
 APPLICATION = 5
 NOW, DEADLINE = 0.0, 1.0

@@ -1,4 +1,4 @@
-"""OpenCV's ways of finding a part, in the scenes that :mod:`tests.proofs.locate` draws."""
+"""OpenCV's ways of finding a part, in the scenes of :mod:`tests.inspection.proofs.locate`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam.inspection import Picture
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, photograph, shares
-from tests.proofs import locate as judge
+from tests.inspection.proofs import locate as judge
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

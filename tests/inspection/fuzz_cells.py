@@ -19,14 +19,20 @@ import numpy as np
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection import Picture, Program, Teaching, load_cell
+from smartcam.inspection._camera import eyes
 from smartcam.inspection._camera.eyes import failed_values
 from smartcam.inspection._program import MAX_REASON_BYTES
-from smartcam.inspection._read.gs1 import GS, elements
+from smartcam.inspection._read import gs1
+from smartcam.inspection._read.gs1 import GS
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
+from tests.inspection.inside import elements
 
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection
+
+EYES = eyes
+"""The module that cuts reasons."""
 
 PROGRAMS = """
 cameras:
@@ -79,6 +85,11 @@ def check_teaching(name: str, number: int, program: Program) -> None:
         assert path.read_bytes() == before
         return
     assert load_cell(path)[name].programs[number].interpret_as == program.interpret_as
+
+
+def first_element(text: str) -> tuple[tuple[str, str], ...]:
+    """Return no more than the first element: a mistake."""
+    return gs1.elements(text)[:1]
 
 
 def check_gs1(data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""The proof of locating in its short form; ``python -m tests.proofs.locate`` is the long one."""
+"""The short form of the proof of locating, ``python -m tests.inspection.proofs.locate``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.inspection.drawn_parts import shares, slopes
-from tests.proofs import locate
+from tests.inspection.proofs import locate
 from tests.strategies import over
 
 pytestmark = [pytest.mark.long, pytest.mark.widest]

@@ -1,23 +1,28 @@
-"""Parsers of what cameras and clients say: frames, lines, requests and packets."""
+"""Parsers of the room for :mod:`tests.budgets`, with the hardest inputs."""
 
 from __future__ import annotations
 
-import functools
+import asyncio
+import contextlib
+import io
 import random
 import socket
 import struct
 import time
+import zipfile
 from urllib.parse import urlsplit
 
-from smartcam.emulator._inside import HeardLine, LineCodec
-from smartcam.emulator._line_camera import MAX_INPUT_BYTES
-from smartcam.emulator._ticketed_camera import MAX_REQUEST
 from smartcam.exceptions import SmartCamError
+from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES as MAX_BITMAP
+from smartcam.frames._codecs.jpeg import decode_jpeg
+from smartcam.frames._gige import description as _description
+from smartcam.frames._gige import expressions as _expressions
 from smartcam.frames._gige import gvcp as _gvcp
 from smartcam.frames._gige import setup as _setup
 from smartcam.frames._gige.assembler import Assembler
 from smartcam.frames._gige.event_channel import decode_events
 from smartcam.frames._gige.messages import cut_chunks
+from smartcam.frames._inside import GenicamFeatures, entry_point, jpeg_header, read_bitmap
 from smartcam.frames._streaming.rtp.assembling import MAX_ACCESS_UNIT_BYTES
 from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
 from smartcam.frames._streaming.rtp.h264 import units
@@ -35,239 +40,8 @@ from smartcam.frames._streaming.rtsp_client.description import described, url_of
 from smartcam.frames._streaming.rtsp_client.ways import options_of
 from smartcam.frames._video import multipart as _multipart
 from smartcam.frames._video import redirects as _redirects
-from smartcam.gateway._lines import MAX_LINE_BYTES, NotWritableError, RequestReader
-from smartcam.makes import PCIC
-from smartcam.makes._ifm.chunks import ImageChunk, read_chunks
-from smartcam.makes._ifm.layouts import check_layout
-from smartcam.models import Status
-from smartcam.protocols import (
-    FramedDialect,
-    LineDialect,
-    LineMachine,
-    LineRow,
-    Machine,
-    Role,
-    Transport,
-)
-from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
-from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
-from smartcam.protocols._insight.answers import MAX_IMAGE
-from smartcam.protocols._insight.dialect import NATIVE
-from smartcam.protocols._insight.machine import InSightMachine
-from smartcam.protocols._insight.words import MAX_LINE
+from tests.budgets.inputs import UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
-
-UDP_BYTES = 65_507
-"""Bytes of the largest datagram."""
-
-# ---------------------------------------------------------------------- frames of the BVS
-
-
-def _session(dialect: FramedDialect, role: Role, transport: Transport, pieces: list[bytes]) -> None:
-    machine = Machine(dialect, role, transport)
-    if role is Role.CLIENT:
-        machine.send(m.Connect())
-        machine.receive_data(dialect.encode(m.ConnectAnswer(version=1)))
-    else:
-        machine.receive_data(dialect.encode(m.Connect()))
-        machine.send(m.ConnectAnswer(version=1))
-    for number, piece in enumerate(pieces):
-        if transport is Transport.UDP:
-            machine.receive_data(piece)
-        else:
-            at = 0
-            while at < len(piece):
-                room = machine.room()
-                part = piece[at : at + len(room)]
-                room[: len(part)] = part
-                machine.filled(len(part), number * 0.1)
-                at += len(part)
-        drain(machine.events())
-
-
-def _written(dialect: FramedDialect, role: Role, pieces: list[bytes]) -> None:
-    """Hand pieces to a machine as programs do that read for themselves."""
-    machine = Machine(dialect, role, Transport.TCP)
-    for piece in pieces:
-        machine.receive_data(piece)
-        drain(machine.events())
-
-
-def _frames(dialect: FramedDialect) -> dict[str, Make]:
-    header = dialect.header
-    magic = header.magic or b"\0"
-    status = dialect.encode(m.StatusReport(status=Status(0)))
-    result = dialect.encode(m.ResultContainer(application=1, data=b"x" * 9))
-    return {
-        "statuses": fill(status),
-        "results of one byte more each": lambda size: b"".join(
-            dialect.encode(m.ResultContainer(application=1, data=b"x" * (at % 7)))
-            for at in range(max(1, size // 24))
-        ),
-        "results": fill(result),
-        "one result": lambda size: dialect.encode(
-            m.ResultContainer(application=1, data=b"x" * min(size, 65_000))
-        ),
-        "a result of magic numbers": lambda size: dialect.encode(
-            m.ResultContainer(application=1, data=magic * (min(size, 65_000) // len(magic)))
-        ),
-        "magic numbers": fill(magic),
-        "a large frame, and magic numbers": fill(
-            magic + b"\xff" * 4,
-            dialect.encode(m.ResultContainer(application=1, data=b"x" * 5000)),
-        ),
-        "frames of unknown ids": fill(header.pack(0x77, 0)),
-        "one byte": fill(b"\xff"),
-    }
-
-
-def _framed(dialect: FramedDialect) -> list[Parser]:
-    rows = []
-    for role, who in ((Role.CLIENT, "camera"), (Role.CAMERA, "client")):
-        rows.append(
-            Parser(
-                f"frames of a {who}, {dialect.name}",
-                functools.partial(_session, dialect, role, Transport.TCP),
-                streamed(_frames(dialect)),
-                DEFAULT_MAX_LENGTH,
-                "protocols._framed.framing.DEFAULT_MAX_LENGTH",
-                size=1 << 14,
-            )
-        )
-    return rows
-
-
-def _datagrams(kinds: dict[str, Make]) -> dict[str, Make]:
-    def cut(make: Make) -> Make:
-        return lambda size: [make(2000)] * max(1, size // 2000)
-
-    return {f"datagrams of {kind}": cut(make) for kind, make in kinds.items()}
-
-
-def _dump(data: bytes) -> None:
-    """Read frames as ``smartcam decode`` does."""
-    from smartcam.protocols._inside import Framer, view_fields
-
-    frames = bytes.fromhex(data.decode("ascii"))
-    framer = Framer(HANDBOOK.header, len(frames))
-    framer.feed(frames)
-    while (frame := framer.next_frame()) is not None:
-        HANDBOOK.decode(m.Sender.CAMERA, frame)
-        view_fields(HANDBOOK, m.Sender.CAMERA, HANDBOOK.encode_frame(frame))
-
-
-def _hex(make: Make) -> Make:
-    return lambda size: make(size // 2).hex().encode()
-
-
-# ---------------------------------------------------------------------- lines
-
-
-def _insight_answers(kind: type[m.Message], pieces: list[bytes]) -> None:
-    machine = InSightMachine(NATIVE, Role.CLIENT, Transport.TCP, max_length=DEFAULT_MAX_LENGTH)
-    machine.send(m.Connect())
-    machine.receive_data(b"User: Password: User Logged In\r\n")
-    machine.send(kind())
-    for piece in pieces:
-        machine.receive_data(piece)
-        drain(machine.events())
-
-
-def _bitmap_lines(size: int) -> bytes:
-    data = b"BM" + struct.pack("<I", size // 2) + bytes(max(0, size // 2 - 6))
-    digits = data.hex().upper().encode()
-    lines = b"".join(digits[at : at + 80] + b"\r\n" for at in range(0, len(digits), 80))
-    return b"1\r\n" + str(len(data)).encode() + b"\r\n" + lines + b"0000\r\n"
-
-
-def _short_lines(size: int) -> bytes:
-    data = b"BM" + struct.pack("<I", size // 4 + 6) + bytes(size // 4)
-    return b"1\r\n9\r\n" + b"".join(b"%02X\r\n" % one for one in data)
-
-
-_ROWS = (
-    LineRow(m.Connect, "HELLO", m.ConnectAnswer, lambda _: m.ConnectAnswer(version=1)),
-    LineRow(m.Query, "ASK", m.QueryAnswer, lambda said: m.QueryAnswer(application=int(said))),
-    LineRow(
-        m.SetClock,
-        "C {year} {month} {day} {hour} END",
-        m.SetClockAnswer,
-        lambda _: m.SetClockAnswer(),
-    ),
-    LineRow(None, "", m.StatusReport, lambda said: {"S": m.StatusReport(status=Status(0))}[said]),
-)
-_LINES = LineDialect(name="lines", about="", source="", rows=_ROWS)
-
-
-def _line_machine(pieces: list[bytes]) -> None:
-    machine = LineMachine(_LINES, Role.CLIENT, Transport.TCP, max_length=0)
-    machine.send(m.Connect())
-    machine.receive_data(b"HELLO\n")
-    for piece in pieces:
-        machine.receive_data(piece)
-        drain(machine.events())
-
-
-def _ifm_machine(pieces: list[bytes]) -> None:
-    dialect = PCIC.dialects["v3"]
-    assert isinstance(dialect, LineDialect)
-    machine = LineMachine(dialect, Role.CLIENT, Transport.TCP, max_length=DEFAULT_MAX_LENGTH)
-    for piece in pieces:
-        machine.receive_data(piece)
-        drain(machine.events())
-
-
-def _chunks(length: int) -> Make:
-    """Return a maker of an answer with images of so many bytes each."""
-
-    def make(size: int) -> bytes:
-        one = ImageChunk(251, length, 1, 1, 0.0, bytes(length)).encoded
-        data = one * max(1, size // len(one))
-        return b"%09d" % len(data) + data
-
-    return make
-
-
-def _ifm_layout(element: str) -> Make:
-    """Return a maker of a layout of equal elements."""
-
-    def make(size: int) -> str:
-        elements = element * max(1, size // len(element))
-        return '{"layouter":"flexible","elements":[' + elements[:-1] + "]}"
-
-    return make
-
-
-def _line_codec() -> LineCodec:
-    import re
-
-    return LineCodec(
-        "lines", _ROWS, line_end=b"\n", ends=re.compile(rb"\n"), max_line=4096, encoding="utf-8"
-    )
-
-
-def _line_server(pieces: list[bytes]) -> None:
-    from smartcam.emulator._line_codec import LineServer
-
-    codec = _line_codec()
-    server = LineServer(codec, Transport.TCP, lambda *_: None)
-    for piece in pieces:
-        server.receive_data(piece)
-        for heard in server.events():
-            assert isinstance(heard, HeardLine)
-            codec.decode(m.Sender.CLIENT, codec.to_frame(heard))
-
-
-_TEXT_LINES: dict[str, Make] = {
-    "short lines": fill(b"S\n"),
-    "empty lines": fill(b"\n"),
-    "a line without an end": fill(b"x"),
-    "a line that nearly fits": lambda size: b"C" + b" 1" * (min(size, 4000) // 2) + b"\n",
-    "half line ends": fill(b"\r"),
-}
-
-# ---------------------------------------------------------------------- RTSP
 
 
 def _rtsp(pieces: list[bytes]) -> None:
@@ -308,6 +82,7 @@ def _redirect(pieces: list[bytes]) -> None:
 
 
 _ANSWER = b"RTSP/1.0 401 No\r\n"
+
 _REDIRECT: dict[str, Make] = {
     "one header again and again": fill(b"a:b\r\n", _ANSWER, b"\r\n"),
     "a line without an end": fill(b"A"),
@@ -325,22 +100,6 @@ _REDIRECT: dict[str, Make] = {
     "a location of dots": fill(b"../", _ANSWER + b"Location: ", b"\r\n\r\n"),
     "a location of users": fill(b"//a@", _ANSWER + b"Location: ", b"\r\n\r\n"),
     "locations": fill(b"Location: /a\r\n", _ANSWER, b"\r\n"),
-}
-
-
-def _robots(form: str, pieces: list[bytes]) -> None:
-    reader = RequestReader(form)
-    for piece in pieces:
-        reader.feed(piece)
-
-
-_ROBOTS: dict[str, Make] = {
-    "requests": fill(b"12 TRIGGER 7\r\n"),
-    "empty lines": fill(b"\r\n"),
-    "a line without an end": fill(b"A"),
-    "XML": fill(b"<Robot><Id>1</Id><Request>NEXT</Request></Robot>"),
-    "XML without an end": fill(b"<Robot>"),
-    "zeros": fill(b"\0"),
 }
 
 _RTSP: dict[str, Make] = {
@@ -420,8 +179,6 @@ _RTSP_ANSWERS: dict[str, Make] = {
     ),
 }
 
-# ---------------------------------------------------------------------- web cameras
-
 
 def _web_pictures(pieces: list[bytes]) -> None:
     cutter = _multipart.PictureCutter()
@@ -430,7 +187,9 @@ def _web_pictures(pieces: list[bytes]) -> None:
 
 
 _SEGMENT = b"\xff\xe0\0\x04ab"
+
 _SCANNED = b"\xff\xd8\xff\xda\0\x04ab"
+
 _WEB_PICTURES: dict[str, Make] = {
     "small pictures": fill(b"\xff\xd8\xff\xd9"),
     "beginnings": fill(b"\xff\xd8"),
@@ -446,8 +205,6 @@ _WEB_PICTURES: dict[str, Make] = {
     "lengths before each": fill(b"Content-Length: 3\r\n\xff\xd8\xff"),
     "nothing": fill(b"a"),
 }
-
-# ---------------------------------------------------------------------- RTP
 
 
 def _rtp(datagrams: list[bytes]) -> None:
@@ -517,6 +274,7 @@ def _h265(datagrams: list[bytes]) -> None:
 
 
 _SPS_265 = b"\x42\x01" + b"\x55" * 40
+
 _H265: dict[str, Make] = {
     "a unit of many parts": grown(
         lambda count: [
@@ -592,8 +350,6 @@ _RTCP: dict[str, Make] = {
     "packets of an unknown kind": fill(struct.pack("!BBH", 0x80, 210, 0)),
 }
 
-# ---------------------------------------------------------------------- GigE Vision
-
 
 def _gvsp(datagrams: list[bytes]) -> None:
     assembler = Assembler(1 << 19, 576 - 28)
@@ -612,6 +368,7 @@ def _gvsp_packet(kind: int, block: int, packet: int, data: bytes = b"") -> bytes
 
 
 _FULL = bytes(540)
+
 _GVSP: dict[str, Make] = {
     "packets in order": grown(
         lambda count: [_gvsp_packet(3, 0, at + 1, _FULL) for at in range(count)], 548
@@ -640,6 +397,7 @@ def _event(items: bytes, *, command: int = 0xC0, flags: int = 1) -> bytes:
 
 
 _EVENT_ITEM = struct.pack(">HHHHQ", 0, 0x9001, 0, 1, 2)
+
 _EVENTS: dict[str, Make] = {
     "events": lambda size: _event(_EVENT_ITEM * (size // len(_EVENT_ITEM))),
     "one event with data": lambda size: _event(_EVENT_ITEM + bytes(size), command=0xC2),
@@ -668,115 +426,173 @@ def _ack(unit: bytes) -> Make:
     return make
 
 
-# ---------------------------------------------------------------------- the table
+def _described(inner: Make) -> Make:
+    head, tail = "<RegisterDescription>", "</RegisterDescription>"
+    return lambda size: f"{head}{inner(size)}{tail}".encode()
 
-WIRE: tuple[Parser, ...] = (
-    *(row for dialect in (HANDBOOK, THESIS, B16, BID) for row in _framed(dialect)),
-    Parser(
-        "datagrams of a camera",
-        functools.partial(_session, HANDBOOK, Role.CLIENT, Transport.UDP),
-        _datagrams(_frames(HANDBOOK)),
-        UDP_BYTES,
-        "UDP: a datagram",
-        size=8000,
-    ),
-    Parser(
-        "frames that a program hands over",
-        functools.partial(_written, HANDBOOK, Role.CAMERA),
-        streamed(_frames(HANDBOOK)),
-        DEFAULT_MAX_LENGTH,
-        "protocols._framed.framing.DEFAULT_MAX_LENGTH",
-        size=1 << 14,
-    ),
-    Parser(
-        "hex dumps of frames",
-        _dump,
-        {
-            kind: _hex(make)
-            for kind, make in _frames(HANDBOOK).items()
-            if kind in ("statuses", "results", "one result", "one byte", "magic numbers")
-        },
-        1 << 30,
-        "memory: the file is the user's",
-        short=300,
-    ),
-    Parser(
-        "In-Sight: images",
-        functools.partial(_insight_answers, m.ReadImage),
-        streamed(
-            {
-                "a bitmap": _bitmap_lines,
-                "lines of two digits": _short_lines,
-                "a line without an end": fill(b"A", b"1\r\n9\r\n"),
-                "empty lines": fill(b"\r\n", b"1\r\n9\r\n"),
-            }
+
+_DESCRIPTIONS: dict[str, Make] = {
+    kind: _described(make)
+    for kind, make in {
+        "text in pieces": fill_text("1" * 36 + "<x/>", '<Integer Name="a">', "</Integer>"),
+        "text in pieces by comments": fill_text("1<!---->", '<Integer Name="a">', "</Integer>"),
+        "text in pieces by instructions": fill_text("1<?a?>", '<Integer Name="a">', "</Integer>"),
+        "text in pieces by sections": fill_text(
+            "<![CDATA[1]]>", '<Integer Name="a">', "</Integer>"
         ),
-        2 * MAX_IMAGE,
-        "protocols._insight.answers.MAX_IMAGE, in hex",
-    ),
-    Parser(
-        "In-Sight: lines",
-        functools.partial(_insight_answers, m.GetStatus),
-        streamed(_TEXT_LINES),
-        MAX_LINE,
-        "protocols._insight.words.MAX_LINE",
-        size=1000,
-    ),
-    Parser(
-        "ifm: frames of a device",
-        _ifm_machine,
-        streamed(
-            {
-                "results": fill(b"0000L000000010\r\n0000abcd\r\n"),
-                "a long result": lambda size: b"0000L%09d\r\n0000" % (size + 6) + bytes(size),
-                "notices": fill(b"0001L000000016\r\n0001000000000:\r\n"),
-                "no frames": fill(b"9"),
-            }
+        "text in pieces by entities": fill_text("&#49;", '<Integer Name="a">', "</Integer>"),
+        "a long text": fill_text("1 ", '<Integer Name="a">', "</Integer>"),
+        "elements": fill_text('<Integer Name="n{}"/>'),
+        "one name again and again": fill_text('<Integer Name="n"/>'),
+        "attributes": fill_text('a{}="" ', "<Integer ", "/>"),
+        "a long attribute": fill_text("a", '<Integer Name="', '"/>'),
+        "a long comment": fill_text("a", "<!--", "-->"),
+        "nested elements": fill_text("<Group>"),
+        "namespaces": fill_text('<a:Integer xmlns:a="{}"/>'),
+        "entries of a structure": lambda size: (
+            "<StructReg>"
+            + "<Sign/>" * (size // 14)
+            + "".join(f'<StructEntry Name="e{n}"/>' for n in range(size // 50))
+            + "</StructReg>"
         ),
-        DEFAULT_MAX_LENGTH,
-        "protocols._framed.framing.DEFAULT_MAX_LENGTH",
-        size=1000,
-    ),
-    Parser(
-        "ifm: images",
-        read_chunks,
-        {
-            "empty chunks": _chunks(0),
-            "small chunks": _chunks(16),
-            "one chunk": lambda size: _chunks(size)(size),
-        },
-        DEFAULT_MAX_LENGTH,
-        "protocols._framed.framing.DEFAULT_MAX_LENGTH",
-    ),
-    Parser(
-        "ifm: layouts of a client",
-        check_layout,
-        {
-            "elements": _ifm_layout('{"type":"uint8","id":"n"},'),
-            "records": _ifm_layout('{"type":"records","id":"r","elements":[]},'),
-            "open brackets": fill_text("["),
-            "a long text": _ifm_layout('{"type":"string","id":"s","value":"aaaaaaaaaaaaaaaa"},'),
-        },
-        MAX_REQUEST,
-        "emulator._ticketed_camera.MAX_REQUEST",
-        refuses=(ValueError, RecursionError),
-    ),
-    Parser(
-        "lines of a camera",
-        _line_machine,
-        streamed(_TEXT_LINES),
-        1 << 15,
-        "protocols._lines.READ_SIZE",
-        size=1000,
-    ),
-    Parser(
-        "lines of a client",
-        _line_server,
-        streamed(_TEXT_LINES),
-        MAX_INPUT_BYTES,
-        "emulator._line_camera.MAX_INPUT_BYTES",
-        size=1000,
-    ),
+    }.items()
+}
+
+
+def _zipped(make: Make) -> Make:
+    def made(size: int) -> bytes:
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.xml", make(size))
+        return packed.getvalue()
+
+    return made
+
+
+def _many_files(size: int) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for number in range(max(1, size // 110)):
+            archive.writestr(f"{number}", b"")
+    return packed.getvalue()
+
+
+def _bomb(method: int) -> Make:
+    def make(size: int) -> bytes:
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", method) as archive:
+            archive.writestr("a.xml", bytes(size * 100))
+        return packed.getvalue()
+
+    return make
+
+
+_FORMULAS: dict[str, Make] = {
+    "a sum": fill_text("+1", "1"),
+    "brackets": lambda size: "(" * min(size // 2, 4000) + "1" + ")" * min(size // 2, 4000),
+    "signs": fill_text("-", tail="1"),
+    "powers": fill_text("**9", "9"),
+    "shifts": fill_text("<<63", "1"),
+    "digits": fill_text("9"),
+    "hex digits": fill_text("F", "0x"),
+    "an exponent": fill_text("9", "1e"),
+    "a name": fill_text("a"),
+    "spaces": fill_text(" ", tail="1"),
+    "choices": fill_text("1?1:", tail="1"),
+    "arguments": fill_text("1,", "SIN(", "1)"),
+    "products": fill_text("*99999999", "1"),
+}
+
+
+class _Memory:
+    async def read(self, address: int, length: int) -> bytes:
+        return bytes(length)
+
+    async def write(self, address: int, data: bytes) -> None:
+        pass
+
+
+def _features(text: bytes) -> None:
+    nodes = _description.parse(text)
+    features = GenicamFeatures(nodes, _Memory(), "camera")
+
+    async def ask() -> None:
+        for name in ("A", "Zzz"):
+            with contextlib.suppress(SmartCamError):
+                await features.get(name)
+        with contextlib.suppress(SmartCamError):
+            await features.set("A", 3)
+
+    asyncio.run(ask())
+
+
+_FEATURES: dict[str, Make] = {
+    kind: _described(make)
+    for kind, make in {
+        "variables": fill_text(
+            '<pVariable Name="V{}">B</pVariable>',
+            '<Integer Name="B"><Value>1</Value></Integer><SwissKnife Name="A">',
+            "<Formula>1</Formula></SwissKnife>",
+        ),
+        "expressions asked for again and again": lambda size: "".join(
+            (
+                '<SwissKnife Name="A">',
+                *(f'<pVariable Name="V{n}">B</pVariable>' for n in range(size // 80)),
+                '<Formula>1</Formula></SwissKnife><SwissKnife Name="B">',
+                *(f'<Expression Name="E{n}">1+1+1</Expression>' for n in range(size // 80)),
+                "<Formula>1</Formula></SwissKnife>",
+            )
+        ),
+        "nodes that lead to two others": lambda size: "".join(
+            f'<SwissKnife Name="{"A" if not n else f"N{n}"}"><pVariable Name="X">N{n + 1}'
+            f'</pVariable><pVariable Name="Y">N{n + 1}</pVariable><Formula>X+Y</Formula>'
+            "</SwissKnife>"
+            for n in range(size // 130)
+        ),
+        "a circle": fill_text('<Integer Name="A"><pValue>A</pValue></Integer>'),
+        "addresses": fill_text(
+            "<Address>1</Address>",
+            '<Port Name="P"/><IntReg Name="A"><pPort>P</pPort><Length>4</Length>',
+            "</IntReg>",
+        ),
+        "entries": fill_text(
+            '<EnumEntry Name="e{}"><Value>{}</Value></EnumEntry>',
+            '<Enumeration Name="A"><Value>0</Value>',
+            "</Enumeration>",
+        ),
+        "features": fill_text(
+            '<Integer Name="Zz{}"/><Category Name="C{}"><pFeature>Zz{}</pFeature></Category>'
+        ),
+        "indexed values": fill_text(
+            '<pValueIndexed Index="{}">B</pValueIndexed>',
+            '<Integer Name="B"><Value>1</Value></Integer><Integer Name="A"><pIndex>B</pIndex>',
+            "</Integer>",
+        ),
+    }.items()
+}
+
+
+def _bmp(bits: int) -> Make:
+    def make(size: int) -> bytes:
+        side = max(4, int((8 * size / bits) ** 0.5) // 4 * 4)
+        pixels = bytes(side * bits // 8 * side)
+        info = struct.pack("<IiiHHIIiiII", 40, side, side, 1, bits, 0, 0, 0, 0, 0, 0)
+        place = 14 + 40 + 1024 * (bits == 8)
+        return struct.pack("<2sIHHI", b"BM", 0, 0, 0, place) + info + bytes(place - 54) + pixels
+
+    return make
+
+
+def _jpeg(inner: bytes) -> Make:
+    return fill(inner, b"\xff\xd8", b"\xff\xd9")
+
+
+def _read_jpeg(data: bytes) -> None:
+    width, height, _ = jpeg_header(data, "JPEG")
+    decode_jpeg(data, "RGB", (width, height), "JPEG")
+
+
+PARSERS: tuple[Parser, ...] = (
     Parser(
         "RTSP: requests",
         _rtsp,
@@ -785,24 +601,6 @@ WIRE: tuple[Parser, ...] = (
         "frames._streaming.rtsp.messages.ROOM",
         size=1000,
         refuses=(RtspError,),
-    ),
-    Parser(
-        "robots: requests as text",
-        functools.partial(_robots, "text"),
-        streamed(_ROBOTS),
-        MAX_LINE_BYTES,
-        "gateway._lines.MAX_LINE_BYTES",
-        size=1000,
-        refuses=(NotWritableError,),
-    ),
-    Parser(
-        "robots: requests as XML",
-        functools.partial(_robots, "xml"),
-        streamed(_ROBOTS),
-        MAX_LINE_BYTES,
-        "gateway._lines.MAX_LINE_BYTES",
-        size=1000,
-        refuses=(NotWritableError,),
     ),
     Parser(
         "RTP and H.264",
@@ -848,8 +646,8 @@ WIRE: tuple[Parser, ...] = (
         "redirects of a server",
         _redirect,
         streamed(_REDIRECT),
-        _redirects.LARGEST_HEAD,
-        "frames._video.redirects.LARGEST_HEAD",
+        _redirects.MAX_HEAD_BYTES,
+        "frames._video.redirects.MAX_HEAD_BYTES",
         size=1000,
         refuses=(SmartCamError, ValueError),
     ),
@@ -878,8 +676,8 @@ WIRE: tuple[Parser, ...] = (
         "GigE: packets of a stream",
         _gvsp,
         _GVSP,
-        _setup.LARGEST_FRAME,
-        "frames._gige.setup.LARGEST_FRAME",
+        _setup.MAX_FRAME_BYTES,
+        "frames._gige.setup.MAX_FRAME_BYTES",
         size=1 << 15,
     ),
     Parser("GigE: events", decode_events, _EVENTS, UDP_BYTES, "UDP: a datagram"),
@@ -887,8 +685,8 @@ WIRE: tuple[Parser, ...] = (
         "GigE: chunk data",
         _chunk_data,
         _CHUNK_DATA,
-        _setup.LARGEST_FRAME,
-        "frames._gige.setup.LARGEST_FRAME",
+        _setup.MAX_FRAME_BYTES,
+        "frames._gige.setup.MAX_FRAME_BYTES",
     ),
     Parser(
         "GigE: answers",
@@ -896,5 +694,76 @@ WIRE: tuple[Parser, ...] = (
         {"text": _ack(b"a"), "zeros": _ack(b"\0"), "bytes that are no text": _ack(b"\xff")},
         UDP_BYTES,
         "UDP: a datagram",
+    ),
+    Parser(
+        "GenICam: descriptions",
+        _description.parse,
+        _DESCRIPTIONS,
+        _description.MAX_PLAIN_BYTES,
+        "frames._gige.description.MAX_PLAIN_BYTES",
+        refused_from={"entries of a structure": 20_000},
+    ),
+    Parser(
+        "GenICam: archives",
+        lambda data: _description.parse(_description.unpack(data)),
+        {
+            "text in pieces": _zipped(_DESCRIPTIONS["text in pieces"]),
+            "many files": _many_files,
+            "zeros": _bomb(zipfile.ZIP_DEFLATED),
+            "zeros, by bzip2": _bomb(zipfile.ZIP_BZIP2),
+            "zeros, by LZMA": _bomb(zipfile.ZIP_LZMA),
+        },
+        _description.MAX_PACKED_BYTES,
+        "frames._gige.description.MAX_PACKED_BYTES",
+    ),
+    Parser(
+        "GenICam: formulas",
+        lambda text: _expressions.evaluate(text, {}, whole=True),
+        _FORMULAS,
+        _expressions.MAX_FORMULA_CHARACTERS,
+        "frames._gige.expressions.MAX_FORMULA_CHARACTERS",
+        size=1500,
+    ),
+    Parser(
+        "GenICam: values",
+        _features,
+        _FEATURES,
+        _description.MAX_PLAIN_BYTES,
+        "frames._gige.description.MAX_PLAIN_BYTES",
+        refused_from={"expressions asked for again and again": 30_000},
+    ),
+    Parser(
+        "bitmaps",
+        read_bitmap,
+        {"grey": _bmp(8), "colours": _bmp(24), "zeros": fill(b"\0", b"BM")},
+        MAX_BITMAP,
+        "frames._codecs.bitmap.MAX_PIXEL_BYTES",
+    ),
+    Parser(
+        "JPEG",
+        _read_jpeg,
+        {
+            "markers": _jpeg(b"\xff\xe0\0\2"),
+            "fill bytes": _jpeg(b"\xff"),
+            "zeros": _jpeg(b"\0"),
+            "tables": _jpeg(b"\xff\xdb\0\x43\0" + b"\1" * 64),
+            "restarts": _jpeg(b"\xff\xd0"),
+        },
+        1 << 28,
+        "the frame that it comes in",
+        needs=("simplejpeg",),
+    ),
+    Parser(
+        "H.264: entry points",
+        entry_point,
+        {
+            "small units": fill(b"\0\0\1\x09"),
+            "start codes": fill(b"\0\0\1"),
+            "messages": fill(b"\1\0", b"\0\0\1\6"),
+            "lengths without an end": fill(b"\xff", b"\0\0\1\6"),
+            "units of messages": fill(b"\0\0\1\6\1\1a"),
+        },
+        1 << 28,
+        "the frame that it comes in",
     ),
 )

@@ -4,9 +4,9 @@ A plain model of a camera does what ``docs/promises.md`` assumes of it (B, C, D,
 freedom that this leaves: what it says is on its way while our words come the other way, one by one,
 so that the network may cut a write anywhere; results and Waiting for Trigger come in any order; a
 sensor triggers and an operator stops and starts between any two words. The client is the library's
-own :class:`~smartcam._client.results.Results` (:mod:`tests.proofs.interleaved_client`), with what
-stands around it in ``Triggers``. At any moment a call's time is over, or its task is cancelled, and
-is woken a while later.
+own :class:`~smartcam._client.results.Results` (:mod:`tests.client.proofs.interleaved_client`), with
+what stands around it in ``Triggers``. At any moment a call's time is over, or its task is
+cancelled, and is woken a while later.
 
 All states that can be reached are visited, breadth first, each once. Of each result that a call
 returns it is known which word began its run:
@@ -17,8 +17,9 @@ returns it is known which word began its run:
 
 With each step it is seen, too, that every container that came has one fate, or waits for it.
 
-``python -m tests.proofs.interleavings`` visits each variant as deep as stands in it, most of them
-to the end, and prints what was found. ``--table`` prints the table of ``results/promises.md``.
+``python -m tests.client.proofs.interleavings`` visits each variant as deep as stands in it, most of
+them to the end, and prints what was found. ``--table`` prints the table of
+``results/promises.md``.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from smartcam import Status
-from smartcam._client.results import Results
-from tests.proofs.interleaved_client import (
+from tests.client.inside import Results
+from tests.client.proofs.interleaved_client import (
     Client,
     Container,
     Family,

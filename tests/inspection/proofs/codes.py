@@ -1,6 +1,6 @@
 """Measure what `read` reads: drawn codes, public pictures, and photographs without a code.
 
-``python -m tests.proofs.codes [--seeds N] [--public FOLDER] [--photographs FOLDER]``
+``python -m tests.inspection.proofs.codes [--seeds N] [--public FOLDER] [--photographs FOLDER]``
 
 Drawn codes are counted beside zxing-cpp alone, OpenCV and pyzbar (where it is installed). FOLDER of
 ``--public`` is ``test/samples`` of github.com/zxing-cpp/zxing-cpp: pictures with a text or binary

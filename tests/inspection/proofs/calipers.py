@@ -1,10 +1,11 @@
 """The judge of measuring: errors against the Cramer-Rao bound, sigmas against errors.
 
-``python -m tests.proofs.calipers`` draws edges, bars, lines and circles whose places are exact,
-with noise, and measures them many times. No estimate without a bias can be better than the bound
-with unknown blur, levels and tilt, which is worked out here from the drawings alone, by the pixels
-of the strips. A case is good where the error is at most 1.15 times the bound, and the predicted
-sigma between 0.9 and 1.1 times the error. Pictures that cannot be measured must say so, each time.
+``python -m tests.inspection.proofs.calipers`` draws edges, bars, lines and circles whose places are
+exact, with noise, and measures them many times. No estimate without a bias can be better than the
+bound with unknown blur, levels and tilt, which is worked out here from the drawings alone, by the
+pixels of the strips. A case is good where the error is at most 1.15 times the bound, and the
+predicted sigma between 0.9 and 1.1 times the error. Pictures that cannot be measured must say so,
+each time.
 
 The circles and lines of OpenCV and, where it is installed, scikit-image are measured in the same
 pictures.
@@ -34,8 +35,8 @@ from smartcam.inspection._measure.planes import PIXELS
 from smartcam.inspection._measure.strips import Sectors, Strips
 from smartcam.inspection._measure.troubles import NotMeasuredError
 from smartcam.inspection._measure.values import circle_of, line_of, width
+from tests.inspection.proofs import calipers_of_others as others
 from tests.inspection.rendering import Array, disc, half_plane, photographed, pixel_means
-from tests.proofs import calipers_of_others as others
 
 WORST_OVER_BOUND, SIGMA_RANGE = 1.15, (0.9, 1.1)
 
@@ -510,7 +511,9 @@ def judged(case: Case, seed: int, drawings: int, pictures: int) -> list[Row]:
 
 def main() -> int:
     """Print the table; return 1 where a case is missed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.proofs.calipers", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.inspection.proofs.calipers", description=__doc__
+    )
     parser.add_argument("names", nargs="*", help="only cases whose names begin so")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--drawings", type=int, default=30)

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from smartcam._client.results import PendingTrigger, Results
-from tests.proofs.interleavings import FRAMED, ROWS, Variant, table, visit
+from tests.client.inside import PendingTrigger, Results
+from tests.client.proofs.interleavings import FRAMED, ROWS, Variant, table, visit
 
-PROMISES = Path(__file__).parents[2] / "results" / "promises.md"
+PROMISES = Path(__file__).parents[3] / "results" / "promises.md"
 
 SHORT = (
     Variant(name="sensor", sensors=1, results=(0, 1, 2), depth=60, triggers=1),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Chain, chain_of, fit_plane
-from smartcam.calibration._solvers import CameraPosition2D, RealWorldPosition
+from tests.calibration.inside import CameraPosition2D, RealWorldPosition
 from tests.geometry.rigid import OCTANTS, localization, rotation_about, yaw
 
 if TYPE_CHECKING:

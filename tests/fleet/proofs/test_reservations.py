@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from tests.proofs.reservations import TAKES_OVER, VARIANTS, Variant, Wrong, visit
+from tests.fleet.proofs.reservations import TAKES_OVER, VARIANTS, Variant, Wrong, visit
 
 SHORT_DEPTH = 8
 

@@ -1,0 +1,113 @@
+"""Parameters of an RTSP camera as features (RFC 2326, sections 10.8 and 10.9).
+
+The protocol reads and sets a parameter by its name, as text. It has no list of them, no kinds,
+ranges or units, and no commands; many cameras know no parameter at all.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from smartcam.exceptions import FrameFeatureError, UnsupportedError
+from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, as_text
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
+
+READ: Final = "GET_PARAMETER"
+SET: Final = "SET_PARAMETER"
+
+NOT_UNDERSTOOD: Final = 451
+READ_ONLY: Final = 458
+INVALID: Final = 457
+
+WITHOUT_METHOD: Final = (405, 501, 551)
+"""Answers of a camera that reads, or sets, no parameters."""
+
+MAX_SHOWN_CHARACTERS: Final = 80
+"""Characters of a name, value or answer in an error's text."""
+
+
+class RtspParameters(DeviceFeatures):
+    """The parameters of a camera, by the names that its maker tells.
+
+    A name goes to the camera as it is given, since there is no list to find another spelling in.
+
+    Args:
+        name: name of the source, for errors.
+        ask: sends a method with a body, and returns the answer.
+    """
+
+    def __init__(self, name: str, ask: Callable[[str, bytes], Awaitable[ServerAnswer]]) -> None:
+        self._name, self._ask = name, ask
+
+    async def names(self) -> list[str]:
+        """Raise: RTSP has no list of parameters."""
+        self._cannot("list its parameters: read one by the name that its maker tells")
+
+    async def describe(self, name: str) -> Feature:
+        """Return a parameter with its value; that is a text, of which the camera tells no range."""
+        return Feature(name, "string", "rw", value=await self.get(name))
+
+    async def get(self, name: str) -> FeatureValue:
+        """Return the value of a parameter, as text."""
+        answer = await self._answered(READ, name, f"{name}\r\n")
+        body = answer.body.decode(errors="replace")
+        for line in body.splitlines():
+            found, colon, value = line.partition(":")
+            if colon and found.strip().lower() == name.lower():
+                return value.strip()
+        got = (
+            f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
+            if body.strip()
+            else (
+                "got none: it takes the request for a sign that somebody is there, and nothing else"
+            )
+        )
+        raise self._wrong(name, f"expected its value from {READ}, {got}")
+
+    async def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Set a parameter; return what the camera says of it then, or the value where it does not.
+
+        A value of more than one line is refused.
+        """
+        text = as_text(value)
+        if re.search(r"[\r\n\0]", text):
+            shown = repr(text[:MAX_SHOWN_CHARACTERS])
+            raise self._wrong(name, f"expected a value of one line, got {shown}")
+        await self._answered(SET, name, f"{name}: {text}\r\n")
+        try:
+            return await self.get(name)
+        except (FrameFeatureError, UnsupportedError):  # it can be set, and not be read
+            return value
+
+    async def execute(self, name: str) -> None:
+        """Raise: RTSP has no commands."""
+        self._cannot(f"execute a command such as {name[:MAX_SHOWN_CHARACTERS]}")
+
+    async def _answered(self, method: str, name: str, body: str) -> ServerAnswer:
+        if not re.fullmatch(r"[!-9;-~]+", name):
+            text = "expected a name of printable ASCII without blanks and colons"
+            raise self._wrong(name, text)
+        answer = await self._ask(method, body.encode())
+        if answer.status == 200:
+            return answer
+        said = f"{method}: {answer.status} {answer.reason}".rstrip()
+        if answer.status in WITHOUT_METHOD:
+            raise UnsupportedError(f"{self._name}: it has no such request: {said}")
+        why = {
+            NOT_UNDERSTOOD: "it has no such parameter",
+            READ_ONLY: "it can only be read",
+            INVALID: "it does not take that value",
+        }.get(answer.status, "it refuses that")
+        raise self._wrong(name, f"{why}: {said}")
+
+    def _cannot(self, what: str) -> NoReturn:
+        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {what}")
+
+    def _wrong(self, name: str, text: str) -> FrameFeatureError:
+        shown = name[:MAX_SHOWN_CHARACTERS]
+        return FrameFeatureError(f"{self._name}: parameter {shown!r}: {text}", source=self._name)

@@ -1,0 +1,79 @@
+"""A file of JPEG XL, which the libraries of FFmpeg that come with PyAV do not read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._codecs.pictures import converted, decoded, jpegxl_size
+from smartcam.frames._frame import Frame, Moment, amend
+from smartcam.frames._pixels.formats import find_format
+from smartcam.frames._video.frames import Pixels
+
+if TYPE_CHECKING:
+    from smartcam.frames._pixels.formats import PixelFormat
+
+SUFFIX: Final = ".jxl"
+
+MAX_FILE_BYTES: Final = 1 << 30
+"""Bytes of a file that is read; a larger one is refused."""
+
+MAX_PICTURE_PIXELS: Final = 1 << 28
+"""Pixels of a picture that is read; a larger one is refused before it takes memory."""
+
+
+def is_jpegxl(path: str) -> bool:
+    """Return True if a file's name says that it is a JPEG XL."""
+    return Path(path).suffix.lower() == SUFFIX
+
+
+def read_jpegxl(path: str, wanted: PixelFormat | None) -> Pixels:
+    """Return the pixels of a file, as they are or converted.
+
+    Raises:
+        FrameFormatError: the file holds no whole JPEG XL, or too large a picture.
+        FrameSourceError: the file cannot be read.
+        MissingExtraError: the extra ``frames`` is not installed.
+    """
+    try:
+        if (size := Path(path).stat().st_size) > MAX_FILE_BYTES:
+            raise FrameFormatError(
+                f"{path}: expected {MAX_FILE_BYTES} bytes at most, got {size}", source=path
+            )
+        data = Path(path).read_bytes()
+    except OSError as exc:
+        raise FrameSourceError(f"{path}: cannot be read: {exc.strerror}", source=path) from exc
+    frame = Frame(
+        data=data,
+        format=find_format("JPEGXL"),
+        width=0,
+        height=0,
+        stride=0,
+        captured=0.0,
+        utc=0.0,
+        moment=Moment.ARRIVAL,
+        sequence=0,
+        source=path,
+    )
+    width, height = jpegxl_size(frame)
+    if width * height > MAX_PICTURE_PIXELS:
+        raise FrameFormatError(
+            f"{path}: expected {MAX_PICTURE_PIXELS} pixels at most, got {width}x{height}",
+            source=path,
+        )
+    shown = decoded(amend(frame, width=width, height=height), "")
+    if wanted is not None and wanted is not shown.format:
+        shown = _as(shown, wanted)
+    return Pixels(shown.format, width, height, shown.stride, bytes(shown.data))
+
+
+def _as(frame: Frame, wanted: PixelFormat) -> Frame:
+    if wanted.compressed:
+        raise FrameFormatError(
+            f"{frame.source}: expected {wanted.name}, got JPEGXL", source=frame.source
+        )
+    if wanted.name == "BGR8":
+        shown = converted(frame, "RGB8")
+        return amend(shown, data=shown.array()[..., ::-1].tobytes(), format=wanted)
+    return converted(frame, wanted.name)

@@ -1,0 +1,73 @@
+"""The options of a camera's node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam.calibration import HandEyeCalibration
+    from smartcam.calibration._inside import ThesisCalibration
+    from smartcam.frames import FrameSource
+    from smartcam.geometry import Transform
+    from smartcam.settings import CameraSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraNodeOptions:
+    """The options of a camera's node.
+
+    Attributes:
+        frame_id: name of the camera's frame; empty for the camera's name.
+        parent_frame: name of the robot's frame; empty: as a calibration calls it.
+        flange_frame: name of the frame of the part of the robot that carries the camera; empty: as
+            a calibration calls it.
+        place: hand-eye calibration, which says where the camera is; None without.
+        calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
+            calibration of the camera's settings was made; None if the camera stands still.
+        autostart: whether the life cycle goes to Active by itself.
+        application: id of the application to have running and ready once configured; None: that
+            of the camera's settings.
+        diagnostics_period: seconds between two diagnostics.
+        status_rate: most messages of status a second.
+        hardware_id: id of the hardware in diagnostics; empty for the camera's address.
+        settings: what the session with the camera is told, where that is not what the camera's own
+            settings say: the agent's, of a camera of a fleet.
+        heard: whether there is any sign of the agent that has the session; None if nobody is
+            between.
+        frames: parameters that say where its frames come from, by v4l2_camera's names:
+            ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
+        controls: function that returns the open source of the frames, whose device's controls
+            become parameters; None: there are none.
+        calibrations: folder that calibrations of the camera are written to, or the calibrations
+            that other faces of the camera have, too; None: the services for them refuse.
+    """
+
+    frame_id: str = ""
+    parent_frame: str = ""
+    flange_frame: str = ""
+    place: HandEyeCalibration | None = None
+    calibrated_at: Transform | None = None
+    autostart: bool = True
+    application: int | None = None
+    diagnostics_period: float = 1.0
+    status_rate: float = 20.0
+    hardware_id: str = ""
+    settings: CameraSettings | None = None
+    heard: Callable[[], bool] | None = None
+    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    controls: Callable[[], Awaitable[FrameSource]] | None = None
+    calibrations: str | os.PathLike[str] | ThesisCalibration | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("diagnostics_period", self.diagnostics_period),
+            ("status_rate", self.status_rate),
+        ):
+            if not 0.01 <= value <= 3600:
+                raise ConfigurationError(f"{name}: {value!r}: expected 0.01 to 3600")

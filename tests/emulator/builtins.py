@@ -1,0 +1,10 @@
+"""The applications of an emulated camera that is told none."""
+
+from __future__ import annotations
+
+from smartcam.emulator import EmulatedCamera
+
+BUILTIN_APPLICATIONS = tuple(EmulatedCamera().device.applications.values())
+
+LOCALIZATIONS = next(one.layout or "" for one in BUILTIN_APPLICATIONS if one.name == "tangram")
+"""Layout of a container of localizations."""

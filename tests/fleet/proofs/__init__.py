@@ -1,0 +1,1 @@
+"""Proofs of the room: each module's docstring says what it proves."""

@@ -1,0 +1,20 @@
+"""Mistakes in the layout language and in files of YAML, for tests of the fuzzing targets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.layout import _compiled, _yaml_files
+from smartcam.layout._text import parse_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def cannot_tell_lines(mistake: Callable[..., Any]) -> tuple[object, str, Any]:
+    """Return where a line of YAML is found, with a mistake in its place."""
+    return _yaml_files, "_line", mistake
+
+
+CUTS_TEXTS = (_compiled, "parse_text", lambda text, start: parse_text(text[start:]))
+"""The text of a layout is cut off where it begins."""
