@@ -35,8 +35,12 @@ logger: logging.Logger = logging.getLogger("smartcam.outlets")
 MAX_HEADER_BYTES = 12
 """Bytes of a packet beside topic and text: its kind, three lengths, number and properties."""
 
-MAX_COMMANDS = 32
-"""Largest number of commands under way at a time; more are answered with an error."""
+MAX_COMMANDS = 1_000
+"""Largest number of commands under way at a time, such as a trigger of each camera; more are
+answered with an error. As many wait before it is known that they are too many."""
+
+MAX_WAITING_BYTES = 1 << 26
+"""Largest number of bytes of the messages that wait so; what comes beyond is not answered."""
 
 MAX_COMMAND_BYTES = 1 << 16
 """Largest number of bytes of a command's message."""
@@ -104,6 +108,25 @@ class MqttSettings(OutletSettings):
     )
 
 
+class _CommandQueue(asyncio.Queue[Any]):
+    """Messages that wait, with a bound on their bytes, too."""
+
+    _bytes = 0
+
+    def full(self) -> bool:
+        """Return True if no more may wait."""
+        return super().full() or self._bytes >= MAX_WAITING_BYTES
+
+    def _put(self, item: Any) -> None:
+        self._bytes += len(item.payload or b"")
+        super()._put(item)
+
+    def _get(self) -> Any:
+        item: Any = super()._get()
+        self._bytes -= len(item.payload or b"")
+        return item
+
+
 class _ShakenSocket(ssl.SSLSocket):
     """A socket that is closed where its handshake fails; paho leaves it open."""
 
@@ -157,10 +180,11 @@ class MqttOutlet(Outlet[MqttSettings]):
             timeout=settings.timeout,
             keepalive=10,
             clean_start=True,  # a command from before would be done too late
+            queue_type=_CommandQueue,
             max_queued_incoming_messages=MAX_COMMANDS,
             tls_context=self._tls() if parts.scheme == "mqtts" else None,
         )
-        client.pending_calls_threshold = 2 * self.max_batch
+        client.pending_calls_threshold = 2 * self.max_batch + 2 * MAX_COMMANDS
         self._watch_refusals(client)
         self._refusal, self._largest = "", settings.largest
         stack = contextlib.AsyncExitStack()

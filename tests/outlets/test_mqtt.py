@@ -129,6 +129,34 @@ async def test_a_camera_whose_name_is_no_topic_keeps_nothing_back(tmp_path: Path
     assert topics["smartcam/state/a_b"]["camera"] == "a+b"
 
 
+async def test_each_of_many_commands_at_once_is_answered(tmp_path: Path) -> None:
+    import aiomqtt
+
+    async def command(_camera: str, _verb: str, _given: Mapping[str, Any]) -> dict[str, Any]:
+        await asyncio.sleep(0.5)
+        return {}
+
+    async with (
+        broker(tmp_path) as there,
+        listener(there.port, "smartcam/outlet/mqtt") as online,
+        listener(there.port, "smartcam/reply/#") as replies,
+        Outlets(section(there.url, commands=True), tmp_path, command=command),
+    ):
+        await until(lambda: bool(online))
+        async with aiomqtt.Client(
+            "127.0.0.1", there.port, protocol=aiomqtt.ProtocolVersion.V5
+        ) as client:
+            client.pending_calls_threshold = 500
+            topic = "smartcam/command/trigger"
+            await asyncio.gather(
+                *(client.publish(f"{topic}/cam{n}", f'{{"id": {n}}}', qos=1) for n in range(300))
+            )
+        await until(lambda: len(replies) >= 300)
+    said = [json.loads(one.payload) for one in replies]
+    assert sorted(one["id"] for one in said) == [*range(300)]
+    assert all(one["ok"] for one in said)
+
+
 async def test_an_answer_that_the_broker_refuses_keeps_no_result_back(tmp_path: Path) -> None:
     import aiomqtt
     from paho.mqtt.packettypes import PacketTypes
