@@ -155,8 +155,9 @@ def calibrate_hand_eye(
         setup: whether the camera is on the hand (``eye-in-hand``, the target stays), or stands
             beside the robot (``eye-to-hand``, the target is on the hand).
         camera: the camera's lens, which the expected errors take as exact; None: calibrated from
-            the same views, which should then tilt the target: the lens' error is in the expected
-            errors. The target's points are adjusted for this lens, as bent sheets bend it.
+            the same views, which should then tilt the target, and from the robot's motions: the
+            lens' error is in the expected errors. Where ``adjust`` keeps the lens, or the views
+            deny that the target is as meant, the views alone tell it, with the points adjusted.
         method: ``auto``: whichever of ``robot`` and ``reprojection`` predicts left-out poses
             better; or one of these, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.

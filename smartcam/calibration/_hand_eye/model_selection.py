@@ -310,10 +310,9 @@ def _asked(judges: Sequence[Candidate]) -> Candidate | None:
         return None
     plain, *others = judges
     beside, limit = len(plain.solution.change), plain.held_out
-    asked = [one for one in others if one.chance(beside) < SIGNIFICANCE_LEVEL]
-    return min(
-        [plain, *(one for one in asked if one.held_out < limit)], key=lambda one: one.held_out
-    )
+    better = [one for one in others if one.held_out < limit]
+    asked = [one for one in better if one.chance(beside) < SIGNIFICANCE_LEVEL]
+    return min(asked, key=lambda one: one.held_out, default=plain)
 
 
 def _likelier(robot: Candidate, plain: Candidate) -> Candidate:

@@ -68,9 +68,6 @@ WORST_SIGMAS: Final = 20.0
 """Residuals, rms, beyond which the points are not those of the target, as a multiple of the points'
 standard deviation: it counts where it is more pixels than MAX_RMS_PX."""
 
-MAX_TARGET_METRES: Final = 20.0
-"""Metres that no target is long: a board in millimetres is 200."""
-
 OFF_MIDDLE: Final = 0.2
 """A principal point this part of the image's sides off the middle may be of another image."""
 
@@ -249,7 +246,7 @@ def examined(
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
-    """Yield the remarks on views that are copies, or show a target as large as a house."""
+    """Yield a remark on views that are copies."""
     groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
     for view, name in zip(views, names, strict=True):
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
@@ -259,12 +256,6 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         yield Code.COINCIDENT.remark(
             f"views that are the same to the last digit: {'; '.join(copies[:MAX_NAMED])}{more}: "
             "they count as often as they are there, and errors come out too small"
-        )
-    length = float(np.ptp(views[0].target.points, axis=0).max())
-    if length > MAX_TARGET_METRES:
-        yield Code.SCALE_MISMATCH.remark(
-            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are "
-            "its lengths in metres? All lengths that are found are in proportion"
         )
 
 
