@@ -206,13 +206,14 @@ class Candidate:
         points = self.problem.mask.sum(axis=1)
         return math.sqrt(float((points * self.errors**2).sum() / points.sum()))
 
-    @property
-    def chance(self) -> float:
-        """Probability, 0 to 1, that noise alone changes the additional parameters by as much."""
-        if self.solution.information is None:
-            return 1.0
+    def chance(self, beside: int) -> float:
+        """Return the probability that noise alone changes the additional parameters by as much.
+
+        ``beside``: how many of them, the last ones, are adjusted in any case.
+        """
         change, whole = self.solution.change, self.solution.information
-        if not len(change):
+        count = len(change) - beside
+        if whole is None or count <= 0:
             return 1.0
         # Wald's test: without an error beside noise, x^T C^-1 x of the K parameters x is chi-square
         # with K degrees of freedom; C^-1 is Schur's complement of the part of X and Z in the
@@ -221,12 +222,15 @@ class Candidate:
         # Number of Observations is Large (1943).
         mixed = whole[:12, 12:]
         own = whole[12:, 12:] - mixed.T @ solve_scaled(whole[:12, :12], mixed)
-        squares = float(change @ own @ change)
+        if beside:
+            across = own[:count, count:]
+            own = own[:count, :count] - across @ solve_scaled(own[count:, count:], across.T)
+        squares = float(change[:count] @ own @ change[:count])
         if not math.isfinite(squares):
             return 1.0
         # half of the equations each determine one of the robot's two sigmas
         freedom = None if self.problem.sigmas else max(1, 3 * self.problem.count - 6)
-        return Noise(1.0, freedom).chance(max(squares, 0.0), len(change))
+        return Noise(1.0, freedom).chance(max(squares, 0.0), count)
 
 
 def candidates(
@@ -304,12 +308,13 @@ def _robots(
 
 def _asked(judges: Sequence[Candidate]) -> Candidate | None:
     """Return the candidate with the right choice of adjusted values."""
-    if len(judges) < 2:
-        return judges[0] if judges else None
-    plain = next((one for one in judges if one.besides == NOTHING), None)
-    limit = plain.held_out if plain else math.inf
-    asked = [one for one in judges if one.chance < SIGNIFICANCE_LEVEL and one.held_out < limit]
-    return min(asked, key=lambda one: one.held_out, default=plain or judges[0])
+    if not judges:
+        return None
+    plain, *others = judges
+    beside, limit = len(plain.solution.change), plain.held_out
+    better = [one for one in others if one.held_out < limit]
+    asked = [one for one in better if one.chance(beside) < SIGNIFICANCE_LEVEL]
+    return min(asked, key=lambda one: one.held_out, default=plain)
 
 
 def _likelier(robot: Candidate, plain: Candidate) -> Candidate:

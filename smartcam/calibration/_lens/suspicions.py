@@ -67,10 +67,6 @@ MAX_RMS_SHARE: Final = 0.015
 MAX_RMS_SIGMAS: Final = 20.0
 """The limit MAX_RMS_PX as a multiple of the points' standard deviation; the larger holds."""
 
-MAX_TARGET_METRES: Final = 20.0
-"""No target is longer than this many metres; a board whose squares are given in millimetres seems
-200 m long."""
-
 DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
 """A principal point that lies this part of the image's sides off the centre may belong to another
 image."""
@@ -255,7 +251,7 @@ def examined(
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
-    """Yield the remarks on copied views, and on targets as large as a house."""
+    """Yield a remark on copied views."""
     groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
     for view, name in zip(views, names, strict=True):
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
@@ -270,12 +266,6 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
             "views that are the same to the last digit: "
             f"{'; '.join(copies[:MAX_POINTS_IN_MESSAGE])}{more}: "
             "they count as often as they are there, and errors come out too small"
-        )
-    length = float(np.ptp(views[0].target.points, axis=0).max())
-    if length > MAX_TARGET_METRES:
-        yield Code.SCALE_MISMATCH.remark(
-            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are "
-            "its lengths in metres? All lengths that are found are in proportion"
         )
 
 

@@ -300,7 +300,7 @@ class PointSource(Touches, ABC):
         if order is not None and order.sure:
             moved = ", ".join(str(1 + index) for index in order.moved)
             options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
-        if judgement.option == "side" and self.typed:
+        if judgement.option == "side" and self._read_robot is None:
             options["side"] = "say where the tool points"
         doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
         if robust:

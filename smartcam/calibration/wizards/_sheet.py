@@ -282,7 +282,7 @@ class _SheetSource(PointSource):
             camera_frame=frame,
         )
         middle = self._view.points.mean(axis=0)
-        ends = found.transform(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
+        ends = found.transform(np.add(middle, [[0.0, 0.0], [1.0, 0.0]]))
         right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         _, figures, lines, _ = calibrated_plane(plane, "what is to the right in the picture", right)
         seen, predicted = len(self._view.ids), None

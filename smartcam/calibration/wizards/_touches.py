@@ -111,11 +111,6 @@ class Touches:
         self.side = str(self.about.get("side", "unknown"))
 
     @property
-    def typed(self) -> bool:
-        """True if the user types the robot's pose."""
-        return self._read_robot is None
-
-    @property
     def places(self) -> list[Vector]:
         """Positions of the tip at the touches, metres."""
         return [one.robot for one in self.touches]
