@@ -193,7 +193,7 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
 
 
 def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Array:
-    """Return how far blurs move segments across, (N, K), by blurring their picture.
+    """Return the shifts of segments across by blurs, (N, K), by blurring their picture.
 
     Beside a corner, a bent edge or another edge, what a blur makes of an edge is no step about the
     same place.

@@ -324,7 +324,7 @@ class _SvgReader:
 
 
 def _style(element: ElementTree.Element) -> dict[str, str]:
-    """Return what the style of an element says, by name."""
+    """Return the values of an element's style, by name."""
     pairs = (one.partition(":") for one in element.get("style", "").split(";"))
     return {name.strip(): value.strip() for name, _, value in pairs if name.strip()}
 

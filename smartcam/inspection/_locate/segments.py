@@ -70,7 +70,7 @@ class Segments(NamedTuple):
         return points + bend[:, None] * self.normals[owners], owners
 
     def moved_by(self, variance: float) -> Array:
-        """Return how far a blur beyond the taught one moves each edge across, (N,)."""
+        """Return the shift of each edge across by a blur beyond the taught one, (N,)."""
         if variance < 0:  # what is sharper moves edges the other way
             first: Array = self.moves[:, 0] * max(variance / BLURS_PX2[0], -1.0)
             return first
