@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.long, pytest.mark.widest]
 
 SHORT = (
     "noise 2",
-    "blur 2.5",
+    "blur 1.8",
     "contrast 20",
     "texture",
     "covered 15 %",
