@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from smartcam.emulator import TableScene
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters import Interpreter, Reader, resolve, run
 from smartcam.registry import INTERPRETERS
@@ -80,6 +81,19 @@ def test_interpreter_has_fewer_than_fifteen_lines() -> None:
 def test_monitoring_example_finds_what_it_looks_for(name: str, needs: str) -> None:
     pytest.importorskip(needs, reason=f"needs {needs}, of the extra dev")
     runpy.run_path(str(ROOT / "examples" / "monitoring" / f"{name}.py"), run_name="__main__")
+
+
+# ---------------------------------------------------------------------- tangram
+
+
+@pytest.mark.long
+def test_tangram_is_found_in_a_picture(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(ROOT / "examples" / "tangram" / "tangram.py"), run_name="__main__")
+    *pieces, last = capsys.readouterr().out.splitlines()
+    names = {one.split()[0] for one in pieces}
+    assert names == {*TableScene().pieces}
+    assert last.startswith("7 of 7 pieces, all within ")
+    assert float(last.split()[-2]) < 0.03
 
 
 # ---------------------------------------------------------------------- sorting

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
@@ -240,6 +241,38 @@ def test_light_noise_and_blur_may_change(look: Look) -> None:
 
 
 @pytest.mark.long
+def test_light_beyond_the_largest_level_moves_edges_and_is_in_sigma() -> None:
+    part = PlacedPart(PARTS["tee"], 104.2, 97.5, 0.6)
+    (one,) = locate(
+        Picture(drawn(part, look=Look(dark=100, contrast=200))), [model_of("tee")], PartSearch()
+    ).parts
+    assert math.dist(one.pose[:2], truth("tee", part)) < 4 * max(one.sigmas[:2])
+    assert one.chi_square > 10
+    assert 0.02 < one.sigmas[0] < 0.3
+
+
+def test_edges_of_weak_contrast_count_by_their_own_taught_contrast() -> None:
+    part = PlacedPart(PARTS["bolt"], 104.2, 97.5, 0.6)
+    found = locate(Picture(drawn(part, look=Look(contrast=20))), [model_of("bolt")], PartSearch())
+    assert found.parts[0].score > 0.7
+
+
+def test_texture_beside_the_part_is_in_sigma() -> None:
+    random = np.random.default_rng(7)
+    part = PlacedPart(PARTS["tee"], 104.2, 97.5, 0.6)
+    light = shares((200, 200), [part], LOOK.blur)
+    blotches = cv2.GaussianBlur(random.normal(size=light.shape), (0, 0), 6.0)
+    blotches *= 15 / 120 / blotches.std()
+    own = shares((200, 200), [dataclasses.replace(part, shapes=part.shapes[:1])], LOOK.blur)
+    picture = photograph(light + blotches * (1 - own), LOOK, random)
+    plain, textured = (
+        locate(Picture(one), [model_of("tee")], PartSearch()).parts[0]
+        for one in (drawn(part), picture)
+    )
+    assert textured.sigmas[0] > 1.2 * plain.sigmas[0]
+    assert math.dist(textured.pose[:2], truth("tee", part)) < 4 * max(textured.sigmas[:2]) < 0.1
+
+
 def test_part_may_be_covered_in_part() -> None:
     part = PlacedPart(PARTS["bracket"], 98.37, 101.81, 0.6)
     picture = drawn(part)

@@ -128,6 +128,22 @@ def test_curves_and_groups_of_svg_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.reference, model.reference, atol=0.02)
 
 
+def test_box_with_round_corners_is_read(tmp_path: Path) -> None:
+    box = (
+        '<rect x="10" y="10" width="30" height="20" rx="6" ry="8"/><circle cx="18" cy="20" r="4"/>'
+    )
+    # the same in arcs, from another corner
+    arcs = "M40 22 A6 8 0 0 1 34 30 H16 A6 8 0 0 1 10 22 V18 A6 8 0 0 1 16 10 H34 A6 8 0 0 1 40 18Z"
+    path = f'<path d="{arcs}"/><circle cx="18" cy="20" r="4"/>'
+    first, second = (
+        PartModel.from_outline(svg(tmp_path / f"{n}.svg", one), 3.0)
+        for n, one in enumerate((box, path))
+    )
+    np.testing.assert_allclose(first.reference, second.reference, atol=0.02)
+    np.testing.assert_allclose(np.ptp(first.outline, axis=0), (90, 60), atol=1)
+    assert len(first.outline) == pytest.approx(len(second.outline), rel=0.02)
+
+
 SQUARE = '<rect x="10" y="10" width="30" height="20"/>'
 NO_UNIT = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 100">'
 STRETCHED = NO_UNIT.replace("viewBox", 'width="10mm" height="20mm" viewBox')
@@ -140,7 +156,14 @@ STRETCHED = NO_UNIT.replace("viewBox", 'width="10mm" height="20mm" viewBox')
         ("a.svg", f"{STRETCHED}{SQUARE}</svg>", "UNIT", "0.1 and 0.2 mm for a unit"),
         ("a.svg", f"{HEAD}</svg>", "NO_OUTLINE", "no line at all"),
         ("a.svg", f'{HEAD}<path d="M1 1H9V9"/></svg>', "NO_OUTLINE", "meets no other one"),
-        ("a.svg", f'{HEAD}<rect rx="2" width="9" height="9"/></svg>', "UNSUPPORTED", "got 'rect'"),
+        ("a.svg", f'{HEAD}<use href="#a"/></svg>', "UNSUPPORTED", "got 'use'"),
+        (
+            "a.svg",
+            f'{HEAD}<g style="fill:red; transform: scale(2)">{SQUARE}</g></svg>',
+            "UNSUPPORTED",
+            "in the style of a 'g'",
+        ),
+        ("a.svg", f'{HEAD}<g style="display: none">{SQUARE}</g></svg>', "NO_OUTLINE", "no line"),
         ("a.svg", f'{HEAD}<image href="a.png"/></svg>', "UNSUPPORTED", "got 'image'"),
         ("a.svg", f'{HEAD}<path d="M1 1L"/></svg>', "UNREADABLE", "a.svg"),
         ("a.svg", f'{HEAD}<g transform="turn(3)">{SQUARE}</g></svg>', "UNREADABLE", "turn"),

@@ -328,6 +328,8 @@ def _settled(
     """
     off = np.abs(shifts) * np.sqrt(weights)
     kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
+    if kept.any():  # where the whole part is not quite the taught one, as in too much light
+        spread = max(1.4826 * float(np.median(off[kept])), 1.0)
     for _ in range(3):
         kept = (weights > 0) & (off <= CUT * spread)
         if np.count_nonzero(kept) < MIN_SEEN:

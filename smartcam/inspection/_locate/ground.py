@@ -47,7 +47,7 @@ LEAST_PART: Final = 1e-4
 
 
 class Ground(NamedTuple):
-    """Variation of the light beside N edges: (N,), grey levels for a band's half width."""
+    """Light beside N edges that is not of one level: (N,), grey levels for a band's half width."""
 
     dark: Array  # standard deviation of the slope on the darker side
     bright: Array
@@ -60,7 +60,7 @@ def ground_beside(
     segments: Segments,
     used: NDArray[np.bool_],
 ) -> Ground | None:
-    """Return the variation of the light along edges; None: each side has one level.
+    """Return the slopes of the light along edges; None: each side has one level.
 
     ``places``: across and along, (P,) each; ``used`` (N,): the bands that have an edge.
     """
@@ -115,7 +115,7 @@ def fit_on_ground(
 
 
 def common_error(segments: Segments, shifts: Array, kept: NDArray[np.bool_]) -> float:
-    """Return by how much the variance of a pose grows as neighbours have errors in common.
+    """Return the factor of a pose's variance for errors that neighbours have in common.
 
     ``shifts`` (N,): in parts of their standard deviations.
     """

@@ -268,8 +268,15 @@ class _SvgReader:
                 f"{self._path}: expected {MAX_NESTED} groups in each other at most",
             )
         tag = _tag(element)
-        if tag in SVG_SILENT or element.get("display") == "none":
+        style = _style(element)
+        if tag in SVG_SILENT or "none" in (element.get("display"), style.get("display")):
             return
+        if "transform" in style:
+            raise TeachingError(
+                TeachingTrouble.UNSUPPORTED,
+                f"{self._path}: expected transforms as attributes, got one in the style of a "
+                f"{tag!r:.40}",
+            )
         label = element.get("{http://www.inkscape.org/namespaces/inkscape}label")
         wanted = wanted or element.get("id") in self._layers or label in self._layers
         matrix = matrix @ _matrix(element.get("transform", ""))
@@ -302,16 +309,37 @@ class _SvgReader:
             turns = np.linspace(0, 2 * math.pi, 1 + _steps(max(radii), flat))
             around = np.column_stack([np.cos(turns), np.sin(turns)]) * radii
             yield around + np.array([number("cx"), number("cy")])
-        elif tag == "rect" and not (number("rx") or number("ry")):
-            x, y, width, height = map(number, ("x", "y", "width", "height"))
-            right, below = x + width, y + height
-            yield _loop(np.array([[x, y], [right, y], [right, below], [x, below]]))
+        elif tag == "rect":
+            sides = np.array([number("width"), number("height")])
+            across = number("rx", number("ry"))
+            rounded = np.minimum([across, number("ry", across)], sides / 2)
+            with np.errstate(all="ignore"):
+                box = np.array([number("x"), number("y")]) + _round_box(sides, rounded, flat)
+            yield box
         else:
             raise TeachingError(
                 TeachingTrouble.UNSUPPORTED,
-                f"{self._path}: expected paths, polygons, lines, circles, ellipses and rectangles "
-                f"with sharp corners, got {tag!r:.40}: name the groups with the outline as layers",
+                f"{self._path}: expected paths, polygons, lines, circles, ellipses and rectangles, "
+                f"got {tag!r:.40}: name the groups with the outline as layers",
             )
+
+
+def _style(element: ElementTree.Element) -> dict[str, str]:
+    """Return the values of an element's style, by name."""
+    pairs = (one.partition(":") for one in element.get("style", "").split(";"))
+    return {name.strip(): value.strip() for name, _, value in pairs if name.strip()}
+
+
+def _round_box(sides: Array, radii: Array, flat: float) -> Array:
+    """Return the outline of a box at the origin with round corners; radii of 0: sharp ones."""
+    turns = np.linspace(0, math.pi / 2, 1 + _steps(float(radii.max()), flat))
+    quarter = np.column_stack([np.cos(turns), np.sin(turns)]) if radii.all() else np.zeros((1, 2))
+    rounds = []
+    for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1)):  # each from where the last one ended
+        corner = quarter if x * y > 0 else quarter[::-1]
+        middle = sides / 2 + [x, y] * (sides / 2 - (radii if radii.all() else 0))
+        rounds.append(middle + corner * radii * [x, y])
+    return _loop(np.concatenate(rounds))
 
 
 def _loop(corners: Array) -> Array:

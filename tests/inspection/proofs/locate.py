@@ -225,7 +225,7 @@ def _textured(light: Array, part: PlacedPart, kind: Kind, random: np.random.Gene
 
 
 def _behind(shape: tuple[int, ...], part: PlacedPart, kind: Kind) -> Array:
-    """Return how much of each pixel (H, W) is behind a part."""
+    """Return the share of each pixel (H, W) that is behind a part."""
     outline = tuple(one._replace(level=1.0) for one in part.shapes[:1])
     return 1 - shares(shape, [dataclasses.replace(part, shapes=outline)], kind.look.blur)
 

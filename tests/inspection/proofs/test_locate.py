@@ -13,7 +13,16 @@ from tests.strategies import over
 
 pytestmark = [pytest.mark.long, pytest.mark.widest]
 
-SHORT = ("noise 2", "blur 1.8", "covered 15 %", "clutter", "scale 0.8 to 1.25", "square")
+SHORT = (
+    "noise 2",
+    "blur 1.8",
+    "contrast 20",
+    "texture",
+    "covered 15 %",
+    "clutter",
+    "scale 0.8 to 1.25",
+    "square",
+)
 
 
 @over("name", SHORT)
