@@ -38,6 +38,7 @@ PACKAGES: Final = {
     "lz4": Package("lz4", "record", "recordings need"),
     "paho": Package("paho-mqtt", "mqtt", "outlets over MQTT need"),
     "prometheus_client": Package("prometheus-client", "operations", "metrics need"),
+    "regex": Package("regex", "inspection", "patterns of texts need"),
     "rosbags": Package("rosbags", "ros2", "messages of ROS need"),
     "ruamel": Package("ruamel.yaml", "inspection", "teaching needs"),
     "scipy": Package("SciPy", "calibration", "calibration needs"),

@@ -23,7 +23,7 @@ from benchmarks.peers.echo import REPLY, asking, zenoh_session
 from smartcam._zenoh import with_ports
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import AsyncIterator, Iterator
 
 __all__ = ["Broker", "broker"]
 
@@ -75,7 +75,7 @@ def broker() -> Iterator[Broker | None]:
 
 
 @contextlib.asynccontextmanager
-async def _client(port: int, topic: str) -> Any:
+async def _client(port: int, topic: str) -> AsyncIterator[Any]:
     """Give a client of the broker that has subscribed to a topic, as soon as the broker is up."""
     import aiomqtt
 

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
+MAX_HEADER_BYTES = 12
+"""Bytes of a packet beside topic and text: its kind, three lengths, number and properties."""
+
 MAX_COMMANDS = 32
 """Largest number of commands under way at a time; more are answered with an error."""
 
@@ -94,7 +97,10 @@ class MqttSettings(OutletSettings):
         "applications; see to it that the broker says who that is",
     )
     largest: int = Field(
-        10_000_000, ge=1000, le=268_000_000, description="bytes of a message; larger are refused"
+        10_000_000,
+        ge=1000,
+        le=268_000_000,
+        description="bytes of a message with its topic; larger are refused",
     )
 
 
@@ -122,6 +128,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         self._client: Any = None
         self._hearing: asyncio.Task[None] | None = None
         self._refusal = ""
+        self._largest = settings.largest
         self._states: dict[str, Mapping[str, Any]] = {}
         self._fresh: set[str] = set()
         self._changed = asyncio.Event()
@@ -155,7 +162,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         )
         client.pending_calls_threshold = 2 * self.max_batch
         self._watch_refusals(client)
-        self._refusal = ""
+        self._refusal, self._largest = "", settings.largest
         stack = contextlib.AsyncExitStack()
         self._stack = stack
         await stack.enter_async_context(client)
@@ -177,9 +184,9 @@ class MqttOutlet(Outlet[MqttSettings]):
         return made
 
     def _watch_refusals(self, client: Any) -> None:
-        """Learn which messages the broker acknowledges with a failure: aiomqtt does not tell."""
+        """Learn which messages the broker does not take: aiomqtt does not tell."""
         inner = client._client  # noqa: SLF001
-        send, told = inner.publish, inner.on_publish
+        send, told, came = inner.publish, inner.on_publish, inner.on_connect
         topics: dict[int, str] = {}  # of messages that are not acknowledged yet
 
         def publish(topic: str, *given: Any, **named: Any) -> Any:
@@ -199,7 +206,13 @@ class MqttOutlet(Outlet[MqttSettings]):
                     )
             told(of, data, number, reason, properties)
 
-        inner.publish, inner.on_publish = publish, on_publish
+        def on_connect(of: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
+            largest = getattr(properties, "MaximumPacketSize", None)  # of all of the packet
+            if largest is not None:
+                self._largest = min(self._largest, largest - MAX_HEADER_BYTES)
+            came(of, data, flags, reason, properties)
+
+        inner.publish, inner.on_publish, inner.on_connect = publish, on_publish, on_connect
 
     def _topic(self, kind: str, camera: str) -> str:
         """Return the topic of a camera; what no topic may have in its name is _ there."""
@@ -208,12 +221,15 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; the broker has acknowledged each one then."""
         messages = [_message(entry) for entry in entries]
-        sizes = [len(one) for one in messages]
-        count, largest = len(messages), self.settings.largest
+        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
+        sizes = [
+            len(topic.encode()) + len(message)
+            for topic, message in zip(topics, messages, strict=True)
+        ]
+        count, largest = len(messages), self._largest
         bad = next((place for place, size in enumerate(sizes) if size > largest), None)
         if bad is not None:
             count = bad
-        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
         await self._while_here(
             [
                 self._client.publish(topic, message, qos=1)

@@ -101,6 +101,7 @@ class Pump:
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
+        self._together = outlet.max_batch  # entries of the next batch at most
         self._gathering: asyncio.TimerHandle | None = None  # until what came is written
 
     async def start(self) -> None:
@@ -323,10 +324,16 @@ class Pump:
             logger.debug("outlet %s: closing: %s", self.outlet.name, text_of(exc))
 
     async def _deliver_some(self) -> bool:
-        """Deliver a batch, or wait for one; return True if one was taken."""
+        """Deliver a batch, or wait for one; return True if one was taken.
+
+        After one that failed, entries come one by one at first: if the far end fails at one of
+        them, those before it are not delivered again and again.
+        """
         self._spooled.clear()
-        waiting = await self._run(lambda: self.spool.head(self.outlet.max_batch))
+        together, self._together = self._together, 1
+        waiting = await self._run(lambda: self.spool.head(together))
         if not waiting.places:
+            self._together = together
             if self.trouble:
                 self._say_far("")
             await self._idle()
@@ -345,6 +352,7 @@ class Pump:
             await self._forget(waiting, place, str(exc) or "refused")
         else:
             await self._forget(waiting, None, "")
+        self._together = min(2 * together, self.outlet.max_batch)
         self._say_far("")
         return True
 

@@ -27,6 +27,9 @@ ROW_BYTES = 200
 MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
+MAX_PLACES_AT_ONCE = 1 << 32
+"""Places that are free behind the last one, or the note of it is damaged."""
+
 MAX_REASON_CHARACTERS = 500
 """Largest number of characters of the reasons of a gap, which may be several gaps in one."""
 
@@ -158,6 +161,9 @@ class Spool:
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
         if not _account(counts, self._spooled).balanced:
             raise sqlite3.DatabaseError("its account does not balance")
+        ((used,),) = database.execute("SELECT COALESCE(MAX(place), 0) FROM entries").fetchall()
+        if not used < _next_place(database):
+            raise sqlite3.DatabaseError(f"place {used} is behind the last one")
         before, last = counts.get("epoch", 0), self._last_epoch()
         self.epoch = max(before + 1, last + 1, time.time_ns() // 1000)
         with _transaction(database):
@@ -271,7 +277,7 @@ class Spool:
         self._spooled += sum(entry.kind != "gap" for entry in kept) - gone
 
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
-        rows = [_row(entry) for entry in entries]
+        rows = [_row(entry, place) for place, entry in enumerate(entries, _next_place(database))]
         database.executemany(_INSERT, rows)
         return sum(row[-2] for row in rows)
 
@@ -320,7 +326,7 @@ class Spool:
                 (most,),
             ):
                 entry = OutletEntry(*fields)
-                if _checksum(entry) != checksum:
+                if _checksum(entry, place) != checksum:
                     bad.append(place)
                 else:
                     places.append(place)
@@ -497,15 +503,29 @@ def _last_numbers(database: sqlite3.Connection, which: str = "") -> list[tuple[s
     return database.execute(f"SELECT camera, epoch, number FROM cameras {which}").fetchall()  # noqa: S608
 
 
-def _checksum(entry: OutletEntry) -> int:
-    return zlib.crc32(repr((*entry,)).encode(errors="backslashreplace"))
+def _checksum(entry: OutletEntry, place: int) -> int:
+    """Return the checksum of an entry and of its place, without which it would come out of turn."""
+    return zlib.crc32(repr((place, *entry)).encode(errors="backslashreplace"))
 
 
-def _row(entry: OutletEntry, place: int | None = None) -> tuple[Any, ...]:
-    """Return a row of the table; None: behind all others."""
+def _next_place(database: sqlite3.Connection) -> int:
+    """Return the place behind all that entries ever had.
+
+    Raises:
+        sqlite3.DatabaseError: the file's note of it is damaged.
+    """
+    found = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
+    last = 0 if found is None else found[0]
+    if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MAX_PLACES_AT_ONCE:
+        raise sqlite3.DatabaseError(f"expected the last place of an entry, got {last!r:.40}")
+    return last + 1
+
+
+def _row(entry: OutletEntry, place: int) -> tuple[Any, ...]:
+    """Return a row of the table."""
     entry = entry._replace(at=float(entry.at))
     size = 0 if entry.kind == "gap" else len(entry.body) + ROW_BYTES
-    return place, *entry, size, _checksum(entry)
+    return place, *entry, size, _checksum(entry, place)
 
 
 def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
@@ -548,7 +568,7 @@ def _add_gap(
         (last.camera, in_flight, MAX_PLACE if place is None else place),
     ):
         entry = OutletEntry(*fields)
-        if entry.kind != "gap" or _checksum(entry) != checksum:
+        if entry.kind != "gap" or _checksum(entry, there) != checksum:
             break
         said = json.loads(entry.body)
         count += said["lost"]
@@ -560,7 +580,7 @@ def _add_gap(
     error = "; ".join(each)[:MAX_REASON_CHARACTERS]
     body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)
-    database.execute(_INSERT, _row(gap, place))
+    database.execute(_INSERT, _row(gap, _next_place(database) if place is None else place))
 
 
 def _salvaged(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
@@ -577,6 +597,6 @@ def _salvaged(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
                     if place in entries:
                         break
                     entry = OutletEntry(*fields)
-                    if _checksum(entry) == checksum:
+                    if _checksum(entry, place) == checksum:
                         entries[place] = entry
     return [entries[place] for place in sorted(entries)], counts

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
 from smartcam._user_code import text_of
-from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.exceptions import ConfigurationError, EntryRefusedError, OutletError
 from smartcam.outlets._database import open_database
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._records import picture_of, records_of
@@ -155,6 +155,7 @@ class _StoreFile:
         self._database: sqlite3.Connection | None = None
         self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
         self._expired = 0.0
+        self._identity: object = None  # of the file that is open
 
     def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
         """Have work done in the thread; ``last``: the thread ends with it."""
@@ -185,7 +186,16 @@ class _StoreFile:
             if version == 1:
                 database.execute("ALTER TABLE results ADD COLUMN at_least INTEGER")
             database.execute(f"PRAGMA user_version = {VERSION}")
+        self._identity = self._identity_there()
         self._expired = 0.0
+
+    def _identity_there(self) -> object:
+        """Return the device and the number of the file at the path; None without one."""
+        try:
+            there = self.path.stat()
+        except FileNotFoundError:
+            return None
+        return there.st_dev, there.st_ino
 
     def close(self) -> None:
         """Close the file."""
@@ -212,6 +222,7 @@ class _StoreFile:
 
         Raises:
             EntryRefusedError: no table can have one of them; none is written.
+            OutletError: the file was moved or deleted meanwhile, with these entries.
         """
         self._columns.clear()  # a layout may have changed, and a transaction been undone
         with _transaction(database):
@@ -220,6 +231,8 @@ class _StoreFile:
                     self._write_one(database, entry)
                 except _UNFIT as exc:
                     raise EntryRefusedError(text_of(exc), place=place) from exc
+        if self._identity_there() != self._identity:
+            raise OutletError(f"the store {self.path} was moved or deleted: it is begun anew")
 
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
         said: dict[str, Any] = _readable(json.loads(entry.body))

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         COUNTER,
         ECHO,
         FREE,
-        NOBODYS,
         OTHER,
         SLOW,
         SLOW_TIME,
@@ -38,7 +37,6 @@ __all__ = [
     "COUNTER",
     "ECHO",
     "FREE",
-    "NOBODYS",
     "OTHER",
     "SLOW",
     "SLOW_TIME",
@@ -64,7 +62,7 @@ if not TYPE_CHECKING:
         {
             "_logs": "CameraLog",
             "_suites.interpreters": "ContainerSample InterpreterSuite",
-            "_suites.protocols.cameras_under_test": "COUNTER ECHO FREE NOBODYS OTHER SLOW "
+            "_suites.protocols.cameras_under_test": "COUNTER ECHO FREE OTHER SLOW "
             "SLOW_TIME CameraKind LiveCamera",
             "_suites.protocols.conversations": "Came Conversation Sent",
             "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",

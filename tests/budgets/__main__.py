@@ -68,14 +68,7 @@ def count_instructions(
         command = [
             *counting.CALLGRIND,
             f"--callgrind-out-file={written}",
-            *(
-                sys.executable,
-                "-m",
-                "tests.budgets",
-                "--child",
-                str(written),
-                *asked,
-            ),
+            *(sys.executable, "-m", "tests.budgets", "--child", str(written), *asked),
         ]
         done = subprocess.run(  # noqa: S603 - this very file
             command,

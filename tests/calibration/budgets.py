@@ -166,7 +166,8 @@ PARSERS: tuple[Parser, ...] = (
             from_file(form.read, "a"),
             _SAMPLES,
             form.most,
-            f"calibration.formats._file_format.{'MAX_YAML' if 'yaml' in name else 'MAX_FILE'}",
+            "calibration.formats._file_format."
+            + ("MAX_YAML_BYTES" if "yaml" in name else "MAX_FILE_BYTES"),
             size=2500,
             short=PAST_LOOKAHEAD,
             needs=("yaml",),

@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from smartcam._cli.calibrate import calibrate
 
-__all__ = [
-    "calibrate",
-]
+__all__ = ["calibrate"]

@@ -154,10 +154,7 @@ def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(
     tmp_path: Path, files: list[str]
 ) -> None:
-    lines = [
-        *answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {"x": 1.0}),
-        {"do": "abort"},
-    ]
+    lines = [*answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {"x": 1.0}), {"do": "abort"}]
     done = calibrating(tmp_path, lines, "--wizard", "hand-eye", *files)
     assert [line.get("step") for line in done.lines] == [
         "about", "rulers", "view-1", "view-1", None,

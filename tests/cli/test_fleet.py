@@ -316,10 +316,7 @@ def test_serve_schema_is_that_of_fleet_files() -> None:
     [
         ("cameras:\n  line1/cam3: {ulr: 'bvs://a'}\n", ["line 2", "cameras.line1/cam3.ulr"]),
         ("cameras:\n  Line1: {url: 'bvs://a'}\n", ["line 2", "'Line1'"]),
-        (
-            "fleet: plant\ncameras:\n  a: {}\n",
-            ["line 3", "url, emulated, software"],
-        ),
+        ("fleet: plant\ncameras:\n  a: {}\n", ["line 3", "url, emulated, software"]),
         ("cameras: [\n", ["line "]),
     ],
 )

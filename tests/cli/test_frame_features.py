@@ -74,7 +74,7 @@ async def test_a_triggered_picture_is_written(tmp_path: Path) -> None:
         assert code == 5
         assert "TriggerMode is Off" in err
         code, _, err = await command(
-            *("frames", "grab", url(there, "&trigger=Line1"), "-o", str(file), "--timeout", "0.5"),
+            *("frames", "grab", url(there, "&trigger=Line1"), "-o", str(file), "--timeout", "0.5")
         )
         assert code == 4
         assert "TriggerSource Line1, and nothing triggered it" in err

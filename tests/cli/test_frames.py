@@ -19,14 +19,7 @@ import pytest
 
 from smartcam._cli.frame_measure import measure
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames import (
-    FoundSource,
-    Frame,
-    FrameSink,
-    Moment,
-    StreamFormat,
-    find_format,
-)
+from smartcam.frames import FoundSource, Frame, FrameSink, Moment, StreamFormat, find_format
 from smartcam.frames import open as open_frames
 from smartcam.registry import FRAMES
 from tests.cli.commandline import run

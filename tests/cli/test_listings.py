@@ -112,8 +112,7 @@ HEAVY = {"asyncio", "construct", "logging", "numpy", "pydantic", "socket", "yaml
 
 
 @pytest.mark.parametrize(
-    ("main", "argument"),
-    [("main", "--help"), ("main", "--version"), ("emulator_main", "--help")],
+    ("main", "argument"), [("main", "--help"), ("main", "--version"), ("emulator_main", "--help")]
 )
 def test_help_imports_what_it_shows_and_nothing_else(main: str, argument: str) -> None:
     found = imported_for(f"sys.argv = ['smartcam', {argument!r}]\nmain(cli.{main})")
@@ -217,14 +216,7 @@ def test_demo_json_is_json_with_a_balanced_account() -> None:
     (result,) = [line["result"] for line in lines if "result" in line]
     assert len(result["value"]) == 7
     account = lines[-1]["statistics"]
-    fates = (
-        "triggered",
-        "streamed",
-        "unclaimed",
-        "late",
-        "wrong_application",
-        "uninterpretable",
-    )
+    fates = ("triggered", "streamed", "unclaimed", "late", "wrong_application", "uninterpretable")
     assert account["received"] == sum(account[fate] for fate in fates) == 12
 
 

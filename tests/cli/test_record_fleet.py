@@ -109,11 +109,7 @@ def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None
     kept = runs(load_recording(paths[1]))
     assert len(kept) < len(whole[1])
     assert kept or len(whole[1]) < 10  # of a few, none may stand before the damage
-    assert runs(found) == [
-        *whole[0],
-        *kept,
-        *itertools.chain(*whole[3:]),
-    ]
+    assert runs(found) == [*whole[0], *kept, *itertools.chain(*whole[3:])]
     with Process("smartcam", "replay", str(folder), "--loop") as played:
         url = played.read_until(b"\n").split()[0]
         rest = [*whole[0], *kept, *itertools.chain(*whole[3:])]

@@ -65,9 +65,7 @@ def test_none_goes_with_a_bag(tmp_path: Path) -> None:
     assert "pictures go into a recording (-o), not into a bag" in refused.err
 
 
-def test_a_fleets_software_camera_is_recorded_and_played_with_its_pictures(
-    tmp_path: Path,
-) -> None:
+def test_a_fleets_software_camera_is_recorded_and_played_with_its_pictures(tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     with Process("smartcam", "serve", str(cell_of(tmp_path))) as agent:
         urls = agent.read_until(b"\n", count=2).split()

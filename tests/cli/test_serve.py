@@ -146,9 +146,7 @@ def test_a_wrong_file_is_told_as_json(tmp_path: Path) -> None:
     assert "operations.listen: expected HOST:PORT" in line["message"]
 
 
-def test_agent_whose_router_is_away_tries_again_and_a_router_has_no_cameras(
-    tmp_path: Path,
-) -> None:
+def test_agent_whose_router_is_away_tries_again_and_a_router_has_no_cameras(tmp_path: Path) -> None:
     place = free_place()
     south, router = tmp_path / "south.yaml", tmp_path / "router.yaml"
     router.write_text(f"agent: router\nlisten: {place}\ncameras: {{}}\n")

@@ -170,8 +170,7 @@ def test_pixels_that_share_their_noise_are_told(iterations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"alpha": 0}, {"alpha": 1.1}, {"alpha": math.nan}, {"delta": 0}, {"delta": math.inf}],
+    "wrong", [{"alpha": 0}, {"alpha": 1.1}, {"alpha": math.nan}, {"delta": 0}, {"delta": math.inf}]
 )
 def test_average_that_is_none_is_told(wrong: dict[str, float]) -> None:
     for kind in (SpatialFilter, TemporalFilter):

@@ -50,11 +50,7 @@ def lens(size: tuple[int, int], focal: float) -> CameraModel:
 TURN = np.array(cv2.Rodrigues(np.array([0.02, -0.03, 0.015]))[0], dtype=np.float64)
 RIGHT_LEFT = Transform("right", "left", TURN, np.array([-0.12, 0.003, 0.002]))
 LEFT, RIGHT = lens(SIZE, 210.0), lens(SIZE, 215.0)
-CHAIN = CameraChain(
-    cameras=(LEFT, RIGHT),
-    transforms=(RIGHT_LEFT,),
-    names=("left", "right"),
-)
+CHAIN = CameraChain(cameras=(LEFT, RIGHT), transforms=(RIGHT_LEFT,), names=("left", "right"))
 ROOM = Room((1.6, 0.2, 0.1), 0.9, detail=0.04)
 
 
@@ -392,10 +388,7 @@ def test_sizes_lenses_and_maps_go_together() -> None:
 
 @pytest.mark.parametrize(
     ("translation", "said"),
-    [
-        ([0.12, 0, 0], "right of the right one"),
-        ([0, -0.12, 0], "above or below it"),
-    ],
+    [([0.12, 0, 0], "right of the right one"), ([0, -0.12, 0], "above or below it")],
 )
 def test_cameras_that_are_not_side_by_side_are_refused(translation: list[float], said: str) -> None:
     other = Transform("right", "left", np.eye(3), np.array(translation))

@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from smartcam.doctor._findings import Exit
 
-__all__ = [
-    "Exit",
-]
+__all__ = ["Exit"]

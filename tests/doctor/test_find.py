@@ -17,14 +17,7 @@ from smartcam.doctor._opening import MAX_SAID_BYTES, Opened, is_own
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Protocol, Transport
 from smartcam.registry import PROTOCOLS
-from tests.doctor.findkit import (
-    NETWORK,
-    RefusesAtOnce,
-    TakenAtOnce,
-    filtered,
-    free_port,
-    listening,
-)
+from tests.doctor.findkit import NETWORK, RefusesAtOnce, TakenAtOnce, filtered, free_port, listening
 from tests.handmade import until
 
 if TYPE_CHECKING:

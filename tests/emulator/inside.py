@@ -5,7 +5,4 @@ from __future__ import annotations
 from smartcam.emulator._generators import generator_names
 from smartcam.emulator._links import _TcpLink
 
-__all__ = [
-    "_TcpLink",
-    "generator_names",
-]
+__all__ = ["_TcpLink", "generator_names"]

@@ -10,8 +10,14 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from smartcam.emulator import Application, Run, TablePose, TableScene, register_generator
-from smartcam.emulator._application import make_application
+from smartcam.emulator import (
+    Application,
+    EmulatedCamera,
+    Run,
+    TablePose,
+    TableScene,
+    register_generator,
+)
 from smartcam.emulator._inside import PIECES, TABLE_SIZE, Observation, find_generator, wrap_number
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
@@ -273,17 +279,17 @@ def test_default_processing_time_gives_way_to_the_rate() -> None:
 )
 def test_make_application_wrong_field_is_named(fields: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigurationError, match=f"(?s)application .*{text}"):
-        make_application({"id": 5, **fields})
+        EmulatedCamera([{"id": 5, **fields}])
 
 
 def test_make_application_without_an_id() -> None:
     with pytest.raises(ConfigurationError, match=r"application \?: id: Field required"):
-        make_application({})
+        EmulatedCamera([{}])
 
 
 def test_make_application_takes_an_application_as_it_is() -> None:
     app = builtin(3)
-    assert make_application(app) is app
+    assert EmulatedCamera([app], builtins=False).device.applications[3] is app
 
 
 # ----------------------------------------------------------------------

@@ -347,8 +347,8 @@ async def test_what_is_said_arrives_however_long_it_is(size: int) -> None:
         for says, hears in (ends, ends[::-1]):
             heard = await heard_by(says, hears)
             says.put("test/it", payload)
-            await heard.come(1)
-            assert heard.payloads == [payload]
+            await heard.come_all([payload])
+            assert {*heard.payloads} == {payload}
 
 
 @pytest.mark.parametrize("count", [20, 100, 2000])
@@ -432,6 +432,8 @@ async def test_what_is_said_while_a_link_stands_still_arrives_in_order(urgent: b
                 assert slowest < LOOP_MAY_WAIT
                 relay.flows.set()
                 await heard.come_all(payloads)
+                await until(lambda says=says: not says._behind)  # the loop says it again itself
+                assert (says._doubtful, says.waiting_bytes) == (0, 0)
                 results.close()
         finally:
             await connects.close()
@@ -453,7 +455,7 @@ async def test_engine_thread_keeps_its_state_from_one_callback_to_the_next() -> 
         for count in range(20):
             listens.put("test/it", b"")
             await heard.come(count + 1)
-        await until(lambda: len(calls) == 20)
+        await until(lambda: len(calls) >= 20)  # one that was slow to go may come twice
         assert calls.count(1) <= 4  # threads that came for the first time
         subscriber.undeclare()
 
@@ -489,8 +491,7 @@ async def test_callback_that_raises_harms_nobody(caplog: pytest.LogCaptureFixtur
             for number in range(100):
                 says.put("test/it", b"%d" % number)
             says.be_present("presence/one")
-            await heard.come(100)
-        assert heard.payloads == [b"%d" % number for number in range(100)]
+            await heard.come_all([b"%d" % number for number in range(100)])
         assert any("was not taken" in record.message for record in caplog.records)
         caplog.clear()
 

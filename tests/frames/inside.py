@@ -8,12 +8,4 @@ from smartcam.frames._streaming.rtp.driver import RtpDriver
 from smartcam.frames._streaming.rtp.packets import RtpPacket, is_rtcp
 from smartcam.frames._v4l2 import discovery, system
 
-__all__ = [
-    "Depacketizer",
-    "RtpDriver",
-    "RtpPacket",
-    "discovery",
-    "is_rtcp",
-    "parse",
-    "system",
-]
+__all__ = ["Depacketizer", "RtpDriver", "RtpPacket", "discovery", "is_rtcp", "parse", "system"]

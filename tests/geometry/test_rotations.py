@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.geometry import _rotations as rotations
+from smartcam.geometry import _inside as rotations
 from smartcam.geometry._inside import (
     IDENTITY,
     Rigid,

@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from smartcam.inspection._read.gs1 import elements
 
-__all__ = [
-    "elements",
-]
+__all__ = ["elements"]

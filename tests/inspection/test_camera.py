@@ -171,7 +171,7 @@ async def test_a_lost_source_is_a_system_error_until_it_is_back(cell: Path, desk
         await camera.wait_status(
             lambda status: bool(status & Status.SYSTEM_ERROR), timeout=PATIENCE
         )
-        with pytest.raises(CameraFaultError):
+        with pytest.raises(CameraFaultError, match=r"System Error: .*cable"):
             await triggered(camera)
         desk.plug()
         desk.level = 77

@@ -181,3 +181,10 @@ def test_region_that_cannot_be_compared_is_refused(
     cv2.imwrite(str(tmp_path / "good.png"), label())
     with pytest.raises(ConfigurationError, match=message):
         programs(tmp_path, f"7: {{compare: {{taught: good.png, {settings}}}}}")
+
+
+def test_what_follows_needs_a_region(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "good.png"), label())
+    tools = "present: {grey: [0, 40]}, compare: {taught: good.png, follow: present}"
+    with pytest.raises(ConfigurationError, match="compare: expected a region"):
+        programs(tmp_path, f"7: {{{tools}}}")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-import time
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
 from smartcam.inspection._read.codes import formats_of, read_codes
 from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
-from smartcam.inspection._read.patterns import TextPattern
+from smartcam.inspection._read.patterns import TextPattern, TooLongError
 from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
@@ -153,16 +154,49 @@ def test_pattern_that_is_too_large_is_refused(tmp_path: Path) -> None:
         "(a|a?)+b",
     ],
 )
-def test_no_pattern_takes_longer_the_more_ways_it_could_match(pattern: str) -> None:
+def test_pattern_with_countless_ways_through_a_text_says_no_or_gives_up(pattern: str) -> None:
     expected = TextPattern(pattern)
-    begun = time.process_time()
-    assert not expected.fits(28 * "a" + "!")
-    assert time.process_time() - begun < 1.0  # by re, some of these take years
+    for length in (28, 4000):
+        with contextlib.suppress(TooLongError):
+            assert not expected.fits(length * "a" + "!")  # by re, some of these take years
+
+
+def test_comparing_lets_other_threads_run() -> None:
+    ways, turns, ended = TextPattern("(a|a)+"), 0, False
+
+    def work() -> None:
+        nonlocal turns
+        while not ended:
+            turns += 1
+
+    other = threading.Thread(target=work)
+    other.start()
+    before = turns
+    try:
+        with contextlib.suppress(TooLongError):
+            ways.fits(4000 * "a" + "!")
+        assert turns > before
+    finally:
+        ended = True
+        other.join()
 
 
 def test_patterns_match_what_those_of_re_match() -> None:
     random = np.random.default_rng(5)
-    atoms = ["a", "b", ".", r"\d", "[ab]", "[^a]", "(?i:B)", r"\b", "^", "$", r"\B", r"\Z", ""]
+    atoms = [
+        "a",
+        "b",
+        ".",
+        r"\d",
+        "[ab]",
+        "[^a]",
+        "(?i:B)",
+        r"\b",
+        "^",
+        "$",
+        r"\Z",
+        "",
+    ]  # not \B, as Python 3.14 changed it
     times = ["*", "+", "?", "{2}", "{1,2}", "*?", "??"]
 
     def pattern(depth: int) -> str:
@@ -189,25 +223,14 @@ def test_patterns_match_what_those_of_re_match() -> None:
     assert matches > 25
 
 
-@pytest.mark.parametrize(
-    ("pattern", "text"),
-    [
-        (r"(a)\1", "references to groups"),
-        ("(?>a)b", "atomic groups"),
-        ("(a{0,100}){0,100}", "each counted as often as it may be repeated"),
-        ("(){1,4294967294}", "each counted as often as it may be repeated"),
-        ("(?<=a*)b", "no fixed width"),
-    ],
-)
-def test_pattern_that_is_not_compared_is_refused(pattern: str, text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        TextPattern(pattern)
+def test_pattern_that_is_too_long_is_refused() -> None:
+    with pytest.raises(ValueError, match="4000 characters at most, got 4001"):
+        TextPattern("a" * 4001)
 
 
 def test_text_that_takes_too_long_to_compare_is_not_ok(tmp_path: Path) -> None:
-    hard = f"({'(?!.*b)' * 100}.)*"  # each place of the text looks at all behind it, 100 times
-    cell = f"{{read: {{codes: DataMatrix, length: 200, expect: '{hard}'}}}}"
-    found = inspected(tmp_path, cell, picture(text=200 * "a"))
+    cell = "{read: {codes: DataMatrix, length: 200, expect: '(a|a)+'}}"
+    found = inspected(tmp_path, cell, picture(text=150 * "a" + "!"))
     assert (found.ok, found.reason.endswith("takes too long")) == (False, True)
 
 

@@ -16,7 +16,9 @@ from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.interpreters._inside import plain, run_plain
 from smartcam.layout import Layout
 from smartcam.models import ByteOrder
-from tests.interpreters.inside import TableInterpreter
+from smartcam.registry import INTERPRETERS
+
+TableInterpreter: Any = INTERPRETERS.load("table")
 
 NUMBERS = {
     "int8": ("b", -5),
@@ -190,7 +192,7 @@ def test_built_in_interpreters_of_bytes_alone_are_plain(spec: str) -> None:
 
 
 def test_table_that_is_read_otherwise_is_read_so_in_bursts() -> None:
-    class Count(TableInterpreter):
+    class Count(TableInterpreter):  # type: ignore[misc]
         def read(self, data: bytes, context: Context) -> Any:
             return len(super().read(data, context))
 

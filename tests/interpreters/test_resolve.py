@@ -9,12 +9,15 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, LayoutError, PluginError
 from smartcam.interpreters import Context, Interpreter, Reader, resolve, run
-from smartcam.interpreters._basic import RawInterpreter, RecordInterpreter, Strings50Interpreter
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.models import jsonable
 from smartcam.registry import INTERPRETERS
-from tests.interpreters.inside import TableInterpreter
+
+RawInterpreter: Any = INTERPRETERS.load("raw")
+RecordInterpreter: Any = INTERPRETERS.load("record")
+Strings50Interpreter: Any = INTERPRETERS.load("strings50")
+TableInterpreter: Any = INTERPRETERS.load("table")
 
 XY = "(x: real32 mm, y: real32 mm)*"
 

@@ -43,13 +43,7 @@ _SCENARIO = "name: a\nseed: 1\n"
 _SCENARIOS: dict[str, Make] = {
     **{
         f"YAML: {kind}": YAML[kind]
-        for kind in (
-            "a long list",
-            "nested brackets",
-            "aliases of aliases",
-            "complex keys",
-            MERGED,
-        )
+        for kind in ("a long list", "nested brackets", "aliases of aliases", "complex keys", MERGED)
     },
     "unknown fields": fill_text("field{}: 1\n", _SCENARIO),
     "applications": fill_text("- {id: {}, layout: 'x: int32'}\n", _SCENARIO + "applications:\n"),

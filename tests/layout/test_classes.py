@@ -73,11 +73,7 @@ OBJECTS: list[tuple[Any, str, Any]] = [
     ),
     (Named, "number: uint32 @sequence", Named(number=3)),
     (Pair, "left: real64, right: int8", Pair(0.5, 3)),
-    (
-        Model,
-        "grade: uint8, width: int32 um, parts: (x: real32 mm, theta: real32 deg)*",
-        MODEL,
-    ),
+    (Model, "grade: uint8, width: int32 um, parts: (x: real32 mm, theta: real32 deg)*", MODEL),
     (Outer, "grades: (grade: uint8)[2]", Outer([Nested(grade=Grade.A), Nested(grade=Grade.B)])),
     (list[Pair], "(left: real64, right: int8)*", [Pair(1, 2), Pair(3, 4)]),
     (Annotated[list[Pair], "[1]"], "(left: real64, right: int8)[1]", [Pair(1, 2)]),

@@ -128,8 +128,7 @@ def test_scenario_with_many_mistakes_tells_some(
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["[" * 1000, "{a: " * 1000, "- " * 1000, "\n".join(" " * n + "a:" for n in range(1000))],
+    "text", ["[" * 1000, "{a: " * 1000, "- " * 1000, "\n".join(" " * n + "a:" for n in range(1000))]
 )
 def test_yaml_nested_too_deep_says_where(text: str) -> None:
     with pytest.raises(

@@ -16,9 +16,7 @@ from tests.makes.test_ifm import PATIENCE, Peer, by_hand
 
 
 @contextlib.asynccontextmanager
-async def switching(
-    **options: Any,
-) -> AsyncIterator[tuple[list[int], Peer, smartcam.Camera[Any]]]:
+async def switching(**options: Any) -> AsyncIterator[tuple[list[int], Peer, smartcam.Camera[Any]]]:
     """Put up a device that names the applications of a list in turn, the last for ever."""
     left = [1]
 

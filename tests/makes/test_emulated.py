@@ -135,10 +135,7 @@ async def test_recording_is_played_to_clients_that_ask_otherwise(make: str, tmp_
         with Recorder(path) as made:
             async with smartcam.connect(emulator.url, name="left", observers=[made]) as camera:
                 recorded = [(await camera.trigger()).raw for _ in range(3)]
-    async with (
-        replay(load_recording(path)) as played,
-        smartcam.connect(played.url) as camera,
-    ):
+    async with replay(load_recording(path)) as played, smartcam.connect(played.url) as camera:
         await camera.query_application()  # which moves all the tickets
         assert [(await camera.trigger()).raw for _ in range(3)] == recorded
 
@@ -159,10 +156,7 @@ async def test_recorded_state_is_played_at_its_trigger_however_often_a_client_as
                 clock.advance(0.3)
                 recorded = (await triggered).raw
     assert Status.BUSY in last  # which nothing but the code follows
-    async with (
-        replay(load_recording(path)) as played,
-        smartcam.connect(played.url) as camera,
-    ):
+    async with replay(load_recording(path)) as played, smartcam.connect(played.url) as camera:
         for _ in range(5):
             assert Status.BUSY not in await camera.query_status()
         assert (await camera.trigger()).raw == recorded

@@ -58,10 +58,7 @@ def test_emulated_camera_has_a_page_without_a_word_more(name: str) -> None:
 @pytest.mark.parametrize(("version", "dialect"), [(1, "v1"), (2, "v2"), (3, "v3"), (4, "v4")])
 @pytest.mark.asyncio
 async def test_version_of_the_device_is_found_out(version: int, dialect: str) -> None:
-    async with (
-        EmulatedIfm(version=version) as emulator,
-        smartcam.connect(emulator.url) as camera,
-    ):
+    async with EmulatedIfm(version=version) as emulator, smartcam.connect(emulator.url) as camera:
         assert camera.url.endswith(f"?dialect={dialect}")
         assert (await camera.trigger()).value == b"star;12.5000;-3.0000;0.9700;stop"
 

@@ -180,10 +180,7 @@ async def test_overrun_ends_an_asynchronous_trigger() -> None:
 @pytest.mark.asyncio
 async def test_overrun_of_a_sensor_does_not_touch_a_trigger_with_a_ticket() -> None:
     clock = ManualClock()
-    async with (
-        EmulatedIfm(clock=clock) as emulator,
-        smartcam.connect(emulator.url) as camera,
-    ):
+    async with EmulatedIfm(clock=clock) as emulator, smartcam.connect(emulator.url) as camera:
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         await until(lambda: emulator.busy)
         emulator.device.trigger()
@@ -308,10 +305,7 @@ async def test_emulated_sensor_refuses_what_is_no_layout() -> None:
 
 @pytest.mark.asyncio
 async def test_input_goes_to_the_container_of_the_url() -> None:
-    async with (
-        EmulatedIfm() as emulator,
-        smartcam.connect(f"{emulator.url}?input=3") as camera,
-    ):
+    async with EmulatedIfm() as emulator, smartcam.connect(f"{emulator.url}?input=3") as camera:
         await camera.set_input(b"bolt \xff")
         assert await camera.request("J03?") == b"000000006bolt \xff"
         assert (await camera.trigger(input=b"nut")).raw.startswith(b"star")

@@ -123,10 +123,7 @@ async def test_count_of_the_sensor_is_the_sequence_of_a_result() -> None:
 
 @pytest.mark.asyncio
 async def test_result_is_of_the_program_that_somebody_else_has_chosen() -> None:
-    async with (
-        EmulatedIv3(programs=(0, 1)) as emulator,
-        smartcam.connect(emulator.url) as camera,
-    ):
+    async with EmulatedIv3(programs=(0, 1)) as emulator, smartcam.connect(emulator.url) as camera:
         assert (await camera.trigger()).application == 0
         emulator.device.switch_application(1)
         with pytest.raises(WrongApplicationError):
@@ -234,10 +231,7 @@ def test_bank_that_is_none_is_a_mistake(bank: str) -> None:
 @pytest.mark.asyncio
 async def test_bytes_of_a_code_come_as_they_are() -> None:
     code = bytes(range(14, 256)).decode("latin-1")
-    async with (
-        EmulatedSr(codes=[code]) as emulator,
-        smartcam.connect(emulator.url) as camera,
-    ):
+    async with EmulatedSr(codes=[code]) as emulator, smartcam.connect(emulator.url) as camera:
         assert (await camera.trigger()).raw == code.encode("latin-1")
 
 

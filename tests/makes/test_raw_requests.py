@@ -108,10 +108,7 @@ async def test_layout_of_the_session_is_not_changed_by_hand() -> None:
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.asyncio
 async def test_version_without_lengths_reads_no_pictures(version: int) -> None:
-    async with (
-        EmulatedIfm(version=version) as emulator,
-        smartcam.connect(emulator.url) as camera,
-    ):
+    async with EmulatedIfm(version=version) as emulator, smartcam.connect(emulator.url) as camera:
         assert not camera.capabilities.read_image
         with pytest.raises(UnsupportedError):
             await camera.read_image()

@@ -180,6 +180,38 @@ async def test_a_message_that_is_too_large_is_dropped_and_counted(tmp_path: Path
         assert (found.delivered, found.dropped) == (2, {"refused": 1})
 
 
+async def test_what_is_too_large_for_the_broker_keeps_nothing_else_back(tmp_path: Path) -> None:
+    lines = "allow_anonymous true\nmax_packet_size 2000\n"  # which it tells
+    async with broker(tmp_path, lines) as there, Outlets(section(there.url), tmp_path) as outlets:
+        for length in (1000, 5000, *range(1600, 1900, 3)):
+            outlets.offer_result(result(1, value={"text": "x" * length}))
+        await until(lambda: outlets.states["mqtt"].account.spooled == 0)
+        found = outlets.states["mqtt"].account
+        assert not outlets.states["mqtt"].trouble
+    assert found.results == 102
+    assert 2 < found.dropped["refused"] < found.delivered
+
+
+async def test_a_message_that_the_broker_never_takes_has_those_before_it_sent_once(
+    tmp_path: Path,
+) -> None:
+    lines = "allow_anonymous true\nmessage_size_limit 2000\n"  # which it does not tell
+    async with (
+        broker(tmp_path, lines) as there,
+        listener(there.port, "smartcam/outlet/mqtt") as online,
+        listener(there.port, "smartcam/result/#") as heard,
+        Outlets(section(there.url), tmp_path) as outlets,
+    ):
+        for number in range(20):
+            value = {"n": number, "text": "x" * (5000 if number == 15 else 1)}
+            outlets.offer_result(result(number, value=value))
+        await until(lambda: outlets.states["mqtt"].account.delivered == 15)
+        await until(lambda: sum(b"true" in one.payload for one in online) > 7)
+        assert outlets.states["mqtt"].trouble
+        assert outlets.states["mqtt"].account.spooled == 5
+    assert len(heard) < 3 * 20  # and not all of them with each of 8 tries
+
+
 async def test_the_last_will_tells_that_the_process_was_killed(tmp_path: Path) -> None:
     program = (
         "import asyncio, sys\nfrom pathlib import Path\nfrom smartcam.outlets import Outlets\n"

@@ -151,7 +151,13 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
         assert there.camera.active_application == 3
         assert (await client.call(prepare, none, "1"))[0].Id == "1"
         await client.wait_for("Ready")
-        await until(lambda: [one.InternalId.Id for one in heard.of(1022)] == ["1", "3", "1"])
+        await until(lambda: [said.InternalId.Id for said in heard.of(1022)] == ["1", "3", "1"])
+        one, three = (ua.Variant(number, ua.VariantType.UInt32) for number in (1, 3))
+        for number in (three, "3"):  # and not the recipe that is ready
+            assert (await client.call("Plain.StartJob", "m", "p", number))[-1] == -2
+        assert await refused(client, "Plain.StartJob", "m", "p", True) == "BadInvalidArgument"
+        assert (await client.call(prepare, none, one))[0].Id == "1"
+        await client.wait_for("Ready")
         for external, number in (("unknown", none), ("housing", "3"), (none, none)):
             assert (await client.call(prepare, external, number))[-1] == -2
         most = [ua.Variant(one, ua.VariantType.UInt32) for one in (1, 1)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -285,6 +286,38 @@ def test_a_spool_whose_tables_have_no_readable_names_is_put_aside(tmp_path: Path
     again = opened(tmp_path)
     assert [one.kind for one in again.head(10).entries] == ["gap"]
     assert [*tmp_path.glob("a.spool.damaged-*")]
+    again.close()
+
+
+def test_an_entry_at_another_place_than_its_own_is_damaged(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool) for n in range(1, 6)])
+    spool.close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.spool")) as database:
+        database.execute("UPDATE entries SET place = 9 WHERE place = 2")
+        database.commit()
+    again = opened(tmp_path)
+    head = again.head(10).entries
+    assert [one.number for one in head if one.kind == "result"] == [1, 3, 4, 5]
+    assert [one.kind for one in head[4:]] == ["gap"]
+    assert again.account == OutletAccount(5, 0, 4, {"damaged": 1})
+    again.close()
+
+
+@pytest.mark.parametrize("last", [-1, 2, (1 << 63) - 1, "none"])
+def test_a_spool_whose_last_place_is_damaged_is_put_aside(tmp_path: Path, last: object) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool) for n in range(1, 4)])
+    spool.close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.spool")) as database:
+        database.execute("UPDATE sqlite_sequence SET seq = ?", (last,))
+        database.commit()
+    again = opened(tmp_path)
+    assert [*tmp_path.glob("a.spool.damaged-*")]
+    again.add([entry(1, again)])
+    kinds = [one.kind for one in again.head(10).entries]
+    assert kinds.count("result") == 4
+    assert again.account.balanced
     again.close()
 
 

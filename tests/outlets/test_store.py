@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import sqlite3
+import sys
 import threading
 import time
 from pathlib import Path
@@ -16,9 +17,10 @@ import pytest
 from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
 from smartcam.models import PoseSigma
-from smartcam.outlets import OutletDesk, OutletEntry, StoreQuestion
+from smartcam.outlets import OutletDesk, OutletEntry, Outlets, StoreQuestion
 from smartcam.outlets._inside import columns_of, read_store
 from smartcam.registry import OUTLETS
+from tests.outlets.outletkit import result, until
 
 pytestmark = pytest.mark.real_time
 
@@ -43,6 +45,10 @@ def store(folder: Path, columns: Any = COLUMNS, **settings: Any) -> Any:
 def rows(folder: Path, query: str) -> list[Any]:
     with contextlib.closing(sqlite3.connect(folder / "results.sqlite")) as database:
         return database.execute(query).fetchall()
+
+
+def files(folder: Path) -> list[Path]:
+    return [*folder.glob("results.sqlite*")]
 
 
 async def written(made: Any, *entries: OutletEntry) -> None:
@@ -147,6 +153,26 @@ async def test_a_store_that_a_disk_held_for_too_long_is_opened_again_when_it_is_
         other.execute("COMMIT")
     await written(made, entry(2, {"n": 2}))
     assert rows(tmp_path, "SELECT number FROM results ORDER BY number") == [(1,), (2,)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps an open file where it is")
+async def test_a_store_that_is_moved_away_is_begun_anew_and_nothing_is_lost(tmp_path: Path) -> None:
+    section = {"sqlite": {"file": "results.sqlite"}}
+    async with Outlets(section, tmp_path) as outlets:
+
+        async def delivered(number: int) -> None:
+            outlets.offer_result(result(number))
+            await until(lambda: outlets.states["sqlite"].account.delivered == number)
+
+        await delivered(1)
+        for file in files(tmp_path):
+            file.rename(tmp_path / f"archive-{file.name}")
+        await delivered(2)
+        assert rows(tmp_path, "SELECT number FROM results") == [(2,)]
+        for file in files(tmp_path):
+            file.unlink()
+        await delivered(3)
+    assert rows(tmp_path, "SELECT number FROM results") == [(3,)]
 
 
 async def test_old_results_are_deleted_with_their_records(tmp_path: Path) -> None:

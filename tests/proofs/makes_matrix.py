@@ -253,10 +253,7 @@ CALLS: dict[str, Callable[[Bench], Awaitable[object]]] = {
 @contextlib.asynccontextmanager
 async def bench_of(make: str) -> AsyncIterator[Bench]:
     """Put up a bench whose client is not open."""
-    async with (
-        MAKES[make].camera() as emulator,
-        LinkProxy(emulator.host, emulator.port) as link,
-    ):
+    async with MAKES[make].camera() as emulator, LinkProxy(emulator.host, emulator.port) as link:
         bench = Bench(make, emulator, link)
         try:
             yield bench

@@ -67,8 +67,7 @@ def _frames(dialect: FramedDialect) -> dict[str, Make]:
         ),
         "magic numbers": fill(magic),
         "a large frame, and magic numbers": fill(
-            magic + b"\xff" * 4,
-            dialect.encode(m.ResultContainer(application=1, data=b"x" * 5000)),
+            magic + b"\xff" * 4, dialect.encode(m.ResultContainer(application=1, data=b"x" * 5000))
         ),
         "frames of unknown ids": fill(header.pack(0x77, 0)),
         "one byte": fill(b"\xff"),

@@ -6,8 +6,4 @@ from smartcam.protocols._base import UNDOCUMENTED
 from smartcam.protocols._insight.dialect import NATIVE
 from smartcam.protocols._insight.machine import InSightMachine
 
-__all__ = [
-    "NATIVE",
-    "UNDOCUMENTED",
-    "InSightMachine",
-]
+__all__ = ["NATIVE", "UNDOCUMENTED", "InSightMachine"]

@@ -5,11 +5,4 @@ from __future__ import annotations
 from smartcam.recording import _recorder
 from smartcam.recording._mcap.form import KINDS, Item, message_fields, message_of, nanoseconds
 
-__all__ = [
-    "KINDS",
-    "Item",
-    "_recorder",
-    "message_fields",
-    "message_of",
-    "nanoseconds",
-]
+__all__ = ["KINDS", "Item", "_recorder", "message_fields", "message_of", "nanoseconds"]

@@ -12,7 +12,6 @@ from mcap.writer import Writer
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.recording import load_recording
-from smartcam.recording._mcap.form import FORMAT, FORMATS
 from tests.recording.recordingkit import COUNTER, at, frame, record, session, write
 
 
@@ -147,7 +146,7 @@ def test_load_recording_of_another_form_is_refused(tmp_path: Path) -> None:
         load_recording(path)
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["1", "2", "3"])
 def test_load_recording_of_either_form(tmp_path: Path, form: str) -> None:
     path = tmp_path / "run.mcap"
     said: dict[str, Any] = {"at": at(0).isoformat(), "camera": "left", "direction": "<"}
@@ -173,7 +172,7 @@ def test_load_recording_other_topics_are_left_alone(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         writer: Any = Writer(stream)
         writer.start()
-        writer.add_metadata("smartcam", {"format": FORMAT})
+        writer.add_metadata("smartcam", {"format": "3"})
         schema = writer.register_schema("mine", "jsonschema", json.dumps({}).encode())
         writer.add_message(writer.register_channel("/mine", "json", schema), 0, b"{}", 0)
         writer.finish()

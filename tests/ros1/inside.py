@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from smartcam.ros1._json_messages import from_json
 
-__all__ = [
-    "from_json",
-]
+__all__ = ["from_json"]

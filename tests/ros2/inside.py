@@ -8,10 +8,4 @@ from smartcam.ros2._node.qos import PARAMETERS
 from smartcam.ros2._node.tokens import Entity
 from smartcam.ros2._types.built_in import MESSAGES
 
-__all__ = [
-    "MESSAGES",
-    "PARAMETERS",
-    "Attachment",
-    "CameraResults",
-    "Entity",
-]
+__all__ = ["MESSAGES", "PARAMETERS", "Attachment", "CameraResults", "Entity"]

@@ -15,10 +15,20 @@ from smartcam.depth import Cloud, DepthFrame
 from smartcam.exceptions import ConfigurationError, FrameTimeoutError
 from smartcam.geometry import Transform
 from smartcam.ros2 import DepthTopics, cloud_from, frame_from, pixels_from
-from smartcam.ros2._cameras.depth_topics import TOPICS
 from smartcam.ros2._inside import LATCHED
 from tests.ros2.roskit import soon, two_nodes, until
 from tests.ros2.tfkit import TransformTree
+
+TOPICS = {
+    "disparity": "stereo_msgs/msg/DisparityImage",
+    "depth/image_rect": "sensor_msgs/msg/Image",
+    "depth/image_rect/compressedDepth": "sensor_msgs/msg/CompressedImage",
+    "depth/camera_info": "sensor_msgs/msg/CameraInfo",
+    "points2": "sensor_msgs/msg/PointCloud2",
+    "left/image_rect": "sensor_msgs/msg/Image",
+    "left/camera_info": "sensor_msgs/msg/CameraInfo",
+    "right/camera_info": "sensor_msgs/msg/CameraInfo",
+}
 
 pytestmark = pytest.mark.real_time
 

@@ -16,13 +16,7 @@ from smartcam._client._inside import localizations_of
 from smartcam.exceptions import RosMessageError
 from smartcam.models import Header, Pose, Position, Quaternion
 from smartcam.ros2 import RosTypes
-from smartcam.ros2._inside import (
-    DETECTIONS,
-    POSES,
-    RESULT,
-    ResultMessages,
-    utf8,
-)
+from smartcam.ros2._inside import DETECTIONS, POSES, RESULT, ResultMessages, utf8
 
 AT = datetime(2030, 1, 31, 12, 0, 0, 123_456, UTC)
 TYPES = RosTypes()
@@ -143,10 +137,7 @@ def test_result_of_no_known_application_says_0() -> None:
     assert (got.application_id, got.error) == (0, "")
 
 
-@pytest.mark.parametrize(
-    "value",
-    [["one", "zwölf"], {"x": 1.5, "ok": True}, [], "text", None, 3],
-)
+@pytest.mark.parametrize("value", [["one", "zwölf"], {"x": 1.5, "ok": True}, [], "text", None, 3])
 def test_other_values_are_said_as_json(value: Any) -> None:
     got = read(RESULT, messages().result(result(value), None))
     assert (json.loads(got.json), got.localizations, got.error) == (value, [], "")

@@ -28,15 +28,7 @@ from smartcam.ros2._inside import LATCHED
 from smartcam.testing import LinkProxy
 from tests.processes import free_place
 from tests.ros2.inside import Attachment
-from tests.ros2.roskit import (
-    PATIENCE,
-    SET_BOOL,
-    STRING,
-    TRIGGER,
-    soon,
-    two_nodes,
-    until,
-)
+from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, TRIGGER, soon, two_nodes, until
 
 MAX_CONCURRENT_CALLS = 64
 MAX_REQUEST_BYTES = 16 << 20

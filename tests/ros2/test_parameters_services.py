@@ -220,10 +220,7 @@ async def test_ten_thousand_names(shared: tuple[Node, Node]) -> None:
     many = [integer("a", 5)] * MANY
     results = (await call(there, "set_parameters", parameters=many)).results
     assert len(results) == MANY
-    for one in (
-        *results,
-        (await call(there, "set_parameters_atomically", parameters=many)).result,
-    ):
+    for one in (*results, (await call(there, "set_parameters_atomically", parameters=many)).result):
         assert not one.successful
         assert "10000 names: expected 1024 at most" in one.reason
     assert here.parameters.get("a") == 0

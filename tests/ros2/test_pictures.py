@@ -243,11 +243,7 @@ async def test_a_subscriber_that_is_stopped_holds_up_nobody() -> None:
         shown = CameraPictures(None, here, frames=source)
         shown.start()
         slow = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-c",
-            textwrap.dedent(SLOW),
-            place,
-            stdout=asyncio.subprocess.PIPE,
+            sys.executable, "-c", textwrap.dedent(SLOW), place, stdout=asyncio.subprocess.PIPE
         )
         try:
             images = there.subscribe(f"{CAM}/image_raw", IMAGE)

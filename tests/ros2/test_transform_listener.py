@@ -13,11 +13,7 @@ import pytest
 from smartcam.exceptions import CalibrationError
 from smartcam.ros2 import Node, QoS, RosTypes
 from smartcam.ros2._cameras import transform_listener
-from smartcam.ros2._cameras.transform_listener import (
-    MAX_FRAMES,
-    MAX_MOMENTS,
-    TransformListener,
-)
+from smartcam.ros2._cameras.transform_listener import MAX_FRAMES, MAX_MOMENTS, TransformListener
 from tests.fleet.fleetkit import until
 from tests.processes import free_place
 

@@ -162,8 +162,7 @@ def test_a_quaternion_is_of_length_one() -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
-    [[("", "a")], [("/base", "a")], [("a", "a")], [("base", "a"), ("flange", "a")]],
+    "names", [[("", "a")], [("/base", "a")], [("a", "a")], [("base", "a"), ("flange", "a")]]
 )
 def test_a_tree_that_is_none_is_refused(names: list[tuple[str, str]]) -> None:
     with pytest.raises(ConfigurationError, match="tf: "):

@@ -149,11 +149,7 @@ BAD_FIELDS: dict[str, tuple[MessageType, dict[str, Any], str]] = {
         {"header": {"stamp": {"s": 1}}},
         "header.stamp.s: builtin_interfaces/",
     ),
-    "other message": (
-        IMAGE,
-        {"header": STRING.new()},
-        "header: expected std_msgs/Header, got S",
-    ),
+    "other message": (IMAGE, {"header": STRING.new()}, "header: expected std_msgs/Header, got S"),
     "text for bytes": (IMAGE, {"data": "x"}, "data: expected uint8[], got 'x'"),
     "byte too large": (IMAGE, {"data": [256]}, "data: expected uint8[], got [256]"),
     "array of others": (IMAGE, {"data": np.array([-1])}, "data: expected uint8[], got [-1]"),
@@ -172,11 +168,7 @@ BAD_FIELDS: dict[str, tuple[MessageType, dict[str, Any], str]] = {
         {"string_array_value": ["a", 1]},
         "string_array_value[1]: expected",
     ),
-    "no list": (
-        DETECTIONS,
-        {"detections": {}},
-        "detections: expected vision_msgs/Detection3D[]",
-    ),
+    "no list": (DETECTIONS, {"detections": {}}, "detections: expected vision_msgs/Detection3D[]"),
     "in list": (
         DETECTIONS,
         {"detections": [{"results": [{"hypothesis": {"score": "1"}}]}]},

@@ -169,12 +169,7 @@ def test_no_attachment_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("name", "full"),
-    [
-        ("/a/b", "/a/b"),
-        ("a/b", "/line1/a/b"),
-        ("~/a", "/line1/cam3/a"),
-        ("~", "/line1/cam3"),
-    ],
+    [("/a/b", "/a/b"), ("a/b", "/line1/a/b"), ("~/a", "/line1/cam3/a"), ("~", "/line1/cam3")],
 )
 def test_names_are_resolved(name: str, full: str) -> None:
     assert resolve(name, "/line1", "cam3") == full

@@ -71,11 +71,7 @@ def framed(dialect: FramedDialect, transport: Transport) -> Conversation:
     steps += [*sent(m.Disconnect()), *came(m.DisconnectAnswer())]
     name = f"{dialect.label} over {transport.value}"
     return Conversation(
-        name=name,
-        steps=steps,
-        dialect=dialect.name,
-        transport=transport,
-        quirks=dialect.quirks,
+        name=name, steps=steps, dialect=dialect.name, transport=transport, quirks=dialect.quirks
     )
 
 

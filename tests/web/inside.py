@@ -4,7 +4,4 @@ from __future__ import annotations
 
 from smartcam.web import _clouds, _fleet
 
-__all__ = [
-    "_clouds",
-    "_fleet",
-]
+__all__ = ["_clouds", "_fleet"]

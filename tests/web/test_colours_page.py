@@ -90,8 +90,7 @@ async def said(page: Page) -> ColourRange:
 async def white(page: Page) -> np.ndarray[Any, Any]:
     """Return which pixels of the mask on the page are white; frames of regions are not."""
     data = await page.eval_on_selector(
-        "#mask",
-        "c => Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data)",
+        "#mask", "c => Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data)"
     )
     pixels = np.array(data, np.uint8).reshape(SIZE[1], SIZE[0], 4)
     found: np.ndarray[Any, Any] = pixels[..., 2] > 200

@@ -61,11 +61,7 @@ class World(NamedTuple):
 @contextlib.asynccontextmanager
 async def served(fleet: Fleet, **options: Any) -> AsyncIterator[World]:
     """Serve the page of a fleet."""
-    async with (
-        fleet,
-        FleetSite(fleet, **options) as site,
-        aiohttp.ClientSession() as session,
-    ):
+    async with fleet, FleetSite(fleet, **options) as site, aiohttp.ClientSession() as session:
         yield World(fleet, site, Caller(site, session, ""))
 
 

@@ -122,10 +122,7 @@ class World(NamedTuple):
 async def served(count: int = 100, **options: Any) -> AsyncIterator[World]:
     """Serve the page of a made-up fleet."""
     fleet = MadeUpFleet(names(count))
-    async with (
-        FleetSite(fleet.as_fleet, **options) as site,
-        aiohttp.ClientSession() as session,
-    ):
+    async with FleetSite(fleet.as_fleet, **options) as site, aiohttp.ClientSession() as session:
         yield World(fleet, site, Caller(site, session, ""))
 
 

@@ -45,11 +45,7 @@ async def page() -> AsyncIterator[Page]:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page,
-    sources: Sequence[FrameSource],
-    *,
-    token: str | None = None,
-    changes: bool = False,
+    page: Page, sources: Sequence[FrameSource], *, token: str | None = None, changes: bool = False
 ) -> AsyncIterator[FramesSite]:
     """Show sources; what the browser finds wrong with the page fails the test."""
     with nothing_wrong(page):

@@ -14,8 +14,19 @@ from smartcam._accepting import is_loopback
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import EmulatorSite
-from smartcam.web._guard import HEADERS
 from tests.web.sitekit import TOKEN, Raw, served
+
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Server": "smartcam",
+}
 
 
 @pytest.mark.parametrize(
@@ -162,7 +173,7 @@ async def test_every_answer_has_the_headers() -> None:
             async with world.caller.session.get(world.site.api + path) as response:
                 answers.append(response.headers)
     for headers in answers:
-        assert {key: headers.get(key) for key in HEADERS} == dict(HEADERS)
+        assert {key: headers.get(key) for key in HEADERS} == HEADERS
 
 
 async def test_page_names_nothing_from_elsewhere() -> None:

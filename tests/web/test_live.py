@@ -260,11 +260,7 @@ def test_parts_are_told_in_the_plane_and_bounded() -> None:
     pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(0.5))
     found = [Localization("bolt", 0.9, 0, pose)] * (MAX_PARTS + 1)
     told = ShownResult(0, result_of(found), "").as_json()
-    assert (len(told["parts"]), told["count"], told["frame"]) == (
-        MAX_PARTS,
-        MAX_PARTS + 1,
-        "table",
-    )
+    assert (len(told["parts"]), told["count"], told["frame"]) == (MAX_PARTS, MAX_PARTS + 1, "table")
     assert told["parts"][0] == pytest.approx(
         {"name": "bolt", "quality": 0.9, "x": 0.1, "y": 0.2, "z": 0.0, "theta": 0.5}
     )

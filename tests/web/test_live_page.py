@@ -74,10 +74,7 @@ async def counts(page: Page) -> dict[str, int]:
 
 
 async def test_triggered_part_is_drawn_and_the_account_adds_up(page: Page) -> None:
-    async with (
-        EmulatedCamera() as emulator,
-        opened(page, emulator.url, **PARTS) as site,
-    ):
+    async with EmulatedCamera() as emulator, opened(page, emulator.url, **PARTS) as site:
         await page.click("#trigger")
         await see(page, "#last", "square")
         (entry,) = site.view.entries

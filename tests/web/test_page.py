@@ -72,11 +72,7 @@ async def page() -> AsyncIterator[Page]:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page,
-    *cameras: WireCamera,
-    token: str | None = None,
-    at: str | None = None,
-    port: int = 0,
+    page: Page, *cameras: WireCamera, token: str | None = None, at: str | None = None, port: int = 0
 ) -> AsyncIterator[View]:
     """Show cameras; what the browser finds wrong with the page fails the test."""
     async with contextlib.AsyncExitStack() as stack:

@@ -248,6 +248,11 @@ def decode_runs(payload: bytes, what: str) -> Batch:
     return Batch(epoch, following, runs)
 
 
+def decode_own_run(data: bytes) -> ResultRun:
+    """Return the run that :meth:`ResultRun.encode` made in this process."""
+    return _decode_run(data, 0)[0]
+
+
 def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
     number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
         _RUN.unpack_from(payload, place)

@@ -270,13 +270,15 @@ class ZenohEnd(ZenohSession, Bus):
         how = self._waiting_for_room[express]
 
         def say() -> None:
-            _put(session, key, payload, how)
-            with self._lock:
-                self._sending -= size
-                self._doubtful -= doubtful
-                self._behind[way] -= 1
-                if not self._behind[way]:
-                    del self._behind[way]
+            try:
+                _put(session, key, payload, how)
+            finally:
+                with self._lock:
+                    self._sending -= size
+                    self._doubtful -= doubtful
+                    self._behind[way] -= 1
+                    if not self._behind[way]:
+                        del self._behind[way]
 
         with self._lock:
             self._sending += size
@@ -417,13 +419,14 @@ class ZenohEnd(ZenohSession, Bus):
             payload: the message.
             urgent_key: key of the message if it waits in one line with those of :meth:`put`.
         """
-        if publisher is None:
+        session = self._session
+        if publisher is None or session is None:
             return
         begun = self._loop.time()
         quietly(publisher.put, payload)
         if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
             way = "" if self._link.mode == "client" else urgent_key
-            self._hand_over(way, self._session, urgent_key, payload, False, doubtful=True)
+            self._hand_over(way, session, urgent_key, payload, False, doubtful=True)
 
 
 class _OnBus(ZenohDeclared, Handle):

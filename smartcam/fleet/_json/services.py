@@ -17,7 +17,7 @@ from smartcam.exceptions import FrameFormatError, UnsupportedError
 from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, outcomes
 from smartcam.fleet._agent.shared import Carrier
 from smartcam.fleet._bus.keys import COMMANDS
-from smartcam.fleet._bus.wire import decode_runs, encode_runs
+from smartcam.fleet._bus.wire import decode_own_run
 from smartcam.fleet._frames.stream import FrameOrder
 from smartcam.fleet._frames.wire import FrameForm, to_fields
 from smartcam.fleet._program.reading import result_fields, singles
@@ -205,8 +205,7 @@ async def triggered(
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
     runs = await outcomes(work.host, work.owner, request, application, work.timeout)
-    batch = decode_runs(encode_runs(0, 0, runs), "results")
-    return [one for run in batch.runs for one in singles(run)]
+    return [one for run in runs for one in singles(decode_own_run(run))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
@@ -256,8 +255,8 @@ async def _results(work: Work) -> dict[str, Any]:
     kept, most = work.host.results, work.request.most
     first = max(1, kept.following - most) if work.request.first is None else work.request.first
     part = kept.part(first, MAX_REPLY_BYTES)
-    batch = decode_runs(encode_runs(0, 0, part.data), "results that are kept")
-    found = (one for run in batch.runs for one in singles(run) if one.number >= part.first)
+    runs = map(decode_own_run, part.data)
+    found = (one for run in runs for one in singles(run) if one.number >= part.first)
     results = [work.topics.result(one) for one in itertools.islice(found, most)]
     return {"first": part.first, "next_result": part.following, "results": results}
 

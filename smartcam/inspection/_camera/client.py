@@ -10,7 +10,12 @@ from smartcam._arguments import check_flag, check_kind
 from smartcam._finishing import finish
 from smartcam._suggestions import did_you_mean
 from smartcam.client import SmartCamera
-from smartcam.exceptions import ConfigurationError, ResponseTimeoutError, UnsupportedError
+from smartcam.exceptions import (
+    CameraFaultError,
+    ConfigurationError,
+    ResponseTimeoutError,
+    UnsupportedError,
+)
 from smartcam.inspection._camera.device import SoftwareDevice
 from smartcam.inspection._camera.pairing import MAX_KEPT, JudgedResults
 from smartcam.inspection._camera.pictures import png_of
@@ -22,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import Self
 
+    from smartcam._client._inside import TriggerRequest
     from smartcam.inspection._camera.eyes import Judged
     from smartcam.inspection._cell import CellCamera
     from smartcam.observers import Observer
@@ -100,6 +106,14 @@ class SoftwareCamera(SmartCamera[ValueT]):
         if isinstance(application, str):
             application = self._device.camera.program(application).application
         await super()._switch_application(application, timeout)
+
+    async def _trigger(
+        self, application: int | None, request: TriggerRequest, timeout: float
+    ) -> list[Result]:
+        try:
+            return await super()._trigger(application, request, timeout)
+        except CameraFaultError as exc:
+            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is over'}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
         return await self._picture(timeout, drawn=False)

@@ -370,16 +370,18 @@ def _argument(given: ua.Variant, kind: int) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Return the text of an id: of a structure, a plain text, or nothing.
+    """Return the text of an id: of a structure, a plain text, a number, or nothing.
 
     Raises:
         MethodArgumentError: the id is nothing of these, or too long.
     """
+    if isinstance(value, int) and not isinstance(value, bool):
+        return str(value)  # of a recipe; no id would be any recipe
     text = value if isinstance(value, str) else getattr(value, "Id", None)
     while text is not None and not isinstance(text, str):  # an id of an id
         text = getattr(text, "Id", None)
     empty = value is None or (isinstance(value, ua.ExtensionObject) and not value.Body)
-    if text is None and not empty and not hasattr(value, "Id") and not isinstance(value, int):
+    if text is None and not empty and not hasattr(value, "Id"):
         raise MethodArgumentError
     text = (text or "").strip()
     if len(text) > MAX_TEXT_CHARACTERS:

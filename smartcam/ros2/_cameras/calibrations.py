@@ -125,8 +125,5 @@ def _stamped(pose: Pose) -> dict[str, Any]:
     stamp: datetime = pose.header.stamp
     return {
         "header": {"stamp": stamp_fields(stamp.timestamp()), "frame_id": pose.header.frame_id},
-        "pose": {
-            "position": pose.position._asdict(),
-            "orientation": pose.orientation._asdict(),
-        },
+        "pose": {"position": pose.position._asdict(), "orientation": pose.orientation._asdict()},
     }

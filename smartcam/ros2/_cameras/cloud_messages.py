@@ -227,12 +227,7 @@ def _column(message: Any, field: Any, kinds: str) -> NDArray[Any]:
             f"{field.count} of type {field.datatype}"
         )
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{name}")
-    height, width, step, row = (
-        message.height,
-        message.width,
-        message.point_step,
-        message.row_step,
-    )
+    height, width, step, row = (message.height, message.width, message.point_step, message.row_step)
     data = memoryview(message.data).cast("B")
     last = field.offset + dtype.itemsize
     wanted = row * (height - 1) + step * (width - 1) + last

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.backoff import Backoff
 from smartcam.exceptions import LinkError, ResponseTimeoutError, SmartCamError
 from smartcam.models import Status
-from smartcam.ros2._node.lifecycle import (
-    STATES,
-    TRANSITIONS,
-    Lifecycle,
-    LifecycleTransition,
-)
+from smartcam.ros2._node.lifecycle import STATES, TRANSITIONS, Lifecycle, LifecycleTransition
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -88,11 +88,7 @@ class PictureRequests:
     """
 
     def __init__(
-        self,
-        node: Any,
-        frame_id: str,
-        lens: CameraLens,
-        take: Callable[[float], Awaitable[Frame]],
+        self, node: Any, frame_id: str, lens: CameraLens, take: Callable[[float], Awaitable[Frame]]
     ) -> None:
         self._node, self._frame_id, self._lens, self._take = node, frame_id, lens, take
         self._one_at_a_time = asyncio.Lock()

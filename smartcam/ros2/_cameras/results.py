@@ -61,12 +61,7 @@ class CameraResults:
     """
 
     def __init__(
-        self,
-        camera: Camera[Any],
-        node: Any,
-        *,
-        frame_id: str | None = None,
-        robot_frame: str = "",
+        self, camera: Camera[Any], node: Any, *, frame_id: str | None = None, robot_frame: str = ""
     ) -> None:
         self.active: bool = True
         self.taken: int = 0

@@ -68,11 +68,7 @@ class CameraStatus:
     """
 
     def __init__(
-        self,
-        camera: Camera[Any],
-        node: Any,
-        options: CameraNodeOptions,
-        state: Callable[[], str],
+        self, camera: Camera[Any], node: Any, options: CameraNodeOptions, state: Callable[[], str]
     ) -> None:
         self._camera, self._node, self._options, self._state = camera, node, options, state
         self.period: float = options.diagnostics_period

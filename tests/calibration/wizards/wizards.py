@@ -24,7 +24,6 @@ from tests.calibration.inside import Journal
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from smartcam.calibration.wizards._sequence import Action
 
 NAME = Step(
     id="name",
@@ -43,7 +42,7 @@ MORE = Step(
 )
 
 
-def survey(trigger: Action) -> Wizard:
+def survey(trigger: Callable[[Any], Awaitable[Any]]) -> Wizard:
     """Return a wizard that asks for a name, takes a picture, and asks for some numbers."""
 
     async def script(parameters: Mapping[str, Any]) -> Any:
