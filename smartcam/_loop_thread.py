@@ -256,7 +256,7 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End the thread. Harmless when done twice, and in a fork, which has no such thread."""
+        """End the thread. Harmless when called twice, and in a fork, which has no such thread."""
         if self._forked:
             return
         thread, self._thread = self._thread, None
