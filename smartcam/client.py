@@ -189,7 +189,7 @@ class SmartCamera(Camera[ValueT]):
             if application is not None:
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline, timeout)
-            deadline = self._connection.deadline(timeout)
+            deadline = self._connection.in_seconds(timeout)
             await lock.turn(deadline, timeout)  # as hold() does, without an object for it
             try:
                 return await triggers.trigger(request, deadline, timeout)
@@ -224,7 +224,7 @@ class SmartCamera(Camera[ValueT]):
             await self._commands.stop(deadline)
 
     async def _query_application(self, timeout: float) -> int:
-        return await self._commands.query(self._connection.deadline(timeout))
+        return await self._commands.query(self._connection.in_seconds(timeout))
 
     async def _query_status(self, timeout: float) -> Status:
         self._connection.require(m.GetStatus)

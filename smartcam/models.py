@@ -256,7 +256,7 @@ class _EstimatedPose(Pose):
         known: PoseSigma | None = self.__dict__.get("sigma")
         return known
 
-    def _asdict(self) -> dict[str, Any]:
+    def _asdict(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the fields by name, with the errors: JSON has them, too."""
         return {**super()._asdict(), "sigma": self.sigma}
 

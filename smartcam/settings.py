@@ -121,7 +121,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     shown = masked(url)
     try:
         parts = urlsplit(full)
-        port = parts.port if parts.port is not None else protocol.default_port
+        host, port = parts.hostname, parts.port
     except ValueError as exc:
         if shown != url and "'" in str(exc):  # its text quotes the URL, and so the password
             raise ConfigurationError(
@@ -129,11 +129,13 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
                 "%2F %3F %23 %5B %5D"
             ) from None
         raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
-    if not parts.hostname:
+    if port is None:
+        port = protocol.default_port
+    if not host:
         raise ConfigurationError(f"camera address {shown!r} has no host")
     # urlsplit lets some pass, and which ones differs from Python to Python
     place = parts.netloc.rpartition("@")[2]
-    if "[" in parts.hostname or "]" in parts.hostname or place.rfind("[") > 0:
+    if "[" in host or "]" in host or place.rfind("[") > 0:
         raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
     if port == 0:
         raise ConfigurationError(f"camera address {shown!r}: port 0 is no camera's port")
@@ -164,7 +166,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     address = Address(
         protocol.name,
         parts.scheme,
-        parts.hostname,
+        host,
         port,
         dialect,
         tuple(sorted({name.strip() for name in quirks.split(",") if name.strip()})),

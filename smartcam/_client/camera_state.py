@@ -106,6 +106,16 @@ class CameraState:
             self.loads_by_others += 1
         return was
 
+    def stays(self, application: int, bits: int, endian: int) -> bool:
+        """Return True if this is what the camera has last told in this session."""
+        same = self.bits == bits and self._told == bits and self.endian == endian
+        return same and self.active == application
+
+    def report_round(self, report: StatusReport) -> None:
+        """Take two statuses of a camera that runs, of which the second is as the one before."""
+        self.statuses_heard += 2
+        self.status = report.status
+
     @property
     def owes_status(self) -> bool:
         """True if the camera was asked for its status, and has not answered as often."""

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from smartcam._client.status import StatusRequests
 
 
+_QUERY = m.Query()
+
+
 @dataclass(eq=False)
 class Commands:
     """Changes what the camera runs.
@@ -130,9 +133,10 @@ class Commands:
             ResponseTimeoutError: no answer, or none but that the camera is busy.
         """
         requests = self._requests
-        await requests.await_owed(m.SwitchAnswer, m.Query(), deadline)
+        if requests.owes(m.SwitchAnswer):
+            await requests.await_owed(m.SwitchAnswer, _QUERY, deadline)
         while True:
-            answer = await requests.ask(m.Query(), m.QueryAnswer, deadline)
+            answer = await requests.ask(_QUERY, m.QueryAnswer, deadline)
             if not requests.is_busy(answer):
                 requests.check(m.Query, answer)
                 return answer.application

@@ -30,6 +30,8 @@ class Features:
             shows whether it took the trigger.
         shows_triggers: the status tells of each trigger that is taken.
         ends_triggers: a trigger that brings nothing is ended before its deadline.
+        tells_all: every change of the status is told, in order, and nothing else shows what became
+            of a trigger.
     """
 
     ordered: bool = True
@@ -39,6 +41,7 @@ class Features:
     fences: bool = False
     shows_triggers: bool = True
     ends_triggers: bool = False
+    tells_all: bool = False
 
     @staticmethod
     def of(link: Link) -> Features:
@@ -47,14 +50,18 @@ class Features:
         ordered = link.machine.transport is Transport.TCP
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
+        ends = dialect.has(m.EndTrigger)
+        fences = ordered and not dialect.in_order  # there the answer itself is enough
+        tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
         return Features(
             ordered=ordered,
             numbered=dialect.has(m.SetSequenceNumber),
             acknowledged=acknowledged,
             polled=polled,
-            fences=ordered and not dialect.in_order,  # there the answer itself is enough
+            fences=fences,
             shows_triggers=dialect.shows_triggers,
-            ends_triggers=dialect.has(m.EndTrigger),
+            ends_triggers=ends,
+            tells_all=tells_all,
         )
 
 
@@ -124,5 +131,8 @@ class Connection:
         Raises:
             ConfigurationError: the timeout is no finite number of seconds, 0 or more.
         """
-        loop = self._loop or asyncio.get_running_loop()
-        return loop.time() + check_seconds(timeout, "timeout", self.name)
+        return self.in_seconds(check_seconds(timeout, "timeout", self.name))
+
+    def in_seconds(self, timeout: float) -> float:
+        """Return the loop time in ``timeout`` seconds, which were checked."""
+        return (self._loop or asyncio.get_running_loop()).time() + timeout

@@ -79,6 +79,10 @@ class TriggerEvidence:
     def on_status(self, status: int) -> None:
         """Note a status."""
 
+    def take_round(self) -> bool:
+        """Note all that comes of a trigger at once; False where each is to be noted by itself."""
+        return False
+
     def on_beginning(self) -> bool:
         """Note that an inspection began; return True if it may be the trigger's."""
         self.began += 1
@@ -125,9 +129,9 @@ class EvidenceByStatus(TriggerEvidence):
 
     __slots__ = ("_answers",)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.reached = self.proven = False
+    def __init__(self) -> None:  # without its base's: each trigger makes one
+        self.began = 0
+        self.reached = self.proven = self.doubtful = False
         self._answers = 0  # to the Queries in front of the trigger and behind it
 
     def on_query_answer(self) -> None:
@@ -146,6 +150,13 @@ class EvidenceByStatus(TriggerEvidence):
         else:
             self.doubtful = self.began > 1
         return self.reached
+
+    def take_round(self) -> bool:
+        """Note an answer, the beginning of an inspection and the other answer, if none came yet."""
+        if self._answers or self.began:
+            return False
+        self._answers, self.began, self.reached, self.proven = 2, 1, True, True
+        return True
 
 
 class EvidenceByAnswer(TriggerEvidence):
@@ -367,6 +378,20 @@ class Correlation:
         """Note that the last trigger itself is answered, and was not refused."""
         if self._last is not None:
             self._last.on_trigger_answer()
+
+    def take_round(self, pending: SentTrigger) -> bool:
+        """Note two answers, and one inspection between them; False where more is to be judged.
+
+        That is where something has come of the trigger already, or is owed from before, or where
+        its evidence is another one. A container behind the inspection is this trigger's then.
+        """
+        evidence = pending.evidence
+        if not self._complete or self.owed or self._last is not evidence:
+            return False
+        if not evidence.take_round():
+            return False
+        self.doubted = False
+        return True
 
     def on_status(self, previous: int | None, status: int) -> bool:
         """Note where an inspection begins: Waiting for Trigger drops while running.

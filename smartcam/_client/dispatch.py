@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.remarks import Remarks
 from smartcam._client.waits import told
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 FEWEST_GATHERED = 6
 """Events of a chunk that are worth to be looked through: two results, each between statuses."""
 
+ROUND_EVENTS = 5
+"""Events that a trigger brings: two answers to Queries, and between them two statuses around the
+result."""
+
 MAX_NOTICE_CHARACTERS = 4096
 """Largest number of characters of a camera's remark that are kept."""
 
@@ -55,6 +59,30 @@ _LOGGED = (
 
 _NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 
+_WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
+
+
+class _Round(NamedTuple):
+    """The messages around the result of a trigger: the same objects each time.
+
+    Attributes:
+        first: answer to the Query in front of the trigger.
+        began: status when the inspection begins.
+        ended: status when the camera waits again.
+        last: answer to the Query behind the trigger.
+        application: the application that both answers name.
+        bits: bits of the last status, which is also the one from before.
+        endian: byte order in both statuses.
+    """
+
+    first: Event
+    began: Event
+    ended: m.StatusReport
+    last: Event
+    application: int
+    bits: int
+    endian: int
+
 
 @dataclass(eq=False)
 class Dispatch:
@@ -71,6 +99,7 @@ class Dispatch:
     def __post_init__(self) -> None:
         self._dialect: Dialect | None = None
         self._remarks = Remarks(self._name)
+        self._round: _Round | None = None  # around the last trigger's result, if that was usual
         self._notes_events = False  # events are seen although nobody subscribed to them
         self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
@@ -103,17 +132,21 @@ class Dispatch:
         """
         for chunk in chunks:
             self._hand_on(chunk)
-        self._ask_in_doubt()
+        if self._state.active_in_doubt:
+            self._requests.ask_what_is_active()
 
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
         self._hand_on(chunk)
-        self._ask_in_doubt()
+        if self._state.active_in_doubt:
+            self._requests.ask_what_is_active()
 
     def _hand_on(self, chunk: Chunk) -> None:
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
         events, takers = chunk.events, self._takers
         self._notes_events = self._listeners.notes_events()
+        if len(events) == ROUND_EVENTS and self._take_round(events, now, at):
+            return
         if len(events) >= FEWEST_GATHERED and self._only_streams():
             events = gathered(events, self._state.endian)
         for event in events:
@@ -123,9 +156,42 @@ class Dispatch:
             if answers and isinstance(event, m.Message):
                 self._waits.on_message(event, now, chunk.delivery)
 
-    def _ask_in_doubt(self) -> None:
-        if self._state.active_in_doubt:
-            self._requests.ask_what_is_active()
+    def _take_round(self, events: list[Event], now: float, at: datetime) -> bool:
+        """Take the answers to the trigger under way in one step, where nothing is unusual in them.
+
+        Neither in who looks at them: nobody but the trigger's caller, and streams of results. It
+        leaves everything as one event after the other would, which
+        ``python -m tests.client.proofs.straight`` shows, or does nothing and returns False.
+        """
+        first, began, container, ended, last = events
+        known = self._round
+        if (
+            known is None
+            or first is not known.first
+            or began is not known.began
+            or ended is not known.ended
+            or last is not known.last
+        ):
+            known = self._round = _round_of(events)
+        if known is None or type(container) is not m.ResultContainer:
+            return False
+        state, listeners = self._state, self._listeners
+        if (
+            self._notes_events
+            or listeners.events.references
+            or listeners.statuses.references
+            or not self._waits.awaits_fences(2)
+            or not state.stays(known.application, known.bits, known.endian)
+            or container.application != known.application
+        ):
+            return False
+        owner = self._results.take_round(container)
+        if owner is None:
+            return False
+        self._waits.expect_fences(0)
+        state.report_round(known.ended)
+        self._results.on_own(container, owner, now, at)
+        return True
 
     def _only_streams(self) -> bool:
         """Return True if nobody looks at statuses, and containers go to streams in any case."""
@@ -207,6 +273,25 @@ class Dispatch:
         for word, level, kind, text in _LOGGED:
             if (risen if level != logging.INFO else fallen) & word:
                 self._remarks.log(kind, level, text, now=now)
+
+
+def _round_of(events: list[Event]) -> _Round | None:
+    """Return the messages around a trigger's result; None where they are not the usual ones."""
+    first, began, _, ended, last = events
+    if (
+        not isinstance(began, m.StatusReport)
+        or not isinstance(ended, m.StatusReport)
+        or not isinstance(first, m.QueryAnswer)
+        or not isinstance(last, m.QueryAnswer)
+    ):
+        return None
+    bits, application = int(ended.status), first.application
+    plain = bits & (_WAITING | _RUNNING) == _WAITING | _RUNNING
+    if not plain or int(began.status) != bits & ~_WAITING:
+        return None
+    if began.endian != ended.endian or last.application != application:
+        return None
+    return _Round(first, began, ended, last, application, bits, ended.endian)
 
 
 def gathered(events: list[Event], endian: int) -> list[Event]:

@@ -1,13 +1,17 @@
-"""Wake the receive task without a turn of the event loop.
+"""Wake the receive task, and who waits for what it hands on, without a turn of the event loop.
 
 A future wakes its task by way of the event loop: a handle, another turn, another system call. For
 each delivery of bytes that costs more than processing them. A caller that rings this doorbell from
 a callback of the loop, as a transport does, makes the task go on at once. It is still a task: an
 exception in it ends the task, and never reaches the caller.
 
-:class:`Doorbell` uses the protocol between asyncio's tasks and futures
+A caller that waits for an :class:`Outcome` goes on in the same way, once the receive task sleeps
+again: no task can begin a step within another one's. Outcomes that come otherwise, such as a
+timeout, wake by way of the loop.
+
+:class:`Doorbell` and :class:`Outcome` use the protocol between asyncio's tasks and futures
 (``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` uses
-only a future: it is chosen by the environment variable ``SMARTCAM_DOORBELL=plain``, for a Python or
+only futures: it is chosen by the environment variable ``SMARTCAM_DOORBELL=plain``, for a Python or
 an event loop that does not have this protocol.
 """
 
@@ -15,11 +19,15 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast
+
+from smartcam._user_code import ENDS_PROGRAM
 
 if TYPE_CHECKING:
     import contextvars
     from collections.abc import Callable, Generator
+
+T = TypeVar("T")
 
 
 class Doorbell:
@@ -31,10 +39,12 @@ class Doorbell:
     Cancellation: safe; the task is woken by the loop.
     """
 
-    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake")
+    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake", "due")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
+        # what came in the present delivery; None: outcomes wake by way of the loop
+        self.due: list[Outcome[Any]] | None = None
         self._asyncio_future_blocking = False
         # function that wakes the waiting task; None if nobody waits
         self._wake: Callable[[Doorbell], None] | None = None
@@ -50,6 +60,32 @@ class Doorbell:
             context.run(wake, self)
         else:
             self._loop.call_soon(wake, self, context=context)
+
+    def deliver(self) -> None:
+        """Have the task go on as :meth:`ring` does, and behind it the callers whose outcome came.
+
+        What ends the program is raised by the loop: a transport would take it for its own.
+        """
+        wake, context, loop = self._wake, self._context, self._loop
+        if wake is None or context is None or asyncio.current_task(loop) is not None:
+            self.ring()
+            return
+        self._wake, self.due = None, []
+        try:
+            context.run(wake, self)
+        except ENDS_PROGRAM as exc:
+            loop.call_soon(_raise, exc)
+        finally:
+            due, self.due = self.due, None
+        for outcome in due:
+            try:
+                outcome.wake()
+            except ENDS_PROGRAM as exc:
+                loop.call_soon(_raise, exc)
+
+    def outcome(self) -> Outcome[Any]:
+        """Return an outcome that one task may wait for."""
+        return Outcome(self)
 
     # ------------------------------------------------------------------ for the task's machinery
 
@@ -78,6 +114,115 @@ class Doorbell:
         """Return nothing: a ring carries no value."""
 
 
+class Outcome(Generic[T]):
+    """A result or an error that one task waits for, once; as a future is used.
+
+    Cancellation: safe; the task is woken by the loop.
+    """
+
+    __slots__ = (
+        *("_asyncio_future_blocking", "_bell", "_cancelled", "_context", "_done", "_error"),
+        *("_value", "_wake"),
+    )
+
+    def __init__(self, bell: Doorbell) -> None:
+        self._bell = bell
+        self._asyncio_future_blocking = False
+        self._done = self._cancelled = False
+        self._value: T | None = None
+        self._error: BaseException | None = None
+        self._wake: Callable[[Outcome[T]], None] | None = None  # None: nobody waits
+        self._context: contextvars.Context | None = None
+
+    def done(self) -> bool:
+        """Return True if there is a result or an error, or the wait was cancelled."""
+        return self._done
+
+    def cancelled(self) -> bool:
+        """Return True if the wait was cancelled before there was anything."""
+        return self._cancelled
+
+    def set_result(self, value: T) -> None:
+        """Have the task go on with a result.
+
+        Raises:
+            asyncio.InvalidStateError: it is done.
+        """
+        if self._done:
+            raise asyncio.InvalidStateError("the outcome is there")
+        self._done, self._value = True, value
+        due = self._bell.due
+        if due is None:
+            self._wake_soon()
+        else:
+            due.append(self)
+
+    def set_exception(self, error: BaseException) -> None:
+        """Have the task go on with an error.
+
+        Raises:
+            asyncio.InvalidStateError: it is done.
+        """
+        if self._done:
+            raise asyncio.InvalidStateError("the outcome is there")
+        self._done, self._error = True, error
+        self._wake_soon()
+
+    def exception(self) -> BaseException | None:
+        """Return the error; None for a result."""
+        return self._error
+
+    def wake(self) -> None:
+        """Have the task go on at once, if it waits."""
+        wake, self._wake = self._wake, None
+        if wake is not None and self._context is not None:
+            self._context.run(wake, self)
+
+    def _wake_soon(self) -> None:
+        wake, self._wake = self._wake, None
+        if wake is not None:
+            self.get_loop().call_soon(wake, self, context=self._context)
+
+    # ------------------------------------------------------------------ for the task's machinery
+
+    def __await__(self) -> Generator[Outcome[T], None, T]:
+        if not self._done:
+            self._asyncio_future_blocking = True
+            yield self  # which raises the error
+            return self._value  # type: ignore[return-value]
+        return self.result()
+
+    def get_loop(self) -> asyncio.AbstractEventLoop:
+        """Return the loop that the task runs in."""
+        return self._bell.get_loop()
+
+    def add_done_callback(
+        self, wake: Callable[[Outcome[T]], None], *, context: contextvars.Context
+    ) -> None:
+        """Note that the task sleeps now; ``wake`` has it go on."""
+        self._wake, self._context = wake, context
+
+    def cancel(self, msg: Any = None) -> bool:
+        """Wake the task to be cancelled; False where it goes on anyway, and is told then."""
+        if self._done:
+            return False
+        self._done = self._cancelled = True
+        self._error = asyncio.CancelledError(*([] if msg is None else [msg]))
+        self._wake_soon()
+        return True
+
+    def result(self) -> T:
+        """Return the result, or raise the error."""
+        error, self._error = self._error, None  # it refers to who waited, once it is raised
+        if error is not None:
+            raise error
+        return cast("T", self._value)
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
+
+
 class PlainDoorbell:
     """A doorbell with a future: a ring makes the task go on in the loop's next turn.
 
@@ -98,6 +243,14 @@ class PlainDoorbell:
         """Make the task go on."""
         if self._ringing is not None and not self._ringing.done():
             self._ringing.set_result(None)
+
+    def deliver(self) -> None:
+        """Have the task go on; callers whose outcome comes go on behind it, by way of the loop."""
+        self.ring()
+
+    def outcome(self) -> asyncio.Future[Any]:
+        """Return an outcome that one task may wait for."""
+        return self._loop.create_future()
 
     def __await__(self) -> Generator[Any, None, None]:
         self._ringing = self._loop.create_future()

@@ -388,9 +388,10 @@ def _sharer(
 
     def on_step(step: str) -> None:
         when = end
-        if step == CONNECTING:
+        if step == CONNECTING and (hurried or untried > 1):
             share = (end - loop.time()) / untried
             when = loop.time() + (min(share, DETECTION_TIMEOUT) if hurried else share)
-        limit.reschedule(when)
+        if when != limit.when():
+            limit.reschedule(when)
 
     return on_step

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import functools
 import logging
 import socket
 import weakref
@@ -24,19 +25,18 @@ from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, se
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
-from smartcam.protocols._inside import Event, ResultBurst
+from smartcam.protocols._inside import Event, ResultBurst, send_each
 from smartcam.protocols.messages import (
     Disconnect,
-    GetStatus,
     Message,
-    Query,
     Sender,
     TriggerAnswer,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
+    from smartcam._client.doorbell import Outcome
     from smartcam.protocols import Frame, Protocol
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
@@ -76,7 +76,7 @@ long as other tasks take longer than one turn."""
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
 """Number of links that are open on each loop."""
 
-MIN_FRAMES_PER_CHUNK = 4
+MIN_FRAMES_PER_CHUNK = 5
 """Fewest frames into which a chunk is cut."""
 
 FIRST_CHUNK = 64
@@ -121,6 +121,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
+        outcome: makes what one task may wait for, to be set by the receive task, or by others.
         heard_at: loop time of the last byte received.
     """
 
@@ -144,6 +145,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
+        # where the machine can say several at once
+        each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
+        self._send_all = getattr(machine, "send_all", each)
         # function that takes the bytes of an unfinished frame
         self.on_rest: Callable[[bytes], None] | None = None
         self._chunks: collections.deque[Chunk] = collections.deque()
@@ -153,7 +157,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         # time since which the link works on the last chunk, if that was a large one
         self._busy_since: float | None = None
         self._busy_with = 0
-        self._doorbell = make_doorbell(self.loop)  # of the task that receives
+        self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
+        self.outcome: Callable[[], Outcome[Any] | asyncio.Future[Any]] = bell.outcome
         self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
@@ -179,7 +184,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.machine.send(message, answered=answered)
         self._flush()
 
-    def send_all(self, messages: Iterable[Message]) -> None:
+    def send_all(self, messages: Sequence[Message]) -> None:
         """Write messages at once: one write on TCP, a datagram each on UDP.
 
         Raises:
@@ -189,14 +194,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._loss is not None:
             raise self.lost_error()
         try:
-            queried = False
-            for message in messages:
-                kind = type(message)
-                if kind is Query and queried:  # a trigger stands between two
-                    self.machine.send(message, again=True)
-                else:  # a status comes by itself as well: it is owed to nobody
-                    self.machine.send(message, answered=False if kind is GetStatus else None)
-                queried = queried or kind is Query
+            self._send_all(messages)
         finally:
             self._flush()
 
@@ -416,7 +414,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._transport.abort()
         elif frames > self._most or len(self._chunks) >= MAX_CHUNKS:
             self._pause()
-        self._doorbell.ring()
+        self._doorbell.deliver()
 
     async def _give_way(self) -> None:
         """Let the loop go round; more often where it is shared and the others are at work."""

@@ -32,7 +32,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
-    from smartcam._client.waits import OwedAnswer, Waits
+    from smartcam._client.waits import OwedAnswer, Waiter, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -55,8 +55,8 @@ class Requests:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        # future of the wait that the timer belongs to
-        self._late: asyncio.Future[None] | None = None
+        # what the wait goes on by that the timer belongs to
+        self._late: Waiter | None = None
         self._timer = DeadlineTimer(self._wake_late)
 
     def finish(self) -> None:
@@ -199,9 +199,10 @@ class Requests:
 
         It may come later: the link is given up only when ``request_timeout`` is over, too.
         """
+        link = self._connection.require_link()
         patience = self._switch_patience if key is m.SwitchAnswer else self.patience
-        self._due[key] = max(deadline, asyncio.get_running_loop().time() + patience)
-        return self._waits.next_answer(key, behind=self._connection.require_link().deliveries)
+        self._due[key] = max(deadline, link.loop.time() + patience)
+        return self._waits.next_answer(key, behind=link.deliveries)
 
     # ------------------------------------------------------------------ Query, and what it fences
 
@@ -249,6 +250,10 @@ class Requests:
 
     # ------------------------------------------------------------------ answers
 
+    def owes(self, key: type[m.Message]) -> bool:
+        """Return True if the camera owes an answer of this kind."""
+        return self._waits.owes(key)
+
     async def await_owed(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
@@ -274,38 +279,38 @@ class Requests:
             self._connection.require_link().give_up(error)
 
     async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
+        """Wait until an answer is there, and return it.
+
+        The answer is left alone when the task that waits is cancelled: it stays owed.
+
+        Raises:
+            TimeoutError: the deadline is over.
+        """
         if not answer.done():
-            await self._done_or_late(answer, deadline)
+            link = self._connection.require_link()
+            waiter: Waiter = link.outcome()
+            answer.waiters.append(waiter)
+            timer = None  # a wait beside another one has a timer of its own
+            if self._late is None:
+                self._late = waiter
+                self._timer.set(deadline)
+            else:
+                timer = link.loop.call_at(deadline, _wake, waiter)
+            try:
+                await waiter
+            finally:
+                if timer is None:
+                    self._late = None
+                    self._timer.clear()
+                else:
+                    timer.cancel()
+                answer.waiters.remove(waiter)
             if not answer.done():
                 raise TimeoutError
         got = answer.result()
         if isinstance(got, SmartCamError):
             raise got.with_traceback(None)
         return got
-
-    async def _done_or_late(self, answer: OwedAnswer, deadline: float) -> None:
-        """Wait until an answer is there or the deadline is over.
-
-        The answer is left alone when the task that waits is cancelled: it stays owed.
-        """
-        loop = asyncio.get_running_loop()
-        waiter: asyncio.Future[None] = loop.create_future()
-        answer.waiters.append(waiter)
-        timer = None  # a wait beside another one has a timer of its own
-        if self._late is None:
-            self._late = waiter
-            self._timer.set(deadline)
-        else:
-            timer = loop.call_at(deadline, _wake, waiter)
-        try:
-            await waiter
-        finally:
-            if timer is None:
-                self._late = None
-                self._timer.clear()
-            else:
-                timer.cancel()
-            answer.waiters.remove(waiter)
 
     def _wake_late(self) -> None:
         if self._late is not None:
@@ -322,6 +327,6 @@ class Requests:
         )
 
 
-def _wake(waiter: asyncio.Future[None]) -> None:
+def _wake(waiter: Waiter) -> None:
     if not waiter.done():
         waiter.set_result(None)

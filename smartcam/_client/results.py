@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
+    from smartcam._client.doorbell import Outcome
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.listeners import Listeners
     from smartcam.protocols._inside import ResultBurst
@@ -49,10 +50,10 @@ _CURRENT = {"triggered", "nobody"}
 
 @dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
-    """The trigger under way, and the future of the caller that waits for it.
+    """The trigger under way, and what the caller waits for.
 
     Attributes:
-        outcome: future of the results or the error.
+        outcome: what the caller waits for: the results or the error.
         interpretation: interpretation that reads the results.
         has_input: True if input data was sent with the trigger.
         sent_at: loop time at which the trigger was sent.
@@ -63,7 +64,7 @@ class PendingTrigger(SentTrigger):
             fate ``triggered`` are its own then), and the containers behind them.
     """
 
-    outcome: asyncio.Future[list[Result]]
+    outcome: Outcome[list[Result]] | asyncio.Future[list[Result]]
     interpretation: Interpretation
     has_input: bool
     sent_at: float
@@ -399,6 +400,32 @@ class Results:
             owner.results.append(result)
             owner.came += 1
             self._complete(owner, now)
+
+    def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
+        """Return the trigger under way if a container with its answers around it is its result.
+
+        That is noted then, and :meth:`on_own` takes the container. None where anything but its
+        evidence decides, or something has come of it already.
+        """
+        pending = self._pending
+        if pending is None or pending.ended or pending.outcome.done() or pending.came:
+            return None
+        if self._lossy or self._numbering is not None or container.asked is not None:
+            return None
+        expected = self._state.expected
+        if expected is None:
+            expected = pending.application
+        if expected is not None and expected != container.application:
+            return None
+        if pending.unproven or pending.given_up or not self.correlation.take_round(pending):
+            return None
+        return pending
+
+    def on_own(
+        self, container: m.ResultContainer, owner: PendingTrigger, now: float, at: datetime
+    ) -> None:
+        """Take a container that is known to be a trigger's."""
+        self._hand_on(container, owner, "triggered", None, now, at)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if a container equal to this one is there, as when a datagram comes twice."""

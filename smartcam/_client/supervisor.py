@@ -134,8 +134,7 @@ class Supervisor:
             self._run(), name=f"smartcam[{self._settings.address.host}].supervisor"
         )
         self._task.add_done_callback(self._end)
-        await asyncio.wait({self._opened})
-        error = self._opened.result()
+        error = await self._opened
         if error is not None:
             raise error
 
@@ -144,7 +143,7 @@ class Supervisor:
 
         Cancellation: the link is dropped at once.
         """
-        task, session = self._task, self.session
+        task, session, closed = self._task, self.session, self.closed_error()
         self._closing = True
         try:
             if self.connected:
@@ -152,15 +151,15 @@ class Supervisor:
                     async with asyncio.timeout(self._settings.switch_timeout):
                         await self._lock.settle()
             linked = self.connected
-            self._dispatch.fail(self.closed_error())
+            self._dispatch.fail(closed)
             if linked and session is not None:
                 await session.link.close(self._settings.close_timeout)
         finally:
-            self._dispatch.fail(self.closed_error())
+            self._dispatch.fail(closed)
             self._drop()
             if task is not None:
                 await asyncio.wait({task})
-            self._dispatch.finish(self._ended_by or self.closed_error())
+            self._dispatch.finish(self._ended_by or closed)
             self._commands.end_session()
 
     def abandon(self) -> bool:
@@ -333,9 +332,9 @@ class Supervisor:
         self._dispatch.begin_session(session.dialect, ordered=ordered)
         self._commands.begin_session(session.link)
         self._counters.begin(session.link.machine.counters)
-        logger.info("%s = connected to %s", self._name, session.address.url)
-        kind = Reconnected if again else Connected
-        event = kind(camera=self._name, at=datetime.now(UTC), url=session.address.url)
+        url, kind = session.address.url, Reconnected if again else Connected
+        logger.info("%s = connected to %s", self._name, url)
+        event = kind(camera=self._name, at=datetime.now(UTC), url=url)
         self._listeners.publish(event)
         self._dispatch.dispatch_early(session.early)
         if self._opened is not None and not self._opened.done():

@@ -39,7 +39,7 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Sequence
     from typing import Any
 
     from smartcam._client.camera_state import CameraState
@@ -85,6 +85,10 @@ _WHY_READY = "; it does not while it inspects, and an application that runs free
 _HINT = "; where it never shows that, shows_triggers=no in its URL lets results do without"
 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
+
+FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
+"""The messages of a trigger where statuses alone tell what became of it: one object, by which the
+machine knows it."""
 
 
 @dataclass(slots=True)
@@ -135,12 +139,13 @@ class Triggers:
         self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
         self._quickest = 0.0
         self._quickest_of: int | None = None  # the application
+        self._ending: asyncio.TimerHandle | None = None  # of the trigger under way
 
     def give_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
         self._correlation.give_number(number)
 
-    def _check_time(self, deadline: float, timeout: float) -> None:
+    def _check_time(self, left: float, timeout: float) -> None:
         """See that a trigger which has waited has the time that a result takes.
 
         One that is sent all the same ends without its result, which then comes late, and the next
@@ -150,9 +155,6 @@ class Triggers:
             ResponseTimeoutError: less time is left than the quickest result of this application
                 took, or than a hundredth of the timeout.
         """
-        left = deadline - asyncio.get_running_loop().time()
-        if left >= MAX_SHARE_WITHOUT_WAIT * timeout:
-            return
         quickest = self._quickest if self._quickest_of == self._state.active else 0.0
         needed = max(quickest, MIN_TIMEOUT_SHARE * timeout)
         if left < needed:
@@ -162,12 +164,6 @@ class Triggers:
                 f"only, and a result takes {needed:.3g} s at least",
                 waited=waited,
             )
-
-    def _note_time(self, pending: PendingTrigger) -> None:
-        """Remember how long the quickest trigger of the active application took."""
-        took = asyncio.get_running_loop().time() - pending.sent_at
-        if self._quickest_of != self._state.active or took < self._quickest:
-            self._quickest, self._quickest_of = took, self._state.active
 
     def trigger(
         self, request: TriggerRequest, deadline: float, timeout: float
@@ -253,28 +249,113 @@ class Triggers:
                 await self._requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
-        self._check_time(deadline, timeout)
-        number = None if numbering is None else correlation.take_number(numbering.highest)
         link = connection.require_link()
+        now = link.loop.time()
+        if deadline - now < MAX_SHARE_WITHOUT_WAIT * timeout:
+            self._check_time(deadline - now, timeout)
+        number = None if numbering is None else correlation.take_number(numbering.highest)
         pending = PendingTrigger(
             request.results,
             number,
             _evidence(features),
-            link.loop.create_future(),
+            link.outcome(),
             interpretation,
             request.input_data is not None,
-            link.loop.time(),
+            now,
             datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        return await self._await_results(pending, link, request.input_data, deadline)
+        words: Sequence[m.Message] = FENCED_TRIGGER
+        if not features.tells_all or number is not None or request.input_data is not None:
+            words = await self._prepare(pending, link, request.input_data, deadline)
+            await self._await_turn(deadline)
+        self._results.begin_trigger(pending, deadline)
+        try:
+            self._send(pending, link, words, deadline)
+            if not link.is_writable():
+                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
+                    async with asyncio.timeout_at(deadline):
+                        await link.drain()
+            results = await pending.outcome  # TimeoutError: the timer of Results, at the deadline
+        except TimeoutError as exc:
+            raise self._timed_out(pending, link, deadline) from exc
+        except asyncio.CancelledError:
+            if not pending.outcome.done() or pending.outcome.cancelled():
+                correlation.give_up(pending)
+                if self._ending is not None and not self._ending.cancelled():
+                    self._end_reading(link)
+            else:
+                pending.outcome.exception()  # nobody will look at it
+            raise
+        else:
+            took = link.loop.time() - now
+            if took < self._quickest or self._quickest_of != state.active:
+                self._quickest, self._quickest_of = took, state.active
+            return results
+        finally:
+            if self._ending is not None:
+                self._ending.cancel()
+                self._ending = None
+            if features.polled:
+                self._polling.end_trigger()
+            self._results.end_trigger()
 
-    async def _await_results(
+    async def _await_turn(self, deadline: float) -> None:
+        """Wait until a trigger may go out: another task may have asked meanwhile."""
+        requests, features = self._requests, self._connection.features
+        while True:
+            if features.acknowledged and self._waits.owes(m.TriggerAnswer):
+                await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
+            elif features.fences and self._waits.owes(m.QueryAnswer):
+                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            else:
+                break
+
+    def _send(
+        self, pending: PendingTrigger, link: Link, words: Sequence[m.Message], deadline: float
+    ) -> None:
+        """Write a trigger and what goes with it; note what is owed for it."""
+        requests, features = self._requests, self._connection.features
+        link.send_all(words)
+        if features.tells_all and words is FENCED_TRIGGER:
+            requests.expect_fences(2, pending.sent_at, deadline)
+            return
+        if features.ends_triggers:
+            end = pending.sent_at + READING_SHARE * (deadline - pending.sent_at)
+            self._ending = link.loop.call_at(end, self._end_reading, link)
+        if features.fences:
+            requests.expect_fences(words.count(_QUERY), pending.sent_at, deadline)
+        if features.acknowledged:
+            self._expect_acknowledgement(pending, deadline)
+        elif pending.has_input:
+            self._results.input_sent()
+        if features.polled:
+            self._polling.begin_trigger(words.count(_GET_STATUS))
+
+    def _timed_out(
+        self, pending: PendingTrigger, link: Link, deadline: float
+    ) -> TriggerTimeoutError:
+        """Give a trigger up whose time is over; return the error that says so."""
+        self._correlation.give_up(pending)
+        # it may have been stopped: then Waiting did not drop for this trigger
+        certain = self._connection.features.ordered or pending.evidence.began
+        self._doubtful = None if certain else link
+        waited = max(0.0, deadline - pending.sent_at)
+        came = f"{len(pending.results)} of {pending.wanted} results"
+        return TriggerTimeoutError(
+            f"{self._name}: {came if pending.results else 'no result'} within "
+            f"{round(waited, 2):g} s of the trigger; status: {self._status.last}"
+            f"{_what_is_missing(pending)}",
+            waited=waited,
+        )
+
+    async def _prepare(
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
-    ) -> list[Result]:
-        requests, features, outcome = self._requests, self._connection.features, pending.outcome
+    ) -> list[m.Message]:
+        """Return the messages of a trigger; its input goes out now, where that is answered."""
+        requests, features = self._requests, self._connection.features
         asked = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []
         if asked:
@@ -290,63 +371,7 @@ class Triggers:
         words.append(_TRIGGER)
         if features.fences and features.shows_triggers:
             words.append(_GET_STATUS if asked else _QUERY)
-        while True:  # another task may have asked whenever this one has waited
-            if features.acknowledged and self._waits.owes(m.TriggerAnswer):
-                await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
-            elif features.fences and self._waits.owes(m.QueryAnswer):
-                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
-            else:
-                break
-        self._results.begin_trigger(pending, deadline)
-        ending: asyncio.TimerHandle | None = None
-        try:
-            link.send_all(words)
-            if features.ends_triggers:
-                end = pending.sent_at + READING_SHARE * (deadline - pending.sent_at)
-                ending = link.loop.call_at(end, self._end_reading, link)
-            if features.fences:
-                requests.expect_fences(words.count(_QUERY), pending.sent_at, deadline)
-            if features.acknowledged:
-                self._expect_acknowledgement(pending, deadline)
-            elif input_data is not None:
-                self._results.input_sent()
-            if features.polled:
-                self._polling.begin_trigger(words.count(_GET_STATUS))
-            if not link.is_writable():
-                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
-                    async with asyncio.timeout_at(deadline):
-                        await link.drain()
-            results = await outcome  # TimeoutError: the timer of Results, at the deadline
-        except TimeoutError as exc:
-            self._correlation.give_up(pending)
-            # it may have been stopped: then Waiting did not drop for this trigger
-            certain = features.ordered or pending.evidence.began
-            self._doubtful = None if certain else link
-            waited = max(0.0, deadline - pending.sent_at)
-            came = f"{len(pending.results)} of {pending.wanted} results"
-            raise TriggerTimeoutError(
-                f"{self._name}: {came if pending.results else 'no result'} within "
-                f"{round(waited, 2):g} s of the trigger; status: {self._status.last}"
-                f"{_what_is_missing(pending)}",
-                waited=waited,
-            ) from exc
-        except asyncio.CancelledError:
-            if not outcome.done() or outcome.cancelled():
-                self._correlation.give_up(pending)
-                if ending is not None and not ending.cancelled():
-                    self._end_reading(link)
-            else:
-                outcome.exception()  # nobody will look at it
-            raise
-        else:
-            self._note_time(pending)
-            return results
-        finally:
-            if ending is not None:
-                ending.cancel()
-            if features.polled:
-                self._polling.end_trigger()
-            self._results.end_trigger()
+        return words
 
     def _end_reading(self, link: Link) -> None:
         """Have the camera end the trigger under way, which it would not do by itself."""

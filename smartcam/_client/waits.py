@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import SmartCamError
@@ -15,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam._client.counters import ClientCounters
+    from smartcam._client.doorbell import Outcome
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
@@ -30,22 +30,25 @@ def told(error: ErrorT) -> ErrorT:
     A raised error refers to the frames of its caller, and by them to the client: kept by the
     client's own task, it would keep a client alive that nobody has any more.
     """
-    made = copy.copy(error)
+    made = type(error)(*error.args)  # as copy() does, in a tenth of the steps
+    vars(made).update(vars(error))
     made.__cause__ = error.__cause__
     return made
+
+
+Waiter: TypeAlias = "Outcome[None] | asyncio.Future[None]"
 
 
 class OwedAnswer(asyncio.Future[Answer]):
     """An answer that the camera owes; it belongs to nobody who waits for it.
 
     Attributes:
-        waiters: futures of those who wait, each one's own: they are woken in one turn of the loop,
-            where a callback would take two.
+        waiters: what those who wait go on by, each one's own.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__(loop=loop)
-        self.waiters: list[asyncio.Future[None]] = []
+        self.waiters: list[Waiter] = []
 
     def set_result(self, result: Answer) -> None:
         """Have the answer, or why there is none, and wake those who wait."""
@@ -157,6 +160,10 @@ class Waits:
     def expect_fences(self, count: int) -> None:
         """Note that Queries went out with a trigger, for whose answers nobody waits."""
         self._fences_open = count
+
+    def awaits_fences(self, count: int) -> bool:
+        """Return True if so many Queries of a trigger are open, and nobody waits for anything."""
+        return self._fences_open == count and not self.answers and not self.statuses
 
     def take_fence(self) -> bool:
         """Return True if nobody waits for an answer to Query; count that answer off."""

@@ -159,6 +159,17 @@ class Log(Sequence[LogEntry]):
         """Bytes that the entries hold, counted as if all had been read."""
         return self._size
 
+    def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
+        """Put a frame that went over the wire as it is behind the others; as :meth:`append`."""
+        self._unread.append((time, peer, sender, frame, fault, None))
+        weight = _ENTRY + _PER_BYTE * len(frame[1])
+        if fault is not None:
+            weight += len(fault)
+        self._weights.append(weight)
+        self._size += weight
+        if len(self._weights) > self.maxlen or self._size > self.max_bytes:
+            self._push_out()
+
     def append(self, entry: LogEntry | _Traced) -> None:
         """Put an entry, or what one is made of, behind the others."""
         if isinstance(entry, LogEntry):
@@ -170,10 +181,14 @@ class Log(Sequence[LogEntry]):
             weight = _ENTRY + _PER_BYTE * size
             if fault is not None or wire is not None:
                 weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
-        weights = self._weights
         self._unread.append(entry)
-        weights.append(weight)
+        self._weights.append(weight)
         self._size += weight
+        self._push_out()
+
+    def _push_out(self) -> None:
+        """Have the oldest entries go where it is full."""
+        weights = self._weights
         while len(weights) > self.maxlen or (self._size > self.max_bytes and len(weights) > 1):
             (self._entries or self._unread).popleft()
             self._forget_oldest()

@@ -167,6 +167,7 @@ class WireCamera(Server):
         self._listener: Listener = _LISTENERS[Transport(transport)](self)
         self._port = Port(self._listener, host, port, name)
         self._traffic = TrafficLog(spoken)
+        self._shows = False  # whether the log wants each frame, looked at once a step
         self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
         self._stage = Stage(
             device=device,
@@ -516,12 +517,12 @@ class WireCamera(Server):
         """Note a frame that a machine saw, or bytes that make no frame."""
         traffic, now = self._traffic, self.clock.now
         if isinstance(what, Frame):
-            traffic.entries.append((now, link.peer, sender, what, link.hearing, None))
+            traffic.entries.keep(now, link.peer, sender, what, link.hearing)
             if sender is m.Sender.CLIENT:
                 traffic.count(what)
         else:
             traffic.add(now, link.peer, sender, what, link.hearing)
-        if _log.isEnabledFor(logging.DEBUG):
+        if self._shows:
             self._show_last()
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
@@ -558,6 +559,7 @@ class WireCamera(Server):
         return self._step
 
     def _begin_step(self) -> None:
+        self._shows = _log.isEnabledFor(logging.DEBUG)
         if self._started:
             self._move()
 

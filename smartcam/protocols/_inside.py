@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from smartcam.protocols._insight import words
     from smartcam.protocols._insight.machine import ONLINE
     from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
-    from smartcam.protocols._machine import Event, ResultBurst
+    from smartcam.protocols._machine import Event, ResultBurst, send_each
 
 __all__ = [
     "DEFAULT_MAX_LENGTH",
@@ -33,6 +33,7 @@ __all__ = [
     "ResultCode",
     "StatusCode",
     "load_protocol",
+    "send_each",
     "view_fields",
     "words",
 ]
@@ -49,6 +50,6 @@ if not TYPE_CHECKING:
             "_insight.": "words",
             "_insight.machine": "ONLINE",
             "_insight.words": "TRIGGER_EVENT StatusCode",
-            "_machine": "Event ResultBurst",
+            "_machine": "Event ResultBurst send_each",
         },
     )

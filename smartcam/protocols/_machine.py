@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols._base import Dialect, Transport
@@ -163,6 +163,25 @@ class LinkMachine(Protocol):
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
         ...
+
+
+def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
+    """Say messages that go out together, one after the other.
+
+    A second Query among them is no second request: a trigger stands between the two. A status that
+    is asked for comes by itself as well, so it is owed to nobody.
+
+    Raises:
+        LocalProtocolError: the protocol's state forbids one; those before it are said.
+    """
+    queried = False
+    for message in messages:
+        kind = type(message)
+        if kind is m.Query and queried:
+            machine.send(message, again=True)
+        else:
+            machine.send(message, answered=False if kind is m.GetStatus else None)
+        queried = queried or kind is m.Query
 
 
 @dataclass(slots=True)

@@ -263,7 +263,20 @@ class Codec:
             fill_data(made, data)
             return made
 
-        return make
+        if len(others) != 4:
+            return make
+        (fill_1, value_1), (fill_2, value_2), (fill_3, value_3), (fill_4, value_4) = others
+
+        def make_result(data: bytes) -> Message:  # as make() does, without a loop
+            made = new(kind)
+            fill_1(made, value_1)
+            fill_2(made, value_2)
+            fill_3(made, value_3)
+            fill_4(made, value_4)
+            fill_data(made, data)
+            return made
+
+        return make_result
 
     def _make(self, values: tuple[Any, ...]) -> Message:
         message = object.__new__(self.type)
@@ -436,6 +449,10 @@ class FramedDialect(Dialect):
     @property
     def capabilities(self) -> Capabilities:
         """Abilities of a camera in this dialect."""
+        return self._capabilities
+
+    @cached_property
+    def _capabilities(self) -> Capabilities:
         return Capabilities(
             dialect=self.name,
             status_by_itself=self.status_by_itself,

@@ -8,7 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 from smartcam.exceptions import (
     FrameError,
@@ -29,6 +29,7 @@ from smartcam.protocols._machine import (
     LinkFailed,
     ResultBurst,
     State,
+    send_each,
 )
 
 if TYPE_CHECKING:
@@ -58,6 +59,17 @@ short requests."""
 MAX_KNOWN_CHUNK_BYTES = 64
 """Largest number of bytes of the longest of these chunks: a Query, a sequence number and a Trigger
 have 40."""
+
+MAX_KNOWN_DELIVERIES = 64
+"""Largest number of deliveries that a client's machine looks at, to know the next one like them, in
+one state."""
+
+MAX_KNOWN_DELIVERY_BYTES = 1 << 12
+"""Largest number of bytes of one of these: the answers to a trigger, with a result of ordinary
+size."""
+
+MAX_KNOWN_DELIVERY_FRAMES = 8
+"""Largest number of frames of one of these: a trigger's five, and more statuses around them."""
 
 
 _SESSION_REQUESTS = (
@@ -143,6 +155,52 @@ _Made: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
 """Bytes of a frame, its id and that of its answer; the frame."""
 
 
+class _Delivery(NamedTuple):
+    """A delivery of whole frames that each came before, with one result at most.
+
+    Attributes:
+        head: bytes in front of the result's data; all bytes where it has no result.
+        begin: place where the data begins.
+        tail: bytes behind that data.
+        end: place where the data ends.
+        owed: ids of the answers that were owed when it came, and of those owed twice.
+        left: ids of those that were owed behind it, and of those owed twice.
+        before: messages in front of the result; all messages where it has no result.
+        make: function that makes the result of its data.
+        behind: messages behind the result.
+        frames: number of its frames.
+    """
+
+    head: bytes
+    begin: int
+    tail: bytes
+    end: int
+    owed: tuple[set[int], set[int]]
+    left: tuple[set[int], set[int]]
+    before: list[Message]
+    make: Callable[[bytes], Message] | None
+    behind: list[Message]
+    frames: int
+
+
+class _Volley(NamedTuple):
+    """Messages that were said together.
+
+    Attributes:
+        messages: messages; the same tuple is the same again.
+        frames: frames of these messages.
+        size: number of bytes of all frames.
+        owed: ids of the answers that were owed before, and of those owed twice.
+        left: ids of those that were owed behind them, and of those owed twice.
+    """
+
+    messages: tuple[Message, ...]
+    frames: list[bytes]
+    size: int
+    owed: tuple[set[int], set[int]]
+    left: tuple[set[int], set[int]]
+
+
 class Machine:
     """One link's protocol: bytes to events and messages to bytes.
 
@@ -207,6 +265,10 @@ class Machine:
         self._statuses: dict[bytes, Message] = {}  # those of statuses
         # by what stands in front of the data: bytes of the frame, what makes the message
         self._results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
+        # of a client, by their sizes; how many more are looked at
+        self._deliveries: dict[int, _Delivery] = {}
+        self._unknown_deliveries = MAX_KNOWN_DELIVERIES
+        self._volley: _Volley | None = None  # of a client: the last messages said together
         # of a camera, by chunks that came before in this state: their messages and frames
         self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
         # of a camera, by the id of a message object that it said before: the message and its frame
@@ -340,6 +402,8 @@ class Machine:
             return False
         self.counters.bytes_received += count
         cut, left = self._framer.filled(count), True
+        if cut and self._deliveries and self._receive_known():
+            return True
         if cut:
             before = self.counters.frames_received
             left = self._receive_frames()
@@ -391,11 +455,10 @@ class Machine:
                 f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant = self._constant.get(kind)
+        constant, frame = self._constant.get(kind), None
         if constant is None:
-            constant, frame = self._made_of(message)
-        else:
-            frame = None
+            known = self._said.get(id(message))
+            constant, frame = self._made_of(message) if known is None else known[1]
         data, message_id, owed = constant
         if answered is not None:
             owed = message_id if answered else None
@@ -417,6 +480,30 @@ class Machine:
                 frame = Frame(message_id, data[self._header_size :])
             self._trace(self._says, frame)
 
+    def send_all(self, messages: Sequence[Message]) -> None:
+        """Say messages together, as :func:`~smartcam.protocols._machine.send_each` does.
+
+        The same tuple said again where the same is owed gives the same frames, and owes the same.
+
+        Raises:
+            LocalProtocolError: the state forbids one; those before it are said.
+        """
+        volley = self._volley
+        if volley is not None:
+            known, frames, size, owed, left = volley
+            if known is messages and owed[0] == self._open and owed[1] == self._open_twice:
+                self._open, self._open_twice = left[0].copy(), left[1].copy()
+                self._outbox += frames
+                counters = self.counters
+                counters.frames_sent += len(frames)
+                counters.bytes_sent += size
+                return
+        owed, state, said = self._owed(), self._state, len(self._outbox)
+        send_each(self, messages)
+        if self._plain and state is self._state and isinstance(messages, tuple):
+            frames = self._outbox[said:]
+            self._volley = _Volley(messages, frames, sum(map(len, frames)), owed, self._owed())
+
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
         outbox, self._outbox = self._outbox, []
@@ -425,13 +512,10 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _made_of(self, message: Message) -> _Made:
-        """Return the frame of a message with a body; a camera often says the same object again.
+        """Return the frame of a message with a body; a camera's machine keeps it by the object.
 
         Of those with data, such as results, only the last one's frame is kept.
         """
-        known = self._said.get(id(message))
-        if known is not None:
-            return known[1]
         dialect = self.dialect
         message_id = dialect.message_id(message)
         frame = dialect.to_frame(message)
@@ -478,6 +562,8 @@ class Machine:
             return
         known, size, owed = self._statuses.get, self._status_size, self._open
         before, available = len(events), len(buffer)
+        looks = self._unknown_deliveries and available <= MAX_KNOWN_DELIVERY_BYTES
+        were = self._owed() if looks and not start and not before else None
         while start < available:
             end = start + size
             message = known(buffer[start:end])
@@ -494,6 +580,64 @@ class Machine:
             start = end
         framer.start = start
         self.counters.frames_received += len(events) - before
+        if were is not None and 0 < start == available:
+            self._note_delivery(buffer, were)
+
+    def _owed(self) -> tuple[set[int], set[int]]:
+        return set(self._open), set(self._open_twice)
+
+    def _note_delivery(self, buffer: bytes, owed: tuple[set[int], set[int]]) -> None:
+        """Know a delivery that was taken as a whole from familiar frames, each of them an event."""
+        framer, events = self._framer, [one for one in self._events if isinstance(one, m.Message)]
+        results = [at for at, one in enumerate(events) if isinstance(one, m.ResultContainer)]
+        self._unknown_deliveries -= 1
+        if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
+            return
+        at, begin, end = len(events), len(buffer), len(buffer)  # of the result's data
+        make = None
+        framer.start = 0
+        for number in range(len(events)):
+            place = framer.cut()
+            if place is not None and number in results:
+                at, begin, end = number, place[1] + self._burst_size, place[2]
+                make = self._results[buffer[begin - self._result_head : begin]][1]
+        self._deliveries[len(buffer)] = _Delivery(
+            buffer[:begin],
+            begin,
+            buffer[end:],
+            end,
+            owed,
+            self._owed(),
+            events[:at],
+            make,
+            events[at + 1 :],
+            len(events),
+        )
+
+    def _receive_known(self) -> bool:
+        """Take a delivery that is like one before, in all bytes but its result's data.
+
+        Cut and read again it would give the same, with other data in the result.
+        """
+        framer, events = self._framer, self._events
+        buffer = framer.buffer
+        size = len(buffer)
+        known = self._deliveries.get(size)
+        if known is None or events or framer.start or type(buffer) is not bytes:
+            return False
+        head, begin, tail, end, owed, left, before, make, behind, frames = known
+        if buffer[:begin] != head or buffer[end:] != tail:
+            return False
+        if owed[0] != self._open or owed[1] != self._open_twice:
+            return False
+        self._open, self._open_twice = left[0].copy(), left[1].copy()
+        events += before
+        if make is not None:
+            events.append(make(buffer[begin:end]))
+            events += behind
+        framer.start = size
+        self.counters.frames_received += frames
+        return True
 
     def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it is a result as there was one before.
@@ -638,7 +782,8 @@ class Machine:
 
     def _forget_familiar(self) -> None:
         """Look at each message again, since it may mean another thing or may be no message now."""
-        self._statuses, self._results, self._chunks = {}, {}, {}
+        self._statuses, self._results, self._chunks, self._deliveries = {}, {}, {}, {}
+        self._unknown_deliveries, self._volley = MAX_KNOWN_DELIVERIES, None
         self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:

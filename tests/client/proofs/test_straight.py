@@ -1,0 +1,75 @@
+"""The short way of a trigger's usual answers and the long one: ``straight.py``, short."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.client.proofs.straight import DifferenceError, ShortDispatch, compare
+from tests.protocols.machine_kinds import ShortMachine
+
+EVENTS, SEED = 2000, 1
+
+
+def test_short_way_gives_what_the_long_one_gives(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("CRITICAL", logger="smartcam")
+    counts = compare(EVENTS, SEED)
+    assert counts["triggers at once"] > 5
+    assert counts["deliveries known"] > 20
+
+
+class ForgetsStatuses(ShortDispatch):
+    """Does not count the statuses around a result."""
+
+    def _take_round(self, *arguments: Any) -> bool:
+        heard = self._state.statuses_heard
+        taken = super()._take_round(*arguments)
+        if taken:
+            self._state.statuses_heard = heard
+        return taken
+
+
+class KeepsFences(ShortDispatch):
+    """Still waits for the answers that it has taken."""
+
+    def _take_round(self, *arguments: Any) -> bool:
+        taken = super()._take_round(*arguments)
+        if taken:
+            self._waits.expect_fences(2)
+        return taken
+
+
+class LooksAtSizes(ShortMachine):
+    """Takes any delivery of a known size for the known one."""
+
+    def _note_delivery(self, *arguments: Any) -> None:
+        super()._note_delivery(*arguments)
+        for size, known in self._deliveries.items():
+            self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
+
+
+class IsOwedAnything(ShortMachine):
+    """Does not see that another answer is owed."""
+
+    def _receive_known(self) -> bool:
+        for size, known in self._deliveries.items():
+            self._deliveries[size] = known._replace(owed=(self._open, self._open_twice))
+        return super()._receive_known()
+
+
+@pytest.mark.parametrize(
+    ("machine", "dispatch"),
+    [
+        (ShortMachine, ForgetsStatuses),
+        (ShortMachine, KeepsFences),
+        (LooksAtSizes, ShortDispatch),
+        (IsOwedAnything, ShortDispatch),
+    ],
+)
+def test_fault_in_the_short_way_is_found(
+    machine: type[ShortMachine], dispatch: type[ShortDispatch], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("CRITICAL", logger="smartcam")
+    with pytest.raises((DifferenceError, AssertionError)):
+        compare(100 * EVENTS, SEED, machine, dispatch)
