@@ -1,20 +1,21 @@
-"""Accepting connections on a port: one policy for every server of the package.
+"""Accept connections on a port, by one policy for every server of the package.
 
-Emulators, pages, the RTSP server and the link proxy listen by it. :class:`Places` says who may
-stay; it knows no socket and no clock. :class:`Acceptor` accepts, and keeps its deadlines.
+Emulators, pages, the RTSP server and the link proxy use it. :class:`Places` decides which
+connections may stay; it uses no socket and no clock. :class:`Acceptor` accepts them, and keeps the
+deadlines.
 
 - A newcomer always gets in as long as one of the others has no session: the one without a session
-  for longest makes room. One with a session never does. What a session is, the server says; what
-  anybody may ask without one, such as OPTIONS, is not one.
-- A connection that has no session in time is closed, whatever it says meanwhile.
-- One address has three quarters of the places at most; the programs of this machine share one
+  for longest makes room. One with a session never does. The server defines what a session is; a
+  request that needs none, such as OPTIONS, does not make one.
+- A connection without a session in time is closed, even if it has sent data.
+- One address gets at most three quarters of the places; the programs of this machine share one
   address, so loopback may have all.
-- Some file descriptors of the process are left to others. Where only those are left, the connection
+- Some file descriptors of the process are left to others. If only those are left, the connection
   without a session for longest, of any server on this event loop, makes room.
 
 Connections are not accepted by ``asyncio.Server``. A connection that it has accepted but not yet
 wrapped when it is closed stays open until the garbage collector finds it, and a client would wait
-for ever. And where no file descriptor is left, it writes a traceback for each place of its backlog,
+forever. And if no file descriptor is left, it writes a traceback for each place of its backlog,
 every second.
 """
 
@@ -40,13 +41,14 @@ if sys.platform != "win32":
     import resource
 
 ACCEPT_PAUSE = 1.0
-"""Seconds until the next try where the system has no socket left, and nobody can make room."""
+"""Seconds until the next attempt if the system has no socket left, and no connection can make
+room."""
 
 BACKLOG: Final = 128
-"""Connections that the system may queue before they are accepted."""
+"""Number of connections that the system may queue before they are accepted."""
 
 HANDSHAKE_TIMEOUT: Final = 60.0
-"""Seconds that a connection may stay without a session, where a server says nothing else."""
+"""Seconds that a connection may stay without a session, unless a server sets another time."""
 
 RESOLVE_TIMEOUT: Final = 10.0
 """Seconds that the look-up of a host's address may take."""
@@ -71,12 +73,12 @@ def is_loopback(host: str) -> bool:
 
 
 def share_of(most: int) -> int:
-    """Return the number of ``most`` places that one address may take; loopback may take all."""
+    """Return the share of ``most`` places for one address; loopback may take all."""
     return max(1, most - most // 4)
 
 
 class Occupant(Protocol):
-    """A connection, as the policy sees it."""
+    """A connection for the policy."""
 
     @property
     def settled(self) -> bool:
@@ -84,7 +86,7 @@ class Occupant(Protocol):
         ...
 
     def turn_away(self, why: str) -> None:
-        """End the connection at once; harmless when said twice."""
+        """End the connection at once; harmless when called twice."""
         ...
 
 
@@ -93,7 +95,7 @@ class _TakenPlace:
     peer: str  # address of the peer, without a port
     since: float  # time at which it came, or last had a session
     within: float  # seconds that it has from then on
-    what: str  # is missing then
+    what: str  # name of the missing thing, for the log
     deadline: float
 
 
@@ -106,14 +108,14 @@ class Places(Generic[G]):
     Moments are seconds of any clock that does not go back.
 
     Args:
-        most: connections at a time.
+        most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        what: text for the log that says what such a connection lacks, "no session".
+        what: reason for the log why such a connection is closed, "no session".
         own: name of a session in the log, "a session".
 
     Attributes:
-        most: connections at a time; may be changed.
-        crowded_out: connections that were closed, or refused, because too many were open.
+        most: largest number of connections at a time; may be changed.
+        crowded_out: number of connections that were closed, or refused, because too many were open.
     """
 
     def __init__(
@@ -141,10 +143,10 @@ class Places(Generic[G]):
         return occupant in self._places
 
     def enter(self, occupant: G, peer: str, now: float) -> str:
-        """Give a newcomer a place, for which another one may have to go.
+        """Give a newcomer a place; another connection may be closed for it.
 
         Returns:
-            "", or why there is none for it.
+            "", or the reason why it gets none.
         """
         crowd, taken = list(self._places), f"{self.most} others are open"
         if len(crowd) < self.most:
@@ -165,23 +167,23 @@ class Places(Generic[G]):
         return ""
 
     def leave(self, occupant: G) -> None:
-        """Forget a connection that has ended; harmless when said twice."""
+        """Forget a connection that has ended; harmless when called twice."""
         self._places.pop(occupant, None)
 
     def move_back(self, occupant: G, now: float) -> None:
-        """Put a connection behind the others: it was served, or its session has ended."""
+        """Put a connection last in the line to make room: it was served, or its session ended."""
         place = self._places.pop(occupant, None)
         if place is not None:
             place.since = now
             self._places[occupant] = place
 
     def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
-        """Set within how many seconds a connection must have a session; None: as long as it likes.
+        """Set within how many seconds a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: word for what the connection lacks then, for the log.
+            what: name of the missing thing, for the log.
             now: the moment.
         """
         place = self._places.get(occupant)
@@ -190,19 +192,19 @@ class Places(Generic[G]):
             place.deadline = now + place.within
 
     def longest(self) -> tuple[float, G] | None:
-        """Return the connection without a session for longest, and since when; None: no such."""
+        """Return the connection without a session for longest, and since when; else None."""
         found = next((one for one in self._places.items() if not one[0].settled), None)
         return None if found is None else (found[1].since, found[0])
 
     def make_room(self, why: str) -> None:
-        """Have the connection without a session for longest go."""
+        """Close the connection without a session for longest."""
         found = self.longest()
         if found is not None:
             self.crowded_out += 1
             self._send_away(found[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """End connections whose time is over; one with a session then gets the time anew."""
+        """End connections whose time is over; for one with a session the time begins again."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
@@ -237,8 +239,8 @@ class Acceptor(Generic[G]):
     lost.
 
     Args:
-        make: returns a new protocol. One that is made after :meth:`close` is for a connection that
-            was accepted before.
+        make: function that returns a new protocol. One made after :meth:`close` is for a connection
+            that was accepted earlier.
         places: places of the connections that may stay.
         log: logger of failures.
         name: name of the tasks.
@@ -262,22 +264,22 @@ class Acceptor(Generic[G]):
         self._socket: socket.socket | None = None
         self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
         self._adopting: set[asyncio.Task[Any]] = set()
-        self._moving = 0  # connections that wait for a descriptor that becomes free
+        self._moving = 0  # connections that wait for a free descriptor
         self._scarce = False  # the last try has failed
         self._timer: asyncio.TimerHandle | None = None  # timer of the next deadline
-        self.loop: asyncio.AbstractEventLoop | None = None  # while it is open
+        self.loop: asyncio.AbstractEventLoop | None = None  # listening socket while it is open
 
     # ------------------------------------------------------------------ the port
 
     def open(self, sock: socket.socket) -> None:
-        """Accept from now on; the socket listens and does not block."""
+        """Start accepting on a listening, non-blocking socket."""
         self._socket = sock
         self.loop = asyncio.get_running_loop()
         _here.acceptors.add(self)
         self._listen(sock)
 
     def close(self) -> None:
-        """Accept nothing more, at once; connections stay, and so does the socket."""
+        """Stop accepting at once; connections and the socket stay open."""
         sock, self._socket = self._socket, None
         self.loop = None
         _here.acceptors.discard(self)
@@ -302,7 +304,7 @@ class Acceptor(Generic[G]):
 
         Args:
             occupant: the connection.
-            address: address of its peer, as a socket has it.
+            address: address of its peer, in a socket's form.
         """
         now = asyncio.get_running_loop().time()
         why = self.places.enter(occupant, str(address[0]) if address else "", now)
@@ -310,23 +312,23 @@ class Acceptor(Generic[G]):
         return why
 
     def leave(self, occupant: G) -> None:
-        """Forget a connection that has ended; harmless when said twice."""
+        """Forget a connection that has ended; harmless when called twice."""
         self.places.leave(occupant)
         if not self.places and self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def move_back(self, occupant: G) -> None:
-        """Put a connection behind the others: it was served, or its session has ended."""
+        """Put a connection last in the line to make room: it was served, or its session ended."""
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
     def expect(self, occupant: G, within: float | None, what: str) -> None:
-        """Set within how many seconds a connection must have a session; None: as long as it likes.
+        """Set within how many seconds a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: word for what the connection lacks then, for the log.
+            what: name of the missing thing, for the log.
         """
         self.places.expect(occupant, within, what, asyncio.get_running_loop().time())
         self._set_timer()
@@ -349,7 +351,7 @@ class Acceptor(Generic[G]):
     # ------------------------------------------------------------------ accepting
 
     def adopt(self, connection: socket.socket) -> None:
-        """Give an accepted connection its protocol; one that is too late is closed by that."""
+        """Give an accepted connection its protocol, which closes one that is too late."""
         loop = asyncio.get_running_loop()
         task = loop.create_task(
             loop.connect_accepted_socket(self._make, connection), name=f"{self._name}.adopt"
@@ -370,8 +372,8 @@ class Acceptor(Generic[G]):
         try:
             connection, _ = sock.accept()
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-            return  # the client has changed its mind
-        except OSError as exc:  # no file descriptor is left: the reader would call without end
+            return  # the client has closed the connection already
+        except OSError as exc:  # no file descriptor is left: the reader would be called endlessly
             self._tell(f"a connection cannot be accepted: {exc}")
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock)
@@ -398,7 +400,7 @@ class Acceptor(Generic[G]):
         self._scarce = True
 
     def _admit(self, connection: socket.socket) -> None:
-        """Adopt a connection, where the process has descriptors left for it."""
+        """Adopt a connection, if the process has a descriptor left for it."""
         if not _is_last(connection, self._reserve):
             self._take(connection)
         elif _make_room():
@@ -409,9 +411,9 @@ class Acceptor(Generic[G]):
             connection.close()
 
     def _move(self, connection: socket.socket) -> None:
-        """Take a connection with the descriptor that has become free, and give the last one back.
+        """Move a connection to the descriptor that has become free, and release the last one.
 
-        Else the last ones would stay in use, and the next connection would have the free one.
+        Otherwise the last ones would stay in use, and the next connection would get the free one.
         """
         self._moving -= 1
         try:
@@ -425,7 +427,7 @@ class Acceptor(Generic[G]):
     def _take(self, connection: socket.socket) -> None:
         self._scarce = False
         connection.setblocking(False)
-        with contextlib.suppress(OSError):  # it is gone again
+        with contextlib.suppress(OSError):  # the connection is gone again
             # asyncio does so only where the listening socket was made with the protocol's number
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.adopt(connection)
@@ -449,7 +451,7 @@ def _is_last(connection: socket.socket, reserve: int) -> bool:
 
 
 def _make_room() -> bool:
-    """Have the connection go that is without a session for longest, of all on this event loop."""
+    """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
     open_here = [one.places for one in _here.acceptors if one.loop is loop]
     waiting = [(found[0], one) for one in open_here if (found := one.longest()) is not None]
@@ -466,10 +468,10 @@ async def listening(host: str, port: int, *, local: bool = False) -> socket.sock
     Args:
         host: name or address of this machine; "": all of them.
         port: 0 for a free one.
-        local: whether only loopback will do.
+        local: whether only loopback is accepted.
 
     Raises:
-        OSError, ValueError, OverflowError: the address cannot be had, or is not ``local``.
+        OSError, ValueError, OverflowError: the address is not available, or is not ``local``.
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(RESOLVE_TIMEOUT):

@@ -1,4 +1,4 @@
-"""An event loop in a thread, and calls into it from other threads."""
+"""Run an event loop in a thread, and call into it from other threads."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 CALL_TIMEOUT = 10.0
-"""Seconds that a call into the thread may take that has no deadline of its own. It is answered in
-well under a millisecond; longer means that something in there, such as a generator of an
-application, does not return."""
+"""Seconds that a call into the thread may take that has no deadline of its own. A call normally
+takes well under a millisecond; if it takes longer, a function in the thread, such as a generator of
+an application, does not return."""
 
 MAX_LOCK_WAIT_TIME = 0.1
-"""Seconds that Ctrl-C may have to wait where a lock's wait is not interrupted: on Windows, and
+"""Longest delay of Ctrl-C, seconds, if it does not interrupt a lock's wait: on Windows, and
 elsewhere if it comes between the lock's look for signals and its wait."""
 
 
 def start_task(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-    """Return a task that has begun, where Python can do that; it saves a turn of the loop."""
+    """Return a task that has begun, if Python supports that; it saves a turn of the loop."""
     loop = asyncio.get_running_loop()
     if sys.version_info >= (3, 12):
         return asyncio.Task(work, loop=loop, eager_start=True)
@@ -41,10 +41,9 @@ def start_task(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
 
 
 class _Mailbox:
-    """Functions that other threads want to have called in a loop's thread.
+    """Functions from other threads, to be called in a loop's thread.
 
-    Linux has a counter to wake a loop with, which takes a fifth of what the loop's own pair of
-    sockets takes.
+    On Linux a counter wakes the loop, in a fifth of the time of the loop's own pair of sockets.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -65,19 +64,19 @@ class _Mailbox:
         self._functions.append(function)
         if not self._closed:
             self._wake()
-        elif function in self._functions:  # else it was among the last ones
+        elif function in self._functions:  # otherwise it was called with the last ones
             self._functions.remove(function)
             raise ConfigurationError("the thread of the event loop has ended")
 
     def close(self) -> None:
-        """Call what is left, and refuse what comes; in the loop's thread."""
+        """Call the remaining functions, and refuse new ones; in the loop's thread."""
         self._closed = True
         if self._counter is not None:
             self._loop.remove_reader(self._counter)
         self._call_all()
 
     def __del__(self) -> None:
-        if self._counter is not None:  # nobody writes to it any more
+        if self._counter is not None:  # no thread writes to it any more
             os.close(self._counter)
 
     def _wake(self) -> None:
@@ -116,7 +115,7 @@ class _ThreadCall:
     )
 
     def __init__(self, mailbox: _Mailbox, function: Callable[[], object]) -> None:
-        # it is begun by wait(), so that nobody can begin it and not be there to end it
+        # wait() begins the call, so that the thread that began it is there to end it
         self._mailbox = mailbox
         self._function = function
         self._task: asyncio.Task[Any] | None = None
@@ -140,7 +139,7 @@ class _ThreadCall:
                     return False
         except BaseException:  # KeyboardInterrupt, in the main thread
             self.cancel()
-            if not self._finished:  # what is cancelled ends at once
+            if not self._finished:  # a cancelled call ends at once
                 self._done.acquire(timeout=CALL_TIMEOUT)
             raise
         return True
@@ -148,7 +147,7 @@ class _ThreadCall:
     def cancel(self) -> None:
         """Cancel the call, from any thread; a call that has not begun will not begin."""
         self._cancelled = True
-        with contextlib.suppress(ConfigurationError):  # then it is over
+        with contextlib.suppress(ConfigurationError):  # then the call is over
             self._mailbox.post(self._cancel)
 
     def result(self) -> Any:
@@ -191,7 +190,7 @@ class _ThreadCall:
             self._succeed(got)
 
     def _never_begun(self, work: Coroutine[Any, Any, object]) -> None:
-        """End what was cancelled before its task's first step, which nobody else does."""
+        """End a coroutine that was cancelled before its task's first step; asyncio does not."""
         if not self._finished:
             work.close()
             self._fail(asyncio.CancelledError())
@@ -211,7 +210,7 @@ class _ThreadCall:
     def _cancel(self) -> None:
         if self._task is not None:
             self._task.cancel()
-        elif not self._finished:  # it was not even asked to begin
+        elif not self._finished:  # the call was not even asked to begin
             self._fail(asyncio.CancelledError())
 
 
@@ -219,7 +218,7 @@ class LoopThread:
     """An event loop in a thread.
 
     Args:
-        name: the thread's name, for errors, too.
+        name: the thread's name, which is also in errors.
     """
 
     def __init__(self, name: str) -> None:
@@ -240,7 +239,8 @@ class LoopThread:
         async def live() -> None:
             self._loop = asyncio.get_running_loop()
             end = self._end = asyncio.Event()
-            mailbox = self._mailbox = _Mailbox(self._loop)  # last: it runs from now on
+            # last, since the thread runs from now on
+            mailbox = self._mailbox = _Mailbox(self._loop)
             ready.set()
             await end.wait()
             mailbox.close()
@@ -256,7 +256,7 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End the thread. Harmless when done twice, and in a fork, which has no such thread."""
+        """End the thread. Harmless when called twice, and in a fork, which has no such thread."""
         if self._forked:
             return
         thread, self._thread = self._thread, None
@@ -294,7 +294,7 @@ class LoopThread:
                 process.
             ResponseTimeoutError: the coroutine took longer than ``timeout``; it was cancelled.
             KeyboardInterrupt: Ctrl-C; it was cancelled.
-            Exception: whatever it raises.
+            Exception: any error of the coroutine.
         """
         return cast("T", self._call(function, timeout))
 
@@ -325,13 +325,13 @@ class LoopThread:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def post(self, function: Callable[[], object]) -> None:
-        """Have a function called in the thread, and do not wait; nothing where it does not run."""
+        """Schedule a function in the thread without waiting, if the thread runs."""
         if self._mailbox is not None and not self._forked:
             with contextlib.suppress(ConfigurationError):
                 self._mailbox.post(function)
 
     def _checked(self) -> _Mailbox:
-        """Return the mailbox, or say why nothing can be called."""
+        """Return the mailbox; raise if nothing can be called."""
         self._refuse_fork()
         if self._mailbox is None:
             raise self._not_running()
@@ -359,6 +359,6 @@ def _run_loop(live: Callable[[], Coroutine[Any, Any, None]]) -> None:
         asyncio.run(live())
     except RuntimeError:
         # asyncio starts a thread to end its executor, and from Python 3.12 on an interpreter that
-        # ends starts none; the loop is closed all the same
+        # ends starts none; the loop is closed nevertheless
         if threading.main_thread().is_alive():
             raise

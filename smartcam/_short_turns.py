@@ -33,7 +33,7 @@ def shorten_turns(who: object, seconds: float) -> None:
 
 
 def leave_turns(who: object) -> None:
-    """Want no short turns any more. Harmless when done twice."""
+    """Want no short turns any more. Harmless when called twice."""
     if _wanted.pop(who, None) is not None:
         _apply()
 

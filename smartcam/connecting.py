@@ -1,4 +1,4 @@
-"""From an address to a camera."""
+"""Make a camera from an address."""
 
 from __future__ import annotations
 

@@ -541,8 +541,8 @@ class Statistics:
         extra_results: containers that came for a trigger which had its results already; they are
             counted as streamed or unclaimed too.
         inspections_by_others: inspections that something else has triggered, a sensor or a person:
-            Waiting for Trigger went away, and not at a trigger of ours. Told over TCP where the
-            status comes by itself.
+            Waiting for Trigger went away, and not at a trigger of this client. Told over TCP where
+            the status comes by itself.
         overtriggers: times the Overtriggered bit rose.
         notices: errors, notifications and other remarks of the camera's own; the log has the first
             ones of each minute.

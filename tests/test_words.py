@@ -103,6 +103,7 @@ def test_functions_say_what_they_return_by_a_noun() -> None:
 
 HALF = {
     "an argument is said by a noun, not by 'of ...'": (entries, r"^(of|for|in|by) (?!ten )"),
+    "a function is called one": (entries, r"^(returns|makes|called)\b"),
     "an error is said of a noun": (errors, r"^(it|they|that|none|one(?! of)|there is none)\b"),
     "'is none' says nothing of what it is not": (
         docstrings,
@@ -112,6 +113,8 @@ HALF = {
     "'in here' may be a module or a folder": (docstrings, r"\bin here\b"),
     "'cannot be' what?": (docstrings, r"\b(topic|name|value|URL|domain|range) cannot be[.,;]"),
     "'who' is no noun": (docstrings, r"\b(of|for|to|by|from|with|at) who\b"),
+    "whose are ours?": (docstrings, r"\b(error|errors|file|recording|bag) of ours\b"),
+    "one word in two spellings": (docstrings, r"\bfor ever\b"),
 }
 """Ways to say half a thing: what is wrong, where it is looked for, and how it is found."""
 

@@ -1,4 +1,4 @@
-"""``smartcam calibrate compare`` and ``draw``: what is done with calibrations that are in files."""
+"""``smartcam calibrate compare`` and ``draw``: commands on calibrations in files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 """The values of --wizard."""
 
 MIN_LIKENESS = 0.75
-"""Likeness, up to 1, from which a word is taken for a command and not for a host."""
+"""A word counts as a command, not as a host, from this likeness on (0 to 1)."""
 
 OWN = "wizard"
 """Name of the default command below ``calibrate``, which users need not type."""
@@ -49,7 +49,7 @@ class OwnContext(click.Context):
 
 
 class WithParts(click.Command):
-    """The command's own action, whose help lists the other commands, too."""
+    """The default command, whose help also lists the other commands."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, and the commands."""
@@ -59,7 +59,7 @@ class WithParts(click.Command):
 
 
 class WithFiles(ListedGroup):
-    """A command with others below it; arguments that name none go to its default command."""
+    """A command with others below it, of which a default takes arguments without a name."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
@@ -89,7 +89,7 @@ class WithFiles(ListedGroup):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is meant, and what is left for it."""
+        """Return the command, and the arguments that are left for it."""
         name, command, rest = super().resolve_command(ctx, args)
         return (None if name == OWN else name), command, rest
 

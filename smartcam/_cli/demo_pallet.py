@@ -1,9 +1,9 @@
 """``smartcam demo --pick --plain``: parts located in a plain camera's pictures, onto a pallet.
 
 A part and a mark are taught from drawn pictures. The robot touches the mark at nine places, and
-from these pairs comes the calibration; from then on the tool ``locate`` says each part's pose in
-the robot's frame, and how far off it may be. What the robot then does is compared with the truth,
-which a real cell does not know.
+these pairs give the calibration; after that the tool ``locate`` gives each part's pose in the
+robot's frame, and its uncertainty. The robot's actions are then compared with the truth, which a
+real cell does not know.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ MARKS_FILE, CELL_FILE = "marks.yaml", "cell.yaml"
 """Cell files before and after the calibration."""
 
 MAX_PARTS: Final = 8
-"""Largest number of parts that are laid onto the table at once."""
+"""Largest number of parts that lie on the table at once."""
 
 DOWN: Final = (0.0, 0.0, -1.0)
 """Direction of the robot's tool when it touches."""
 
 TAUGHT: Final = TablePart("bracket", TablePose(0.15, 0.125, 0.4))
-"""The part as it lies in the picture that it is taught from."""
+"""The part in the picture from which it is taught."""
 
 MARKS_CELL: Final = """\
 cameras:
@@ -83,11 +83,11 @@ class Grid(NamedTuple):
 async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> None:
     """Teach, calibrate, and move parts from a table onto a pallet until it is full.
 
-    ``folder``: where the models, the calibration, the cell files and the pictures go; ``seed``: of
-    all noise, and of where things are. Raises MissingExtraError: the extra ``inspection`` is not
+    ``folder``: folder for the models, the calibration, the cell files and the pictures; ``seed``:
+    seed of all noise and places. Raises MissingExtraError: the extra ``inspection`` is not
     installed; ConfigurationError: the folder cannot be written.
     """
-    load("scipy", "calibration needs")  # first, since all that comes before would be in vain
+    load("scipy", "calibration needs")  # first, since otherwise all steps before would be in vain
     say = Steps(options)
     with naming(f"--folder {folder}"):
         await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
@@ -189,7 +189,7 @@ def _teach(demo: _Demo, part: TablePart) -> PartModel:
 
 
 async def _calibrate(demo: _Demo) -> PlaneCalibration:
-    """Have the camera locate the mark at nine places, and the robot touch it there."""
+    """Locate the mark at nine places by the camera, and touch it there by the robot."""
     from smartcam.calibration import fit_plane
 
     await _write(demo, MARKS_FILE, MARKS_CELL.format(address=demo.table.address))
@@ -219,7 +219,7 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
 
 
 def _pattern(demo: _Demo) -> PlacePattern:
-    """Have the robot touch three places of the pallet."""
+    """Touch three places of the pallet by the robot."""
     rows, columns, layers = demo.grid
     ends = ((0, 0), (columns - 1, 0), (0, rows - 1))
     first, row_end, column_end = (demo.robot.touch_pallet(*end) for end in ends)
@@ -244,7 +244,7 @@ def _palletize(
     placed: list[Placed],
     expected: list[float],
 ) -> None:
-    """Move every part that was found to the next place, and print how well."""
+    """Move every part that was found to the next place, and print the errors."""
     rows: list[tuple[object, ...]] = []
     for part in value.locate:
         number = sum(one.taken for one in placed)

@@ -37,8 +37,8 @@ class JsonLines(logging.Formatter):
     """Makes a record a line.
 
     Args:
-        agent: returns the agent's name.
-        cameras: returns the names of its cameras.
+        agent: function that returns the agent's name.
+        cameras: function that returns the names of its cameras.
     """
 
     def __init__(self, agent: Callable[[], str], cameras: Callable[[], Container[str]]) -> None:

@@ -1,4 +1,4 @@
-"""``smartcam outlet``: a camera's results go to brokers and databases."""
+"""``smartcam outlet``: deliver a camera's results to brokers and databases."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     terminated=0,
 )
 async def outlet(url: str, file: str, options: Options) -> None:
-    """Bring results out."""
+    """Deliver results."""
     from smartcam._cli.live import have_open
     from smartcam.outlets import Outlets, OutletsFile
 
@@ -69,7 +69,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
 
 
 class _OutletSource:
-    """The camera, and its results, errors and states on the way to the outlets."""
+    """The source of the outlets: a camera's results, errors and states."""
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -115,7 +115,7 @@ class _OutletSource:
 
         options = self._options
         spec = options.interpret_as or "raw"
-        if self.camera is not None:  # one that knows its layouts itself has them there
+        if self.camera is not None:  # a camera that knows its own layouts has them there
             spec = self.camera.settings.interpret_as
         read = Interpretation(spec, lenient=False, y_down=options.y_down)
         return columns_of(read.interpreter(application))
@@ -137,7 +137,7 @@ class _OutletSource:
 
 
 async def _results(name: str, results: Any, outlets: Outlets) -> None:
-    """Hand on results; what the subscription lost is told as an error."""
+    """Pass on results; results that the subscription lost are reported as an error."""
     told = 0
     while True:
         try:

@@ -1,4 +1,4 @@
-"""``--web``: the options, and a page beside what a command does."""
+"""Add ``--web`` to commands: its options, and a page that runs beside the command."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ if TYPE_CHECKING:
 
 
 class PageOptions:
-    """The page as the options want it.
+    """The page that the options ask for.
 
     Args:
-        web: whether there is one.
+        web: whether there is a page.
         web_host: address to listen on, None for loopback.
         web_port: port to listen on, None for a free one.
         web_token: the token, None for the site's own choice.
 
     Attributes:
-        wanted: whether there is one.
-        place: address of the page, and its token, as a site takes them.
+        wanted: whether there is a page.
+        place: address of the page, and its token, in the form for a site.
 
     Raises:
-        click.UsageError: something is said of a page that is not wanted.
+        click.UsageError: options of a page are given without a page.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ def page_options(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that gives a command the options of a page, as ``web``.
 
-    ``about``: what ``--web`` does. ``always``: the command has a page anyway, and no ``--web``.
+    ``about``: help for ``--web``. ``always``: the command has a page anyway, and no ``--web``.
     """
     flag = click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".')
     options = [

@@ -54,9 +54,9 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (CameraFaultError, 5),
     (TriggerError, 5),
 )
-"""First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one, or a
-source of frames that is not there, in use or gone; 4 a wait in a session, or for a frame, ran out;
-5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
+"""First match decides. 0 done; 1 a fault of smartcam; 2 wrong usage; 3 no session or a broken one,
+or a source of frames that is not there, in use or gone; 4 a wait in a session, or for a frame, ran
+out; 5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
 interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut
 off by Ctrl-C or SIGTERM."""
 

@@ -83,8 +83,8 @@ class CameraState:
 
         Args:
             report: report of the status.
-            awaited: kinds of the answers that are awaited; a switch of ours is known by the kind
-                of its answer.
+            awaited: kinds of the answers that are awaited; a switch by this client is known by the
+                kind of its answer.
 
         Returns:
             The status before, None if this session had none.
@@ -147,7 +147,7 @@ class CameraState:
             )
 
     def switched(self, application: int) -> None:
-        """Note that the camera has done a switch of ours."""
+        """Note that the camera has done a switch by this client."""
         self.want_application(application)
         self._loaded_by_us = True
 

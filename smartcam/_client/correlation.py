@@ -418,7 +418,7 @@ class Correlation:
         return self._complete and previous is not None
 
     def judge_told(self, asked: bool) -> Match:
-        """Return the same where the wire says whether a trigger of ours was answered."""
+        """Return the same where the wire says whether a trigger of this client was answered."""
         pending = self.pending
         if not asked:
             return NOBODYS

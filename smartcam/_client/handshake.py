@@ -206,7 +206,7 @@ async def attempt(
         progress: function that is told how far the handshake came.
         name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
-        trace: called with every frame.
+        trace: function that is called with every frame.
         disconnect_first: send Disconnect before Connect.
         liveness_timeout: see :class:`~smartcam._client.link.Link`.
 
@@ -311,7 +311,7 @@ async def establish(
 
     Args:
         settings: where to, and how long.
-        trace: called with every frame.
+        trace: function that is called with every frame.
         layout: the fields of the results, for a camera that can be told.
 
     Raises:

@@ -1,8 +1,8 @@
-"""From a result container to a :class:`~smartcam.Result`: which interpreter, and running it.
+"""Make a :class:`~smartcam.Result` from a result container: choose the interpreter, and run it.
 
-``interpret_as`` is one specification for whatever comes, or a mapping from application id to one.
-``calibration`` stands behind the interpreter, for all applications or for each by itself; where it
-stands no value passes that it has not turned into poses of the robot.
+``interpret_as`` is one specification for all containers, or a mapping from application id to one.
+``calibration`` follows the interpreter, for all applications or for each one; with it, only values
+that it has turned into poses of the robot pass.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _BYTE_ORDERS: dict[int, ByteOrder] = {0: "little", 1: "big"}
 
 
 def byte_order(endian: int) -> ByteOrder:
-    """Return the byte order that a status' endian field tells.
+    """Return the byte order in a status' endian field.
 
     Source: 0 little endian (SC manual p. 30, published), 1 big endian (inferred).
 
@@ -55,11 +55,11 @@ def byte_order(endian: int) -> ByteOrder:
     )
 
 
-# half the time of a NamedTuple's own; the cast because a bare tuple is generic
+# takes half the time of a NamedTuple's own; a cast, since a bare tuple is generic
 new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 MAX_NUMBER = (1 << 31) - 1
-"""Largest sequence number of ours: an int32 in the container holds it."""
+"""Largest own sequence number: it fits into an int32 in the container."""
 
 
 class Interpreted(NamedTuple):
@@ -75,7 +75,7 @@ class Numbering(NamedTuple):
 
     Attributes:
         highest: the largest number that its field holds, at most 2^31 - 1.
-        always: whether each container has it; not where it stands in a record that may be missing.
+        always: whether each container has it; False if it is in a record that may be missing.
     """
 
     highest: int
@@ -83,23 +83,23 @@ class Numbering(NamedTuple):
 
 
 class Interpretation:
-    """The way to read result containers; resolved once, used for every result.
+    """The interpreters of result containers; resolved once, used for every result.
 
     Args:
         spec: what ``interpret_as`` accepts.
-        lenient: any non-zero byte is a true bool.
-        y_down: the camera's y axis points down.
+        lenient: whether any non-zero byte is a true bool.
+        y_down: whether the camera's y axis points down.
         calibration: what ``calibration`` accepts.
-        own: whether the calibration was given for results as ``spec`` reads them; else values that
-            never are localizations stay as they are.
+        own: whether the calibration was given for results read by ``spec``; else values that never
+            are localizations stay unchanged.
 
     Attributes:
-        by_application: each application has its own interpreter.
+        by_application: whether each application has its own interpreter.
 
     Raises:
         ConfigurationError: the specification is wrong (a layout text with the position), or the
-            calibration is not valid, or was made with y taken the other way, or cannot apply to
-            what the specification gives.
+            calibration is not valid, or was made with the other direction of y, or cannot apply to
+            the specification's values.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class Interpretation:
         return way.numbering if way is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
-        """Return the texts of the layouts that have a number in them, as ``interpret_as`` has."""
+        """Return the layouts with a number in them, in the form of ``interpret_as``."""
         if self._one is not None:
             return _numbered(self._one)
         texts = {key: _numbered(way) for key, way in self._by_application.items()}
@@ -224,7 +224,7 @@ class Interpretation:
     def _context(
         self, application: int, endian: int, camera: str, number: int, at: datetime
     ) -> Context:
-        """Return the context for a plain interpreter, which does not keep it: always the same."""
+        """Return the context for a plain interpreter: always one object, as none keeps it."""
         context = self._plain_context
         if endian != self._endian:
             context.byte_order, self._endian = byte_order(endian), endian
@@ -245,8 +245,8 @@ class Interpretation:
     ) -> tuple[Sequence[Any], int] | None:
         """Return the values of several containers that came together, and their empty slots.
 
-        None if they are to be interpreted one by one: the interpreter wants a Reader, a sequence
-        number is to be read, or one of them does not fit.
+        None if they are to be interpreted one by one: the interpreter uses a Reader, a sequence
+        number must be read, or one container does not fit.
         """
         way = self._way(application)
         if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
@@ -256,7 +256,7 @@ class Interpretation:
             values = way.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
             if self._calibrations is not None and way.calibrated:
-                # each by itself, so that it has the same bits whichever way it came
+                # each alone, so that it has the same bits in whichever way it came
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
             raise
@@ -270,11 +270,11 @@ class _Calibrations:
 
     Args:
         given: what ``calibration`` accepts, but None.
-        y_down: the camera's y axis points down.
+        y_down: whether the camera's y axis points down.
 
     Raises:
         ConfigurationError: the calibration is no calibration, and no mapping from application ids
-            to some; or one that was made with y taken the other way.
+            to calibrations; or it was made with the other direction of y.
     """
 
     def __init__(self, given: Any, y_down: bool) -> None:
@@ -296,7 +296,7 @@ class _Calibrations:
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: says what to give instead.
+            ConfigurationError: no value would pass; the text says what to give instead.
         """
         given, known = [self._one], self._by_application
         of = "" if application is None else f" of application {application}"
@@ -316,11 +316,11 @@ class _Calibrations:
             )
 
     def apply(self, value: object, application: int) -> Any:
-        """Return localizations in the robot's frame; any value where None is the calibration.
+        """Return localizations in the robot's frame; if the calibration is None, any value.
 
         Raises:
-            InterpretationError: these are no localizations, or the calibration failed; then the
-                cause is chained.
+            InterpretationError: the value is no list of localizations, or the calibration failed,
+                with the cause chained.
             WrongApplicationError: the mapping does not know the application.
         """
         calibration = self._of(application)
@@ -390,7 +390,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
 
 
 def localizations_of(value: object) -> list[Localization] | None:
-    """Return ``value`` where it is a list of nothing but localizations, else None."""
+    """Return ``value`` if it is a list of only localizations, else None."""
     if not isinstance(value, list):
         return None
     parts: list[Any] = value
@@ -398,12 +398,12 @@ def localizations_of(value: object) -> list[Localization] | None:
 
 
 _WITHOUT_POSES = ("raw", "record", "strings50", "table")
-"""Built-in interpreters whose values are no localizations, whatever comes."""
+"""Built-in interpreters whose values never are localizations."""
 
 
 def without_poses(interpreter: Interpreter) -> str | None:
-    """Return an interpreter's name where it is one of those; a class made from one is not."""
-    # exactly these types: what a user makes of one may give anything
+    """Return an interpreter's name if it is in ``_WITHOUT_POSES``; a subclass does not count."""
+    # exactly these types: a user's subclass may give anything
     found = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
     return next(found, None)
 
@@ -424,7 +424,7 @@ def in_pixels(interpreter: Interpreter | None) -> bool:
 
 
 def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
-    """Return a container's bytes as its layout describes them, where its values are texts."""
+    """Return a container's bytes in the form of its layout, for values that are texts."""
     if container.fault is not None:
         raise InterpretationError(container.fault)
     if interpreter.layout is None or container.cells is None:
@@ -438,9 +438,9 @@ class _ApplicationReader:
 
     Attributes:
         interpreter: reader of the containers.
-        simple: the interpreter where it wants nothing but the bytes, else None.
-        sequenced: whether the interpreter may tell a sequence number.
-        numbering: how the layout carries the sequence number; None if it has none.
+        simple: the interpreter if it needs only the bytes, else None.
+        sequenced: whether the interpreter may report a sequence number.
+        numbering: form of the sequence number in the layout; None if it has none.
         calibrated: whether values pass through the calibration, if there is one.
     """
 

@@ -1,10 +1,10 @@
-"""Finding out that the camera is gone although nobody said so: a pulled cable, a lost supply.
+"""Notice a camera that is gone without a message: a pulled cable, a lost supply.
 
-Any received byte is a sign of life. A camera that has nothing to say owes none, so after half the
-timeout without one a Query asks for it, and the camera has the whole timeout from then on: a pause
-that is shorter ends no session, and a camera that is gone is noticed one and a half timeouts
-behind its last byte, at the latest. While an application is loaded the camera may be
-silent for longer: then it is asked after ``switch_timeout`` only.
+Any received byte is a sign of life. A camera need not send any, so after half the timeout without a
+byte a Query asks for one, and the camera has the whole timeout from then on: a shorter pause ends
+no session, and a camera that is gone is noticed at the latest one and a half timeouts after its
+last byte. While an application is loaded the camera may be silent for longer: then it is asked only
+after ``switch_timeout``.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class KeepAlive:
 
     def ask(self, due: float) -> None:
         """Ask for a sign of life, to come until ``due`` (loop time)."""
-        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports that
             self._requests.ask_for_life(due)
 
     def patience(self, usual: float) -> float:
-        """Return the seconds of silence allowed: more in a switch, or a trigger that is answered.
+        """Return the seconds of allowed silence: more during a switch, or a trigger with an answer.
 
-        It is ours or somebody else's.
+        The trigger may also be another program's.
         """
         status = self._state.status
         loading = status is not None and status.loading
@@ -66,24 +66,24 @@ class KeepAlive:
 
 
 class _Watch:
-    """One timer; set again each time it fires, never by what is received."""
+    """One timer, which is set again each time it fires, and never by received bytes."""
 
     def __init__(self, owner: KeepAlive, link: Link, timeout: float) -> None:
         self._owner = owner
         self._link = link
         self._timeout = timeout  # seconds that the camera has for a sign of life once it is asked
-        self._quiet = timeout / 2  # seconds of silence before it is
+        self._quiet = timeout / 2  # seconds of silence before the camera is asked
         self._loop = asyncio.get_running_loop()
         self._asked_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop watching."""
         if self._timer is not None:
             self._timer.cancel()
 
     def look(self) -> None:
-        """Ask, give up, or wait; then look again when there is something to do next."""
+        """Ask, give up, or wait; then set the timer for the next step."""
         now, heard_at = self._loop.time(), self._link.heard_at
         if self._asked_at is not None and self._asked_at <= heard_at:  # a clock may be coarse
             self._asked_at = None
@@ -102,6 +102,6 @@ class _Watch:
                 silence = f"no sign of life for {now - heard_at:.1f} s"
                 self._link.give_up(TimeoutError(silence))
                 return
-            # it may answer meanwhile, so look when the next question is due
+            # the camera may answer meanwhile, so look again when the next question is due
             when = min(end, now + self._quiet)
         self._timer = self._loop.call_at(when, self.look)

@@ -503,14 +503,14 @@ async def open_link(
     """Open a link; bounded by the caller's deadline.
 
     Args:
-        protocol: makes the machine.
+        protocol: function that makes the machine.
         dialects: one, or several that begin a session alike.
         transport: TCP or UDP.
         host: the camera's name or address.
         port: port of the camera.
         name: name of the camera in logs.
         max_length: bytes of the largest payload that is accepted.
-        trace: called with every frame.
+        trace: function that is called with every frame.
         liveness_timeout: see :class:`Link`.
 
     Raises:

@@ -45,7 +45,7 @@ class OneThread:
     async def close(self) -> None:
         """End the thread when it has finished. Idempotent.
 
-        Cancellation: the thread ends all the same.
+        Cancellation: the thread ends nevertheless.
         """
         pool, self._pool = self._pool, None
         if pool is not None:

@@ -1,4 +1,4 @@
-"""PCD files, version 0.7: what PCL and others write, and our own.
+"""Read and write PCD files, version 0.7, as PCL and others write them.
 
 Source: the Point Cloud Library's document of the PCD file format; for the compression, Marc
 Lehmann's LibLZF 3.6.
@@ -37,14 +37,14 @@ TYPES: Final = {
     **{("U", size): f"<u{size}" for size in (1, 2, 4, 8)},
     **{("F", size): f"<f{size}" for size in (4, 8)},
 }
-"""numpy's type for each TYPE and SIZE."""
+"""NumPy's type for each TYPE and SIZE."""
 
 MAX_UNPACKED_BYTES: Final = 1 << 30
-"""Largest number of bytes that compressed points may unpack to, as many as an uncompressed file
-has."""
+"""Largest number of bytes that compressed points may unpack to, as many as an uncompressed file may
+have."""
 
 COLOURS: Final = ("rgb", "rgba")
-"""Fields of 4 bytes that are a colour, blue in the lowest byte; as a float its bits are meant."""
+"""Fields of 4 bytes with a colour, blue in the lowest byte; in a float its bits are the colour."""
 
 PADDING: Final = "_"
 """Name of fields for padding, which are not read and may come more than once."""
@@ -53,10 +53,10 @@ PADDING: Final = "_"
 @dataclass(frozen=True, slots=True)
 class _PcdHeader:
     names: Sequence[str]
-    types: Sequence[str]  # numpy's
-    counts: Sequence[int]  # numbers of each
+    types: Sequence[str]  # NumPy's types
+    counts: Sequence[int]  # number of values of each field
     points: int
-    data: str  # ascii, binary, binary_compressed
+    data: str  # form of the data: ascii, binary, binary_compressed
     start: int  # offset of the first row
 
 
@@ -141,9 +141,9 @@ def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 
 
 def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
-    """Return columns that come one after the other, and compressed."""
+    """Return columns that are stored one after the other, and compressed."""
     size = head.points * _row(head).itemsize
-    if size > MAX_UNPACKED_BYTES:  # LZF's 3 bytes can stand for 264
+    if size > MAX_UNPACKED_BYTES:  # 3 bytes of LZF can stand for 264
         raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
@@ -164,16 +164,16 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 
 
 def unpacked(data: bytes, size: int) -> bytes:
-    """Return LZF-packed data unpacked; raise BadTableError unless that has the size given."""
+    """Unpack LZF-packed data; raise BadTableError unless the result has the given size."""
     out, place, end = bytearray(), 0, len(data)
     while place < end and len(out) <= size:
         control, place = data[place], place + 1
-        if control < 32:  # so many bytes and one as they are
+        if control < 32:  # that many bytes plus one, uncompressed
             out += data[place : place + control + 1]
             place += control + 1
             continue
         length = control >> 5
-        if length == 7 and place < end:  # a longer one
+        if length == 7 and place < end:  # a longer copy
             length, place = length + data[place], place + 1
         if place >= end:
             break
@@ -182,7 +182,7 @@ def unpacked(data: bytes, size: int) -> bytes:
         if begin < 0:
             raise BadTableError("a place in what is unpacked", f"{-begin} bytes before it")
         length += 2
-        part = out[begin : begin + length]  # which may reach into what it makes
+        part = out[begin : begin + length]  # which may overlap with its own output
         out += (part * (length // len(part) + 1))[:length]
     if len(out) != size or place != end:
         raise BadTableError(f"{end} bytes that unpack to {size}", f"{place} to {len(out)}")
@@ -209,7 +209,7 @@ KNOWN: Final = (
 
 
 def write(cloud: Cloud, text: bool) -> bytes:
-    """Return a cloud as a file, as PCL has them: colours as a float's bits, in text as a number."""
+    """Return a cloud as a file in PCL's form: colours as a float's bits, in text as a number."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
     if cloud.colours is not None:
         red, green, blue = cloud.colours.T.astype(np.uint32)

@@ -1,4 +1,4 @@
-"""A region of a depth map: how far it is, and how it looks."""
+"""Measure the distance of a region of a depth map, and show its small differences."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DepthArea: TypeAlias = "tuple[int, int, int, int] | Sequence[tuple[float, float]] | NDArray[Any]"
-"""A box ``(x, y, width, height)``, a polygon (N, 2) of ``x, y``, or a mask (H, W) of bool; pixels,
-which count from the middle of the upper left one."""
+"""A box ``(x, y, width, height)``, a polygon (N, 2) of ``x, y``, or a mask (H, W) of bool; in
+pixels from the middle of the upper left one."""
 
 OF_A_SIGMA: Final = 1.4826
-"""Sigmas that the median of the absolute deviations is, of normal noise."""
+"""Standard deviation of normal noise, as a multiple of the median of its absolute deviations."""
 
 OF_A_MEDIAN: Final = math.pi / 2 - 1
-"""By how much of one pixel's the variance of a median is more than that of a mean, of normal noise
-that each pixel has for itself; smooth noise adds next to nothing to it."""
+"""Excess of a median's variance over a mean's, in parts of one pixel's variance, for normal noise
+that is independent in each pixel; smooth noise adds next to nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,12 +35,12 @@ class RegionDepth:
     """The depth of a region, and its errors.
 
     Attributes:
-        median: metres.
-        sigma: standard deviation of ``median``, metres, of noise alone.
+        median: median of the depths, metres.
+        sigma: standard deviation of ``median`` by noise alone, metres.
         spread: standard deviation of one pixel, metres, by the median of the deviations: single
-            wild ones do not count; a slope does.
-        count: pixels with a depth.
-        pixels: pixels of the region.
+            outliers do not count; a slope does.
+        count: number of pixels with a depth.
+        pixels: number of pixels of the region.
     """
 
     median: float
@@ -62,17 +62,17 @@ def region_depth(
 
     Args:
         depth: (H, W): float in metres, or uint16 in steps of ``scale``.
-        region: a box, a polygon or a mask; None: all of it. What lies outside of the map is no
-            part of it.
+        region: a box, a polygon or a mask; None: the whole map. Parts outside of the map do not
+            count.
         scale: metres of a step of uint16.
-        shared: pixels whose noise is one and the same, for ``sigma``: 1 where each has its own;
-            :attr:`SpatialFilter.shared` after such a filter (holes make it less: ``sigma`` is then
-            told too large, by a fifth where 5 % are holes). A matcher that looks at windows shares
-            about as many as its window has.
+        shared: number of pixels that share the same noise, for ``sigma``: 1 if each has its own;
+            :attr:`SpatialFilter.shared` after such a filter (holes make it less: then ``sigma`` is
+            too large, by a fifth with 5 % of holes). A matcher by windows shares about as many as
+            its window has.
 
     Raises:
-        ConfigurationError: no region, or ``shared`` is below 1.
-        FrameFormatError: no pixel there has a depth, or the array is no map of depth.
+        ConfigurationError: the region is not valid, or ``shared`` is below 1.
+        FrameFormatError: no pixel of the region has a depth, or the array is no map of depth.
     """
     if not (shared >= 1 and math.isfinite(shared)):
         raise ConfigurationError(
@@ -87,7 +87,8 @@ def region_depth(
         )
     median = float(np.median(there))
     spread = OF_A_SIGMA * float(np.median(np.abs(there - median)))
-    variance = min(1.0, (shared + OF_A_MEDIAN) / there.size)  # of the median, in pixels'
+    # variance of the median, in parts of a pixel's
+    variance = min(1.0, (shared + OF_A_MEDIAN) / there.size)
     return RegionDepth(
         median=median,
         sigma=spread * math.sqrt(variance),
@@ -100,22 +101,22 @@ def region_depth(
 def equalize_depth(
     depth: NDArray[Any], region: DepthArea | None = None, *, scale: float = MILLIMETRE
 ) -> NDArray[np.uint8]:
-    """Return a picture of a region in which small differences are to be seen.
+    """Return a picture of a region that shows small differences.
 
-    Each of its greys has as many pixels as the others: the nearest is 255, the farthest 1. Holes,
-    and in the box around a polygon or a mask whatever is outside, are black, 0.
+    All its greys have the same number of pixels: the nearest is 255, the farthest 1. Holes, and
+    pixels of the box outside of a polygon or a mask, are black, 0.
 
     Args:
         depth: (H, W): float in metres, or uint16 in steps of ``scale``.
-        region: a box, a polygon or a mask; None: all of it.
+        region: a box, a polygon or a mask; None: the whole map.
         scale: metres of a step of uint16.
 
     Returns:
         (h, w) of the box around the region.
 
     Raises:
-        ConfigurationError: no region, or all of it is outside.
-        FrameFormatError: no map of depth.
+        ConfigurationError: the region is not valid, or wholly outside of the map.
+        FrameFormatError: the array is no map of depth.
     """
     metres = as_metres(depth, scale)
     mask = _mask(region, metres.shape)
@@ -131,7 +132,7 @@ def equalize_depth(
 
 
 def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return levels as greys of 1 to 255, as many pixels of each: by how many are below."""
+    """Return levels as greys from 1 to 255, with as many pixels of each grey."""
     _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
     upto = np.cumsum(counts)
     rest = upto[-1] - upto[0]

@@ -190,7 +190,7 @@ class StereoDepth:
     async def close(self) -> None:
         """Close both cameras and end the thread. Idempotent.
 
-        Cancellation: as of :meth:`FrameSource.close`; the thread ends all the same.
+        Cancellation: as of :meth:`FrameSource.close`; the thread ends nevertheless.
         """
         self._closed = True
         try:

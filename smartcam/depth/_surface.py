@@ -1,4 +1,4 @@
-"""The plane about each point of a cloud, and what planes that are known so well determine."""
+"""Fit a plane about each point of a cloud, and find the motions that planes leave undetermined."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 ROWS: Final = 1 << 15
-"""Points at a time; each has its neighbours in memory."""
+"""Number of points at a time; the neighbours of each are in memory."""
 
 MIN_INFORMATION_FACTOR: Final = 12.0
 """Factor by which a direction's information must exceed that from noise of the normals alone.
@@ -30,7 +30,7 @@ class SurfacePlanes(NamedTuple):
     Attributes:
         normals: (N, 3), of length 1.
         along: (N, 3, 2), two directions in each plane.
-        tilts: (N, 2), variances of the normal's turn towards each of them, radians squared.
+        tilts: (N, 2), variances of the normal's turn towards each of ``along``, radians squared.
     """
 
     normals: Array
@@ -45,7 +45,7 @@ class SurfacePlanes(NamedTuple):
 def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
     """Return the planes about points of an index: through their nearest, themselves among them.
 
-    ``tree``: of all points.
+    ``tree``: search tree of all points.
     """
     found = []
     for start in range(0, len(index), ROWS):
@@ -77,8 +77,8 @@ def slopes(arms: Array, directions: Array) -> Array:
 def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     """Return the steps (K, 6), turn in radians and shift in metres, that planes leave open.
 
-    ``arms`` (N, 3): of the points on the planes, from their centre, about which the steps turn.
-    Each moves the points by one metre in the mean.
+    ``arms`` (N, 3): vectors to the points on the planes from their centre, about which the steps
+    turn. Each step moves the points by one metre in the mean.
     """
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     scaled = arms / reach
@@ -88,11 +88,11 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     for axis in range(2):
         part = slopes(scaled, planes.along[:, :, axis]) * np.sqrt(planes.tilts[:, axis, None])
         noise += part.T @ part
-    # What rounds float32 is noise, too: a flat cloud without any has no tilts.
+    # Rounding to float32 is noise, too: a flat cloud without any has no tilts.
     noise += 1e-7 * np.trace(information) * np.eye(6)
     ratios, steps = load("scipy.linalg").eigh(information, noise)
     basis, _ = np.linalg.qr(steps[:, ratios < MIN_INFORMATION_FACTOR])
-    # Any mixture of open steps is open: turns are told first, and shifts as what has no turn.
+    # Any mixture of open steps is open: turns come first, then shifts, which have no turn.
     apart, _, _ = np.linalg.svd(basis.T[:, :3])
     found: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
     return found

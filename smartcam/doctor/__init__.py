@@ -184,7 +184,7 @@ async def examine(
         timeout: seconds for each step: connect (default 10), request (5), switch (10), trigger (5).
         seconds: time for which a camera is watched that sends results by itself.
         count: number of triggers.
-        trace: called with everything that goes over the wire.
+        trace: function that is called with everything that goes over the wire.
 
     Raises:
         ConfigurationError: an address, a layout or a number cannot work; nothing was tried.

@@ -65,7 +65,7 @@ async def open_port(
         address: address of the host.
         port: number of the port.
         timeout: seconds until it is open, and as many again to hear.
-        enough: called with all bytes that came; True ends the hearing.
+        enough: function that is called with all bytes that came; True ends the hearing.
 
     Cancellation: the connection is closed.
     """

@@ -1,4 +1,4 @@
-"""Checks that look and ask, and change nothing: status, application, run state, clock."""
+"""Check status, application, run state and clock, without changing anything."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from smartcam.doctor._findings import Severity
 
 QUERIES = 30
-"""Requests for the round-trip time: enough for a median, done in a moment."""
+"""Number of requests for the round-trip time: enough for a median, and fast."""
 
 QUERIES_WITHIN = 3.0
-"""Seconds after which no further request is sent: on a slow link fewer must do."""
+"""Seconds after which no further request is sent: on a slow link fewer must suffice."""
 
 SLOW_ROUND_TRIP_TIME = 0.05
-"""Seconds of round trip from which on a hint is given: on a local network it takes milliseconds."""
+"""A round trip of this many seconds gives a hint: on a local network it takes milliseconds."""
 
 MAX_SEEN = 1000
-"""Statuses kept while watching; the last ones."""
+"""Largest number of statuses kept while watching; the last ones stay."""
 
 CLOCK_MAY_DIFFER = timedelta(minutes=1)
 """Time by which a camera's clock may be off: a day or two of drift since it was set."""
@@ -39,7 +39,7 @@ CLOCK_MAY_DIFFER = timedelta(minutes=1)
 
 
 class _Complaint(NamedTuple):
-    """A status bit that says something is wrong."""
+    """A status bit that reports trouble."""
 
     bit: Status
     severity: Severity
@@ -89,7 +89,7 @@ _STICKY = " The bit stays set until the errors are reset: await camera.reset_err
 
 
 async def look_at_status(exam: Examination) -> None:
-    """Check ``status``: the bits that say that something is wrong."""
+    """Check ``status``: the bits that report trouble."""
     camera = exam.patient
     capable = camera.capabilities
     status = await camera.query_status() if capable.get_status else camera.status
@@ -156,16 +156,16 @@ _RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
 async def watch(exam: Examination) -> None:
     """Check ``run state``: stopped, busy, waiting for triggers, or running free.
 
-    A camera that waits for a trigger is watched only where none will be sent.
+    A camera that waits for a trigger is watched only if none will be sent.
     """
     camera, witness, seconds = exam.patient, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # that was told, and explains everything
+        return  # this was reported, and explains everything
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # perhaps while it was watched
+    stopped = _is_stopped(seen[-1])  # perhaps while the camera was watched
     if any(_waits(one) for one in seen) and not stopped:
         exam.may_trigger = True
         came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
@@ -204,7 +204,7 @@ def _say_free(exam: Examination, details: dict[str, Any]) -> None:
 
 
 async def _watch(exam: Examination, seconds: float) -> list[Status]:
-    """Return every status of so many seconds, the present one first."""
+    """Return every status within some seconds, the present one first."""
     seen: deque[Status] = deque(maxlen=MAX_SEEN)
 
     def note(status: Status) -> bool:
@@ -212,7 +212,7 @@ async def _watch(exam: Examination, seconds: float) -> list[Status]:
         return False
 
     exam.witness.forget_arrivals()
-    # held while it watches: results are made where somebody takes them
+    # held while watching, since results are made only if somebody takes them
     async with exam.patient.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
             await exam.patient.wait_status(note, timeout=seconds)
@@ -250,7 +250,7 @@ def _waits(status: Status) -> bool:
 async def look_at_clock(exam: Examination) -> None:
     """Check ``clock``: whether it shows this machine's time, local or UTC.
 
-    It carries no time zone, and a restart loses it.
+    The clock has no time zone, and a restart loses it.
 
     Source: BVS ID guide p. 231 (published); for the others inferred.
     """
@@ -294,7 +294,7 @@ async def look_at_clock(exam: Examination) -> None:
 
 
 def _rounded(off: timedelta) -> str:
-    """Return a time in whole seconds, or in whole days where it is more than a week."""
+    """Return a time in whole seconds, or in whole days if it is more than a week."""
     if off > timedelta(days=7):
         return f"{off.days} days"
     return str(timedelta(seconds=round(off.total_seconds())))

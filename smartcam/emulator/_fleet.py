@@ -30,14 +30,14 @@ class EmulatedFleet(Server):
 
     Args:
         scenarios: the path of a scenario file, or scenarios with different names.
-        host: address to listen on; nothing but this.
-        transport: ``"tcp"`` or ``"udp"``; default what each scenario says.
+        host: address to listen on; without a port.
+        transport: ``"tcp"`` or ``"udp"``; by default that of each scenario.
         dialect: name of the wire dialect; default what each scenario says.
-        quirks: fields of :class:`~smartcam.emulator.Quirks` that go before those of each scenario.
-        clock: the time of all; default real time.
+        quirks: fields of :class:`~smartcam.emulator.Quirks` that override those of each scenario.
+        clock: clock of all cameras; by default real time.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
         MissingExtraError: a file was given and PyYAML is not installed.
     """
 
@@ -75,7 +75,7 @@ class EmulatedFleet(Server):
         """Return a camera.
 
         Raises:
-            ConfigurationError: no camera is called so.
+            ConfigurationError: no camera has this name.
         """
         try:
             return self._cameras[name]
@@ -93,16 +93,16 @@ class EmulatedFleet(Server):
 
     @property
     def cameras(self) -> dict[str, WireCamera]:
-        """All by name, in order; a new mapping each time."""
+        """All cameras by name, in order; a new mapping each time."""
         return dict(self._cameras)
 
     @property
     def urls(self) -> dict[str, str]:
-        """Their addresses by name."""
+        """The cameras' addresses by name."""
         return {name: camera.url for name, camera in self._cameras.items()}
 
     async def start(self) -> None:
-        """Start all; does nothing where they are started already.
+        """Start all cameras; does nothing if they are started already.
 
         Raises:
             ConfigurationError: one of the cameras cannot listen; none is started.
@@ -115,5 +115,5 @@ class EmulatedFleet(Server):
             self._stack = stack.pop_all()
 
     async def stop(self) -> None:
-        """Stop all. Harmless when done twice."""
+        """Stop all cameras. Harmless when called twice."""
         await self._stack.aclose()

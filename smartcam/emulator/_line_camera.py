@@ -1,4 +1,4 @@
-"""Emulated cameras that speak in lines of text: the base for those of a plug-in, and In-Sight's."""
+"""Emulate cameras that use lines of text: the base for those of plug-ins, and for In-Sight's."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT_BYTES = 1 << 16
-"""Largest number of bytes of lines that may wait behind the one under way; more bytes are not read
+"""Largest number of bytes of lines that may wait after the current one; further bytes are not read
 yet."""
 
 MAX_AGENDA = 10_000
@@ -48,16 +48,16 @@ _FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", 
 """The fields of a scenario that apply to every camera of this kind."""
 
 _STATE = frozenset({"active", "running"})
-"""The fields of a scenario that apply to cameras with programs only."""
+"""Fields of a scenario that apply only to cameras with programs."""
 
 
 class LineClient:
-    """A client of an emulated camera that speaks in lines.
+    """A client of an emulated camera that uses lines.
 
     Attributes:
         peer: address and port of the client.
-        heard: True once the client has sent the line that begins a session; where the dialect has
-            none, any line that the dialect knows.
+        heard: True once the client has sent the line that begins a session; if the dialect has
+            none, any line of the dialect.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
@@ -66,11 +66,11 @@ class LineClient:
         self._camera = camera
         self._link = link
         self._server = server
-        self._row = 0  # of the line under way
+        self._row = 0  # state of the current line
         self._kept = False
 
     def keep(self) -> Self:
-        """Return a client that answers the line under way later; the next line is heard now."""
+        """Return a client that answers the current line later; the next line is read now."""
         self._kept = True
         kept = copy.copy(self)
         self._kept = False
@@ -83,39 +83,39 @@ class LineClient:
         return self._link.closed
 
     def pack(self, text: str) -> bytes:
-        """Return an answer to the line under way as the camera says it."""
+        """Return an answer to the current line in the camera's form."""
         return self._camera.lines.data(text)
 
     def say(self, text: str) -> None:
-        """Say a line that answers nothing."""
+        """Send a line that is not an answer."""
         self.say_bytes(self._camera.lines.data(text), row=0)
 
     def answer(self, text: str | None) -> None:
-        """Answer the line under way, None with silence; the next one is heard then."""
+        """Answer the current line, None without sending anything; then the next one is read."""
         if text is not None:
             self.say_bytes(self.pack(text))
         if not self._kept:
             self.go_on()
 
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
-        """Say bytes as they are: a part of an answer, or a prompt."""
+        """Send bytes unchanged: a part of an answer, or a prompt."""
         if not self._link.closed:
             message = SaidLine(row=self._row if row is None else row, data=data)
             self._camera.say(self._link, message)
 
     def say_again(self, data: bytes) -> None:
-        """Say bytes that a camera once said as the answer to the line under way."""
+        """Send recorded bytes of a camera as the answer to the current line."""
         self.say_bytes(data)
 
     def go_on(self) -> None:
-        """End the line under way, and hear the next."""
+        """End the current line, and read the next."""
         self._server.busy = False
         if not self._server.going and not self._link.closed:
             with self._camera.step():
                 self._link.feed(b"")
 
     def hide_next(self) -> None:
-        """Keep the next line out of the log: it is a password."""
+        """Keep the next line, a password, out of the log."""
         self._server.secret = True
 
     def close(self, reason: str) -> None:
@@ -123,7 +123,7 @@ class LineClient:
         self._link.close(reason)
 
     def end(self, reason: str) -> None:
-        """End the connection in order, behind what was said; nothing more is heard."""
+        """Close the connection after the sent lines; nothing more is read."""
         self._link.flush()
         self._link.part("close", reason)
 
@@ -134,7 +134,7 @@ class LineClient:
 
 
 class LineCamera(WireCamera):
-    """An emulated camera that hears lines, from several clients, and answers each with a line.
+    """An emulated camera that reads lines from several clients, and answers each with a line.
 
     Subclass it for a camera of your own, and name the class in ``Protocol(emulator=...)``::
 
@@ -144,31 +144,30 @@ class LineCamera(WireCamera):
             def answer(self, line: str) -> str | None:
                 return {"HELLO": "ACME", "STATE": "run"}.get(line, "what?")
 
-    A subclass with options of its own takes ``**options`` beside them and hands these on. A client
-    has one line under way; the next ones wait. Everything is called in the event loop's thread.
+    A subclass with its own options takes ``**options``, too, and passes these on. A client has one
+    current line; the next ones wait. Everything is called in the event loop's thread.
 
     Args:
         host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         name: name of the camera in logs.
-        clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
+        clock: clock of the camera; a :class:`ManualClock` in tests. Default: real time.
         seed: seed of the random numbers that a timeline uses.
         faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
-            of their fields with ``kind``. ``on`` names a request of the dialect's rows, or what
-            answers one.
-        timeline: what happens by itself, and when: cues, or mappings of their fields.
+            of their fields with ``kind``. ``on`` names a request of the dialect's rows, or its
+            answer.
+        timeline: events without a client: cues, or mappings of their fields.
 
     Attributes:
         protocol: protocol of the camera, which speaks its first dialect.
-        device: what an operator can do, where a subclass puts anything there: ``start()``,
-            ``stop()``, ``trigger()``, ``reboot(seconds)``,
-            ``switch_application(id, running=False)``. Faults, scenarios and the page find what
-            there is.
-        fault_kinds: the faults that it can do.
-        lines: how lines are read and written.
+        device: operator's actions, if a subclass defines any: ``start()``, ``stop()``,
+            ``trigger()``, ``reboot(seconds)``, ``switch_application(id, running=False)``. Faults,
+            scenarios and the page use those that exist.
+        fault_kinds: the faults that the camera supports.
+        lines: codec of the lines.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     protocol: Protocol
@@ -192,7 +191,7 @@ class LineCamera(WireCamera):
         self._clients: dict[ClientLink, LineClient] = {}  # the oldest stands first
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._spoken_to: dict[ClientLink, None] = {}  # links that have something to write
+        self._spoken_to: dict[ClientLink, None] = {}  # links with lines to write
         cues = [validated(Cue, one, f"cue {at}") for at, one in enumerate(timeline, start=1)]
         self.lines: LineCodec = self.make_codec()
         super().__init__(
@@ -230,7 +229,7 @@ class LineCamera(WireCamera):
         """Return a camera of a scenario; arguments win over the scenario's fields.
 
         Raises:
-            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+            ConfigurationError: an argument is wrong, or not supported by such a camera.
         """
         options = dict(plan.options)
         if plan.active is not None or plan.running:
@@ -254,7 +253,7 @@ class LineCamera(WireCamera):
 
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+        """Return the place of something unsupported in a scenario, and the reason; or None."""
         fields = _FIELDS | (_STATE if cls.state_options(None, running=True) else frozenset())
         for name in sorted(plan.changed() - fields):
             if name != "dialect" or plan.dialect not in cls.protocol.dialects:
@@ -267,7 +266,7 @@ class LineCamera(WireCamera):
         return camera.mistake_in(plan.timeline)
 
     def mistake_in(self, cues: Sequence[Cue]) -> Mistake | None:
-        """Return the place in a timeline of what it cannot do, and why; or None."""
+        """Return the place of something unsupported in a timeline, and the reason; or None."""
         for number, cue in enumerate(cues):
             if cue.entering is not None and cue.entering not in self.states:
                 able = ", ".join(sorted(state.value for state in self.states))
@@ -280,9 +279,9 @@ class LineCamera(WireCamera):
 
     @classmethod
     def image_answer(cls, image: NDArray[np.uint8]) -> bytes | None:
-        """Return the bytes that answer a line that asks for a picture; None: it has none.
+        """Return the answer to a request for a picture; None: the camera has no pictures.
 
-        A replay asks for it where a picture was recorded and the line was not.
+        A replay uses it if a picture was recorded and the line was not.
 
         Args:
             image: (H, W), the brightness.
@@ -290,10 +289,10 @@ class LineCamera(WireCamera):
         return None
 
     def make_codec(self) -> LineCodec:
-        """Return the lines it speaks: those of its protocol's first dialect.
+        """Return the codec of its lines, by its protocol's first dialect.
 
         Raises:
-            ConfigurationError: the protocol protocol does not speak in lines.
+            ConfigurationError: the protocol does not use lines.
         """
         dialect = next(iter(self.protocol.dialects.values()))
         if not isinstance(dialect, LineDialect):
@@ -313,24 +312,24 @@ class LineCamera(WireCamera):
     # ------------------------------------------------------------------ for subclasses
 
     def answer(self, line: str) -> str | None:
-        """Return the answer to a line, None for silence; override this or :meth:`hear`."""
+        """Return the answer to a line, None for none; override this or :meth:`hear`."""
         raise NotImplementedError(f"{type(self).__name__} says no answer()")
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Do what a line says, and call ``client.answer()`` once, now or later."""
+        """Carry out a line, and call ``client.answer()`` once, now or later."""
         client.answer(self.answer(line))
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Note a client's line as it came, before it is heard; nothing unless overridden."""
+        """Note a client's line as it came, before it is carried out; override to use it."""
 
     def greet(self, client: LineClient) -> None:
-        """Say something to a client that has just come; nothing unless overridden."""
+        """Greet a client that has just connected; override to send something."""
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do something later, by the camera's clock.
+        """Call a function later, by the camera's clock.
 
         Raises:
-            ConfigurationError: 10,000 things wait already.
+            ConfigurationError: 10,000 calls wait already.
         """
         if len(self._agenda) >= MAX_AGENDA:
             raise ConfigurationError(f"{self.name}: {MAX_AGENDA} things wait for their time")
@@ -342,7 +341,7 @@ class LineCamera(WireCamera):
 
     @property
     def url(self) -> str:
-        """Its address."""
+        """The camera's address."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{next(iter(self.protocol.schemes))}://{host}:{self.port}"
 
@@ -351,12 +350,12 @@ class LineCamera(WireCamera):
 
     @property
     def application_ids(self) -> list[int]:
-        """Ids of the programs on it; a subclass that has any says so."""
+        """Ids of the camera's programs; a subclass with programs overrides it."""
         return []
 
     @property
     def sessions(self) -> list[str]:
-        """Address and port of the clients that it serves, the oldest first."""
+        """Address and port of the served clients, the oldest first."""
         return [client.peer for link, client in self._clients.items() if self.serves(link)]
 
     # ------------------------------------------------------------------ links
@@ -396,18 +395,18 @@ class LineCamera(WireCamera):
         return kind is m.Connect or not self.lines.has(m.Connect)
 
     def serves(self, link: ClientLink) -> bool:
-        """Return True if the client on the link has begun a session."""
+        """Return True if the client of the link has begun a session."""
         client = self._clients.get(link)
         return client is not None and client.heard
 
     def lost(self, link: ClientLink) -> None:
-        """Forget a link that is gone; a second call does nothing."""
+        """Forget a lost link; a second call does nothing."""
         self._spoken_to.pop(link, None)
         if self._clients.pop(link, None) is not None:
             self._timeline.entered(DeviceState.DISCONNECTED)
 
     def say(self, link: ClientLink, message: SaidLine) -> None:
-        """Say something to a link; written at the end of the step."""
+        """Send a message to a link; it is written at the end of the step."""
         with self.step():
             faults = self._provoke(self.queue.device_said, message)
             link.say(message)
@@ -422,7 +421,7 @@ class LineCamera(WireCamera):
             heapq.heappop(self._agenda)[2]()
 
     def _collect(self) -> None:
-        pass  # what is said goes to its link at once
+        pass  # messages go to their links at once
 
     def _settle(self) -> None:
         for link in list(self._spoken_to):
@@ -434,7 +433,7 @@ class LineCamera(WireCamera):
         self._timer.set(self._due())
 
     def _due(self) -> int | None:
-        """Return when something happens by itself, nanoseconds of the clock; None for never."""
+        """Return the time of the next scheduled call, nanoseconds of the clock; None for never."""
         return self._agenda[0][0] if self._agenda else None
 
     def _ends(self) -> None:

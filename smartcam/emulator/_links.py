@@ -248,7 +248,7 @@ class TcpListener(Listener):
         return self._acceptor.enter(link, link.address)
 
     def leave(self, link: _TcpLink) -> None:
-        """Forget a connection that has ended; harmless when said twice."""
+        """Forget a connection that has ended; harmless when called twice."""
         self._acceptor.leave(link)
 
     def unseated(self, link: _TcpLink) -> None:

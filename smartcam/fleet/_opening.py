@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class FleetOptions(TypedDict, total=False):
-    """Options of all cameras of a fleet, as :class:`~smartcam.settings.CameraSettings` has them."""
+    """Options of all cameras of a fleet; see :class:`~smartcam.settings.CameraSettings`."""
 
     interpret_as: Spec | Mapping[int, Spec]
     calibration: Calibration | Mapping[int, Calibration | None] | None
@@ -41,7 +41,7 @@ class FleetOptions(TypedDict, total=False):
 
 
 def serve(file: str | Path | FleetFile) -> FleetServer:
-    """Return an agent that shares cameras, to be run by ``async with``.
+    """Return an agent that shares cameras while ``async with`` runs.
 
     ::
 
@@ -49,10 +49,10 @@ def serve(file: str | Path | FleetFile) -> FleetServer:
             print(server.urls)
 
     Args:
-        file: path of a fleet file, or what stands in one.
+        file: path of a fleet file, or its contents.
 
     Raises:
-        ConfigurationError: the file is wrong; says where.
+        ConfigurationError: the file is wrong; the text says where.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
     return FleetServer(file)
@@ -64,18 +64,18 @@ def open(
     connect_timeout: float = 10.0,
     **options: Unpack[FleetOptions],
 ) -> Fleet:
-    """Return a fleet, to be opened by ``async with``.
+    """Return a fleet, which ``async with`` opens.
 
     Args:
         place: the fleet's URL, ``fleet://HOST[:PORT]``; or a fleet file, whose agent and cameras
-            then are in this process, without an engine, for this program only.
-        connect_timeout: seconds for coming to it and meeting its cameras.
+            then are in this process, without an engine, and only for this program.
+        connect_timeout: seconds for connecting to the fleet and finding its cameras.
         **options: ``interpret_as``, ``calibration``, ``y_down``, ``lenient``, ``switch_timeout``,
-            ``request_timeout``, ``reconnect``, as :func:`smartcam.connect` has them.
+            ``request_timeout``, ``reconnect``, as for :func:`smartcam.connect`.
 
     Raises:
         ConfigurationError: the URL, the file or an option cannot work.
-        MissingExtraError: a URL, and the extra ``fleet`` is not installed.
+        MissingExtraError: a URL was given, and the extra ``fleet`` is not installed.
     """
     for name in options:
         if name not in FleetOptions.__annotations__:
@@ -102,7 +102,7 @@ def open(
 SESSIONS_OWN = frozenset(
     {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
 )
-"""Options of the session with the camera: the agent has it, and its file says them."""
+"""Options of the session with the camera, which belong into the agent's file."""
 
 
 def fleet_camera(
@@ -112,7 +112,7 @@ def fleet_camera(
 
     Raises:
         ConfigurationError: the URL or an option cannot work.
-        UnsupportedError: an option is the session's, which is the agent's.
+        UnsupportedError: an option concerns the session, which belongs to the agent.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
     address = FleetAddress.parse(url)

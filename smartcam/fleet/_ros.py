@@ -1,4 +1,4 @@
-"""The cameras of a fleet as nodes of ROS 2, on the fleet's own session of Zenoh."""
+"""Run a fleet's cameras as nodes of ROS 2, on the fleet's own session of Zenoh."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 TIMEOUT = 10.0
-"""Seconds for coming to the fleet."""
+"""Seconds for connecting to the fleet."""
 
 
 MEET_TIMEOUT = 2.0
-"""Seconds that a camera's agent is waited for before its node comes."""
+"""Seconds to wait for a camera's agent before its node is created."""
 
 
 class _SeenCamera(FleetCamera[Any]):
-    """A camera that expects no application: results of all of them are to be seen in ROS.
+    """A camera that expects no application, since ROS gets the results of all.
 
-    Its calibration is for those applications whose results are localizations.
+    Its calibration applies only to applications whose results are localizations.
     """
 
     def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
@@ -56,7 +56,7 @@ class _SeenCamera(FleetCamera[Any]):
 
 
 class _Cameras(Fleet):
-    """A fleet whose cameras have calibrations of their own, and are seen in ROS."""
+    """A fleet whose cameras have their own calibrations, and are nodes of ROS."""
 
     def __init__(self, *given: Any, calibrations: Mapping[str, Calibration]) -> None:
         self._calibrations = calibrations
@@ -73,22 +73,23 @@ class RosFleet(Server):
     """A node for each camera of a fleet, as they come and go.
 
     Args:
-        bus: an end of the fleet's bus, open; its session carries ROS, too.
+        bus: open end of the fleet's bus; its session carries ROS, too.
         fleet: the fleet's name; None for the only one that is there.
         address: address of the fleet.
-        section: settings of how all cameras are seen in ROS.
-        cameras: settings of single cameras, by name.
+        section: settings of all cameras' nodes.
+        cameras: settings of single cameras' nodes, by name.
         settings: settings that the agent gives the cameras' sessions, by name, where known.
         frames: sources of the cameras' frames, by name, as parameters of v4l2_camera.
-        calibrations: calibrations of cameras whose results are to be the robot's, by name.
+        calibrations: calibrations of cameras whose results are turned into the robot's frame, by
+            name.
         controls: functions that return the open source of a camera's frames, whose device has
             controls, by name.
         places: hand-eye calibrations, which say where cameras are, by name.
-        wanted: whether a camera, of an agent, is to be seen.
-        desks: calibrations that the agent's bus has, too; None if there is no folder for them.
+        wanted: function that returns whether a camera of an agent gets a node.
+        desks: calibrations that are also on the agent's bus; None if there is no folder for them.
 
     Raises:
-        ConfigurationError: there is no such domain; or no rclpy, where it is wanted.
+        ConfigurationError: the domain is not valid, or rclpy is wanted and not installed.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -110,7 +111,7 @@ class RosFleet(Server):
     ) -> None:
         self._desks = desks
         self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
-        self._settings, self._frames = settings or {}, frames or {}  # others come into them
+        self._settings, self._frames = settings or {}, frames or {}  # filled by other methods
         self._places, self._controls = places or {}, controls or {}
         self.context: RosContext | NativeContext = _context(bus, section)
         self._fleet = _Cameras(
@@ -121,7 +122,7 @@ class RosFleet(Server):
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Meet the fleet, and begin.
+        """Connect to the fleet, and start its nodes.
 
         Raises:
             ConnectFailedError: no agent of the fleet answers.
@@ -135,13 +136,13 @@ class RosFleet(Server):
         self._task = asyncio.get_running_loop().create_task(self._follow(events))
 
     async def _follow(self, events: Any) -> None:
-        """Have a node for each camera that comes; one that goes stays, and says so."""
+        """Create a node for each new camera; that of a lost camera stays, and reports this."""
         async for event in events:
             if isinstance(event, CameraJoined) and self._wanted(event.agent, event.camera):
                 await self._show(event.camera)
 
     async def _show(self, name: str) -> None:
-        """Have a camera seen; a node whose camera was given up gets the one that came for it."""
+        """Create a camera's node; a node whose camera was given up gets the new camera."""
         camera = self._fleet[name]
         if self._of.get(name) is camera:
             return
@@ -163,7 +164,7 @@ class RosFleet(Server):
 
     @staticmethod
     async def _meet(camera: FleetCamera[Any]) -> None:
-        """Wait a moment for what its agent says of it: whether it has frames."""
+        """Wait briefly for the agent's answer, which says whether the camera has frames."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(MEET_TIMEOUT):
                 while not camera.met:  # noqa: ASYNC110 - nothing tells of it
@@ -202,7 +203,7 @@ class RosFleet(Server):
         return sorted(one.node.full_name for one in self.nodes.values())
 
     async def stop(self) -> None:
-        """Take all nodes back. Idempotent, bounded."""
+        """Close all nodes. Idempotent, bounded."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -223,10 +224,10 @@ def _context(bus: ZenohEnd, section: RosSection) -> RosContext | NativeContext:
 
 @contextlib.asynccontextmanager
 async def ros_of(address: FleetAddress, section: RosSection) -> AsyncIterator[RosFleet]:
-    """Have all cameras of a fleet that is there already seen in ROS 2.
+    """Run nodes of ROS 2 for all cameras of a fleet that is already running.
 
     Raises:
-        ConnectFailedError: no bus, or no agent with a camera, within the time.
+        ConnectFailedError: no bus, or no agent with a camera, answers in time.
     """
     bus = ZenohEnd(address.link, SETTINGS)
     await bus.open(TIMEOUT)

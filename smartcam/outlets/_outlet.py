@@ -21,12 +21,13 @@ class OutletDesk:
     """The things that an outlet may ask of the process that has the cameras.
 
     Args:
-        columns: returns names, types and units of the values of a camera's application, by its
-            layout; empty if they are not known.
+        columns: function that returns names, types and units of the values of a camera's
+            application, by its layout; empty if they are not known.
         command: does a command and returns what is answered; None if commands are not allowed.
-        cameras: returns the names of the cameras, and whether each is emulated; None if that is not
-            known.
-        names: returns the names that a camera's applications have, with their numbers.
+        cameras: function that returns the names of the cameras, and whether each is emulated; None
+            if that is not known.
+        names: function that returns the names that a camera's applications have, with their
+            numbers.
     """
 
     def __init__(

@@ -56,11 +56,15 @@ class Outlets(Server):
     Args:
         section: settings by the outlet's name.
         folder: folder of relative paths: of spools, secrets, stores.
-        columns: returns names, types and units of an application's values, by its layout.
+        columns: function that returns names, types and units of an application's values, by its
+            layout.
         command: does a command for an outlet that takes them.
-        tell: called with an outlet's name and its trouble, and with "" when that is over.
-        cameras: returns the cameras' names, and whether each is emulated; None: not known.
-        names: returns the names that a camera's applications have, with their numbers.
+        tell: function that is called with an outlet's name and its trouble, and with "" when that
+            is over.
+        cameras: function that returns the cameras' names, and whether each is emulated; None: not
+            known.
+        names: function that returns the names that a camera's applications have, with their
+            numbers.
 
     Raises:
         ConfigurationError: the section is wrong.
@@ -129,7 +133,7 @@ class Outlets(Server):
             raise
 
     async def stop(self) -> None:
-        """End; what is not delivered stays in the spools. Harmless when done twice."""
+        """End; what is not delivered stays in the spools. Harmless when called twice."""
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
@@ -162,7 +166,8 @@ class Outlets(Server):
 
         Args:
             result: the result.
-            read: returns value and sequence number; called in a thread. None: as they are.
+            read: function that returns value and sequence number; called in a thread. None: as they
+                are.
         """
         made: list[tuple[Any, int | None, str]] = []
 

@@ -60,7 +60,8 @@ class Arrival(NamedTuple):
         number: number of the entry.
         at: time of arrival, seconds since 1970, UTC.
         size: bytes that it keeps.
-        make: returns kind, application and body of the entry; called in the spool's thread.
+        make: function that returns kind, application and body of the entry; called in the spool's
+            thread.
     """
 
     camera: str
@@ -76,8 +77,8 @@ class Pump:
     Args:
         outlet: the outlet.
         spool: spool of the outlet.
-        tell: called with why the far end or the disk does not take anything, and with "" when
-            they do again.
+        tell: function that is called with why the far end or the disk does not take anything, and
+            with "" when they do again.
 
     Attributes:
         trouble: reason for which nothing is delivered at the time; "" if all is well.
@@ -274,7 +275,7 @@ class Pump:
         try:
             found = await asyncio.shield(running)
         except asyncio.CancelledError:
-            await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang for ever
+            await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang forever
             if running.done() and running.exception() is None:
                 then(running.result())
             raise

@@ -293,8 +293,8 @@ class Protocol:
         default_port: port where a URL names none.
         models: camera models that speak it.
         dialects: the protocol's dialects by name.
-        machine: makes the client's machine of a link; of the dialects given, which begin a session
-            alike, it finds out which one the camera speaks.
+        machine: function that makes the client's machine of a link; of the dialects given, which
+            begin a session alike, it finds out which one the camera speaks.
         parameters: what else a URL may say, and what it is; ``user`` and ``password`` stand before
             the host there.
         detection: what a client tries that was told no dialect, the most probable first, each on a

@@ -77,8 +77,8 @@ class LineRow(NamedTuple):
         line: the line of the request, with the message's fields in braces: ``"PROGRAM
             {application}"``.
         answer: what the answer is; None for a request that is not answered.
-        read: makes it of the answer's line, or several messages of it; a ValueError or LookupError
-            says that it is no answer.
+        read: function that makes it of the answer's line, or several messages of it; a ValueError
+            or LookupError says that it is no answer.
         word: what its answer is known by, in a dialect that splits answers: by default, and always
             behind the first line of a script, the first word of the line; "" for an answer without
             a word of its own. A dialect with tickets needs none, but for what is said unasked.
@@ -387,7 +387,8 @@ class LineMachine:
         role: the client's.
         transport: TCP.
         max_length: bytes of an answer of several lines at most; one line is bounded by the dialect.
-        trace: called with each line in both directions, and with what broke the protocol.
+        trace: function that is called with each line in both directions, and with what broke the
+            protocol.
         kin: unused, there is one dialect.
 
     Raises:

@@ -279,10 +279,10 @@ def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
 
     Args:
         path: the file or folder.
-        note: called with what cannot be read, and why.
+        note: function that is called with what cannot be read, and why.
 
     Raises:
-        ConfigurationError: a file cannot be read, or is no recording of ours.
+        ConfigurationError: a file cannot be read, or is no recording of smartcam.
         RecordingError: the recording goes beyond a bound, or the disk fails.
     """
     for file in _files_in(path, None, None) if path.is_dir() else [path]:
@@ -439,7 +439,7 @@ class _Scan:
         """Yield everything that can be read; with ``states`` also what a camera was.
 
         Raises:
-            ConfigurationError: the file is no recording of ours.
+            ConfigurationError: the file is no recording of smartcam.
             RecordingError: the file goes beyond a bound, or the disk fails.
         """
         try:

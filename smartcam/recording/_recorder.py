@@ -425,7 +425,7 @@ class Recorder(Observer):
             source: open source.
             camera: name of the camera in the recording; default the source's.
             count: pictures after which it ends; None: it ends with the source.
-            on_start: called when the first picture is kept.
+            on_start: function that is called when the first picture is kept.
 
         Returns:
             Counts of what came, and what was lost before it came; ``skipped`` are those left out.

@@ -31,7 +31,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 FLUSH_TIMEOUT = 1.0
 """Seconds at the end for what waits to be sent."""
 ASK_TIMEOUT = 5.0
-"""Seconds for the answer to a call of ours."""
+"""Seconds for the answer to a call by smartcam."""
 REPEAT_INTERVAL = 10.0
 """Seconds between two sayings of what is latched on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""

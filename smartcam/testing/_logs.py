@@ -56,10 +56,10 @@ class CameraLog(Sequence["LogEntry"]):
     """The log of an emulated camera's traffic, oldest first; looked at anew each time.
 
     Args:
-        read: returns the entries.
-        visits: returns the connections that have ended.
-        links: returns who is connected; nobody where there are no connections.
-        pushed_out: returns how many entries are gone because the log was full.
+        read: function that returns the entries.
+        visits: function that returns the connections that have ended.
+        links: function that returns who is connected; nobody where there are no connections.
+        pushed_out: function that returns how many entries are gone because the log was full.
     """
 
     def __init__(

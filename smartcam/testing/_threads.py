@@ -70,7 +70,7 @@ class _InLoop:
             raise
 
     def stop(self) -> None:
-        """Stop what lives in the thread; the log can still be read. Harmless when done twice."""
+        """Stop what lives in the thread; the log can still be read. Harmless when called twice."""
         try:
             self._thread.call(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:

@@ -46,7 +46,7 @@ class Visitors:
     """The connections of a site.
 
     Args:
-        make: returns what speaks HTTP on a connection.
+        make: function that returns what speaks HTTP on a connection.
     """
 
     def __init__(self, make: Callable[[], asyncio.Protocol]) -> None:

@@ -135,7 +135,7 @@ class FleetView:
             self.ended = True
 
     async def stop(self) -> None:
-        """End; harmless when done twice."""
+        """End; harmless when called twice."""
         task, self._task = self._task, None
         self.ended = True
         if task is not None:

@@ -42,7 +42,7 @@ class LiveFrames:
     Nothing is asked of a camera without frames, and one with frames streams while somebody looks.
 
     Args:
-        camera: returns the camera that the page shows now.
+        camera: function that returns the camera that the page shows now.
 
     Attributes:
         pictures: pictures of its frames; None if it has none.
@@ -58,7 +58,7 @@ class LiveFrames:
         self._task = asyncio.create_task(self._follow(), name="smartcam.live.frames")
 
     async def stop(self) -> None:
-        """End; harmless when done twice."""
+        """End; harmless when called twice."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()

@@ -136,7 +136,7 @@ class LiveView:
         self._tasks = [asyncio.create_task(job, name="smartcam.live") for job in jobs]
 
     async def stop(self) -> None:
-        """End; harmless when done twice."""
+        """End; harmless when called twice."""
         tasks, self._tasks = self._tasks, []
         self._results.close()
         self._events.close()

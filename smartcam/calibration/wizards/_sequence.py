@@ -452,7 +452,7 @@ class WizardSession:
         Raises:
             OSError: the journal cannot be written; the sequence goes on.
 
-        Cancellation: the sequence goes on, but a running action is cancelled all the same.
+        Cancellation: the sequence goes on, but a running action is cancelled nevertheless.
         """
         if self._scope is not None and token == self.token:
             self._scope.reschedule(asyncio.get_running_loop().time())

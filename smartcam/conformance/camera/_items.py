@@ -1,7 +1,7 @@
-"""All checks and questions, in the order in which a camera is put through them.
+"""List all checks and questions, in the order in which a camera is tested.
 
-In each module they stand in their order. What leaves least behind comes first; what may leave a
-camera confused (bytes that are no frame, a restart) last.
+Those that change least come first; those that may leave a camera confused (bytes that are no frame,
+a restart) come last. Each module has its own in this order.
 """
 
 from __future__ import annotations

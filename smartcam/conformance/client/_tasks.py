@@ -126,9 +126,9 @@ class FunctionClient(Client):
     """A client behind a Python function, in a thread of its own.
 
     Args:
-        function: takes a task, returns the results' bytes; plain or asynchronous. It raises
-            NotImplementedError for a task that it cannot do, any other exception where it failed.
-            Returning from it means that all is well.
+        function: function that takes a task, returns the results' bytes; plain or asynchronous. It
+            raises NotImplementedError for a task that it cannot do, any other exception where it
+            failed. Returning from it means that all is well.
     """
 
     def __init__(self, function: Perform) -> None:

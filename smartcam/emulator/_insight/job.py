@@ -1,4 +1,4 @@
-"""Jobs of the emulated In-Sight camera: files on it, each with the cells of its spreadsheet."""
+"""Define jobs of the emulated In-Sight camera: files, each with a spreadsheet of cells."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from smartcam.settings import validated
 _log = logging.getLogger("smartcam.emulator")
 
 EXTENSIONS = (".job", ".jobx")
-"""The extensions of job files: the one of older, then the one of newer cameras (published)."""
+"""Extensions of job files on older, then on newer cameras (published)."""
 
 MAX_CELL_TEXT_CHARACTERS = 1024
 """Largest number of characters of a cell's text; a bound of the emulator."""
 
 CellValue: TypeAlias = bool | int | float | str
-"""A value that a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or
-1."""
+"""A value that a cell may hold. The spreadsheet has only numbers and texts; a bool is the number 0
+or 1."""
 
 _Name = Annotated[str, Field(min_length=1, max_length=255)]
 
 
 class Control(EmulatorData):
-    """An edit control in a cell: what ``SI``, ``SF`` and ``SS`` may set.
+    """An edit control in a cell, which ``SI``, ``SF`` and ``SS`` may set.
 
     Its value is set back when the job is loaded.
     """
@@ -76,8 +76,8 @@ class Control(EmulatorData):
 
 
 CellSource: TypeAlias = Control | CellValue | list[CellValue] | Callable[[int], CellValue]
-"""The source of a cell's value: a control, a constant, a list (a value an acquisition, over and
-over), or a function of the run's number, which is 1 for the first since the job was loaded."""
+"""The source of a cell's value: a control, a constant, a list (one value per acquisition,
+repeated), or a function of the run's number, which is 1 for the first since the job was loaded."""
 
 
 class Job(EmulatorData):
@@ -118,7 +118,7 @@ class Job(EmulatorData):
 
     @cached_property
     def id(self) -> int | None:
-        """The number its file name begins with (manual, published); None without."""
+        """Number at the beginning of the file name (manual, published); None without one."""
         return words.job_id(self.file)
 
     @property
@@ -132,15 +132,15 @@ class Job(EmulatorData):
 
     @cached_property
     def sources(self) -> Mapping[str, Any]:
-        """Its cells by :func:`cell_key`."""
+        """Sources of the job's cells by :func:`cell_key`."""
         return {cell_key(name): source for name, source in self.cells.items()}
 
     def fresh_cells(self) -> dict[str, str]:
-        """Return the cells' texts right after loading: what needs a run is in error."""
+        """Return the cells' texts right after loading: cells that need a run are in error."""
         return {key: self._show(key, source, 0) for key, source in self.sources.items()}
 
     def update_cells(self, cells: dict[str, str], run: int) -> None:
-        """Bring the cells up to date after a run, from 1; controls keep what they hold."""
+        """Bring the cells up to date after a run, from 1; controls keep their values."""
         for key, source in self.sources.items():
             if not isinstance(source, Control):
                 cells[key] = self._show(key, source, run)
@@ -204,8 +204,8 @@ class Job(EmulatorData):
 class InspectedJob(Job):
     """A job whose cells an inspector fills from a picture.
 
-    ``cells`` names them; each is in error until a run has given it a value. A list of records has
-    its values in ``NAME_1``, ``NAME_2``, ...
+    ``cells`` names them; each is in error until a run has given it a value. A list of records puts
+    its values into ``NAME_1``, ``NAME_2``, ...
     """
 
     inspector: Inspector = Field(description="the program that inspects the pictures")
@@ -216,7 +216,7 @@ class InspectedJob(Job):
         return dict.fromkeys(self.sources, words.ERROR_VALUE)
 
     def take(self, cells: dict[str, str], found: Values | None) -> None:
-        """Put what was found into the cells; those without a value are in error."""
+        """Put an inspector's findings into the cells; those without a value are in error."""
         cells.update(self.fresh_cells())
         for name, value in _named_values(found):
             key = cell_key(name)
@@ -246,7 +246,7 @@ def _named_values(found: Values | None) -> Iterator[tuple[str, Any]]:
 
 
 def cell_key(name: str) -> str:
-    """Return under what a cell or a cell's name is kept: ``A012``, or the name in lower case.
+    """Return the key of a cell or of a cell's name: ``A012``, or the name in lower case.
 
     Raises:
         ConfigurationError: the text is neither; a ValueError, so it counts for pydantic.
@@ -261,9 +261,9 @@ def cell_key(name: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as the answer to ``GV`` has it: numbers with three decimals (derived).
+    """Return a value in the form of the answer to ``GV``: numbers with three decimals (derived).
 
-    A number that is not finite is a cell in error.
+    A number that is not finite gives a cell in error.
 
     Raises:
         TypeError: the value is no number and no text.
@@ -315,4 +315,4 @@ BUILTIN_JOBS = (
     Job(file="7Counter.job", cells={"A1": lambda run: run}, load_time=0.3),
     Job(file="9Free.job", cells={"A1": lambda run: run}, rate=20),
 )
-"""Jobs for whoever has none at hand: constants with a control, a count of triggers, a free run."""
+"""Default jobs: constants with a control, a count of triggers, a free run."""

@@ -1,7 +1,7 @@
-"""Timelines: what happens to an emulated camera by itself, and when.
+"""Run timelines: events that happen to an emulated camera without a client.
 
-A timeline is a list of *cues*. A cue says when (at a time, on entering a state, on command, or from
-the beginning) and which faults are injected then::
+A timeline is a list of *cues*. A cue gives the moment (at a time, on entering a state, on command,
+or from the beginning) and the faults that are injected then::
 
     timeline:
       - {at: 2.0, do: {kind: condition, condition: overheat}}
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_PENDING = 10_000
-"""Cues that wait for their time; one that comes when so many wait is dropped, with a warning."""
+"""Largest number of cues that wait for their time; a further one is dropped, with a warning."""
 
 MAX_AT_ONCE = 1000
-"""Cues at one instant: cues that bring each other about would go on for ever. One more is dropped,
-with a warning."""
+"""Largest number of cues at one instant, since cues that cause each other would go on forever. A
+further one is dropped, with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
 """Largest number of faults of one cue, far more than anybody writes."""
@@ -57,7 +57,7 @@ _Seconds = Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)]
 
 
 class _OneOrMore:
-    """In a schema: one fault stands for a list of one."""
+    """In a schema, one fault stands for a list of one."""
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -72,10 +72,10 @@ def _as_list(value: object) -> object:
 
 
 class Cue(EmulatorData):
-    """A moment, and what happens at it.
+    """A moment, and the faults that are injected then.
 
-    At most one of ``at``, ``entering`` and ``command`` says when; with none of them it is when the
-    emulator starts.
+    At most one of ``at``, ``entering`` and ``command`` gives the moment; without any it is the
+    start of the emulator.
     """
 
     at: _Seconds | None = Field(default=None, description="seconds after the emulator's start")
@@ -136,12 +136,12 @@ class Cue(EmulatorData):
 
     @property
     def is_random(self) -> bool:
-        """True if chance has a part in the cue."""
+        """True if the cue depends on chance."""
         return self.chance < 1 or self.spread > 0
 
     @property
     def limit(self) -> int | None:
-        """Number of times that the cue applies, None for as often as its moment comes."""
+        """Number of times that the cue applies, None: each time that its moment comes."""
         if self.times is None and (self.every is not None or self.command is not None):
             return None
         return self.times or 1
@@ -149,10 +149,10 @@ class Cue(EmulatorData):
 
 @dataclass(slots=True, eq=False)
 class _CueState:
-    """A cue and what became of it."""
+    """A cue and its counts."""
 
     cue: Cue
-    random: Random  # one for each cue, so that none changes the chance of another
+    random: Random  # its own random numbers, so that no cue changes those of another
     seen: int = 0  # number of times that its moment came
     done: int = 0  # number of times that its faults were injected
 
@@ -163,7 +163,7 @@ class _CueState:
         return limit is not None and self.seen >= self.cue.nth - 1 + limit
 
     def comes(self) -> float | None:
-        """Count a moment; return after how many seconds it happens, None for never."""
+        """Count a moment; return the seconds until the cue happens, None for never."""
         if self.over:
             return None
         self.seen += 1
@@ -177,7 +177,7 @@ class _CueState:
 class Timeline:
     """Runs cues; made anew for each start of the emulator.
 
-    Those that happen at one instant do so in their order; ``seed`` is of all left to chance.
+    Cues at the same instant happen in their order; all random numbers come from ``seed``.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class Timeline:
 
     @property
     def watches(self) -> bool:
-        """True if the timeline wants to know of states."""
+        """True if a cue waits for a state."""
         return bool(self._entering)
 
     @property
@@ -224,7 +224,7 @@ class Timeline:
         self._run()
 
     def stop(self) -> None:
-        """Forget what is to come. Harmless when done twice."""
+        """Drop the waiting cues. Harmless when called twice."""
         self._pending.clear()
         self._waiting.clear()
         self._timer.set(None)
@@ -237,7 +237,7 @@ class Timeline:
         self._run()
 
     def command(self, name: str) -> None:
-        """Somebody gives a command.
+        """Give a command to the cues.
 
         Raises:
             ConfigurationError: no cue has it.
@@ -254,7 +254,7 @@ class Timeline:
         self._run()
 
     def _come(self, row: _CueState) -> None:
-        """Count a moment of a cue, and let it happen or wait."""
+        """Count a moment of a cue, and run or schedule it."""
         later = row.comes()
         if later:
             self._put(nanoseconds(self._clock.now) + nanoseconds(later), row, comes=False)
@@ -268,7 +268,7 @@ class Timeline:
         heapq.heappush(self._pending, (when, next(self._order), row, comes))
 
     def _run(self) -> None:
-        """Let all happen for which it is time, one after the other, never inside each other."""
+        """Run all cues that are due, one after the other, never nested."""
         if self._acting:
             return
         self._acting = True

@@ -95,7 +95,7 @@ __all__ = [
 ]
 
 MAX_FAULTS = 10_000
-"""Largest number of faults that wait at one time; every message is compared with all of them."""
+"""Largest number of faults that wait at one time, as every message is compared with all of them."""
 
 MAX_FIRED = 1000
 """Largest number of records kept of faults that have happened; the oldest go first."""

@@ -157,7 +157,7 @@ class DelayLine(Generic[T]):
         self.run()
 
     def close(self) -> None:
-        """Drop what is on it. Harmless when done twice."""
+        """Drop what is on it. Harmless when called twice."""
         self._timer.set(None)
         self.size = 0
         left = [*self._queue, *self._loose]

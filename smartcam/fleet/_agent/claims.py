@@ -248,7 +248,7 @@ class Claims:
             self._watch = None
 
     async def _refuse(self) -> None:
-        """Raise if another agent has a camera of ours, and neither is one that stands by.
+        """Raise if another agent has a camera of this agent, and neither is one that stands by.
 
         One that neither answers nor goes may have died a moment ago: its presence ends with the
         engine's lease.
@@ -307,7 +307,7 @@ class Claims:
                 self._consider(name)
 
     def _is_contested(self, name: str) -> bool:
-        """Return True if another agent has a camera of ours, or had it a moment ago."""
+        """Return True if another agent has a camera of this agent, or had it a moment ago."""
         now = asyncio.get_running_loop().time()
         return bool(self._others.get(name)) or now < self._contested.get(name, now)
 

@@ -1,4 +1,4 @@
-"""Let commands pass to a camera: anybody's, or those of the program that has reserved it."""
+"""Let commands pass to a camera: those of all programs, or of the one that has reserved it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Change = Literal["Reserved", "Released", "ReservationLost"]
 
 @dataclass(eq=False, slots=True)
 class InLine:
-    """A command, or a reservation, that waits for its turn.
+    """A waiting command or reservation.
 
     Attributes:
         program: name of the waiting program.
         reservation: key of the reservation; None for a command.
         granted: whether the turn has come.
-        wake: future that is done when the turn comes; None if nobody waits.
+        wake: future that is done when the turn comes; None if no caller waits.
     """
 
     program: str
@@ -32,7 +32,7 @@ class InLine:
 
 
 def _tell_nobody(change: Change, program: str) -> None:
-    """Leave a change untold."""
+    """Report nothing."""
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class Gate:
     """Lets commands through to one camera, in the order in which they come.
 
     Attributes:
-        on_change: callback for a program's reservation of the camera, and for its end.
+        on_change: callback for the start and the end of a program's reservation.
         holder: program that has reserved the camera; None if none has.
     """
 
@@ -54,7 +54,7 @@ class Gate:
         """Let a command of ``program`` begin; it ends with :meth:`leave`.
 
         Raises:
-            TimeoutError: not within ``timeout`` seconds.
+            TimeoutError: the turn did not come within ``timeout`` seconds.
         """
         if not self.goes_in(program):
             await self._pass(program, None, timeout)
@@ -78,28 +78,28 @@ class Gate:
 
     @property
     def waiting(self) -> int:
-        """Number of programs that wait to be let in."""
+        """Number of waiting programs."""
         return len(self._line)
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
-        """Keep the commands of others out; those under way are waited for.
+        """Keep the commands of others out; wait for those that are running.
 
-        A program may reserve again what it has reserved; each reservation is released by itself.
+        A program may reserve again what it has reserved; each reservation is released separately.
 
         Raises:
-            TimeoutError: not within ``timeout`` seconds.
+            TimeoutError: the turn did not come within ``timeout`` seconds.
         """
         await self._pass(program, reservation, timeout)
 
     def release(self, reservation: Hashable) -> None:
-        """End a reservation, or the wait for it; does nothing where neither is there."""
+        """End a reservation, or the wait for it; does nothing if there is neither."""
         self._reservations.discard(reservation)
         if not self._reservations:
             self._free("Released")
         self._grant()
 
     def holds(self, reservation: Hashable) -> bool:
-        """Return True if a reservation was made and has not ended; none is made a second time."""
+        """Return True if a reservation was made and has not ended; no key is used twice."""
         return reservation in self._reservations
 
     def forget(self, program: str) -> None:
@@ -127,7 +127,7 @@ class Gate:
             raise
 
     def line_up(self, program: str, reservation: Hashable | None) -> InLine:
-        """Have a command, or a reservation, wait for its turn, which may have come already."""
+        """Add a command or a reservation to the line; its turn may have come already."""
         waiting = InLine(program, reservation)
         if not self._line or self.holder == program:
             self._line.appendleft(waiting)
@@ -137,7 +137,7 @@ class Gate:
         return waiting
 
     def give_up(self, waiting: InLine) -> None:
-        """Take a waiting caller out of the line, or back the turn that it was granted."""
+        """Take a waiting caller out of the line, or take back its granted turn."""
         if waiting in self._line:
             self._line.remove(waiting)
         elif waiting.reservation is not None:

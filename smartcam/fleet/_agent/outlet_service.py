@@ -127,8 +127,8 @@ class OutletService:
         agent: the agent, which does the work in tasks of its own.
         bus: the agent's end of the bus.
         keys: keys of the fleet.
-        states: returns the states of the outlets, by name.
-        stored: returns what the stores say, by the outlet's name.
+        states: function that returns the states of the outlets, by name.
+        stored: function that returns what the stores say, by the outlet's name.
     """
 
     def __init__(

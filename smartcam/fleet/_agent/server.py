@@ -310,7 +310,7 @@ class FleetServer(Server):
         )
 
     async def stop(self) -> None:
-        """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
+        """End the sessions with Disconnect, and leave the bus. Harmless when called twice."""
         self._agent = None
         await self._stack.aclose()
         for stream in self._events:

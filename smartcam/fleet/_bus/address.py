@@ -1,4 +1,4 @@
-"""The address of a fleet, and the names that its cameras may have."""
+"""Parse the address of a fleet, and check names in it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 7447
 CERTIFICATES = "SMARTCAM_FLEET_CERTIFICATES"
-"""Variable of the environment with the folder of certificates, where the URL names none."""
+"""Variable of the environment with the folder of certificates, if the URL names none."""
 
 CERTIFICATE_FILES = ("ca.pem", "cert.pem", "key.pem")
 
@@ -37,7 +37,7 @@ def check_name(name: str, what: str = "camera") -> str:
     """Return a camera's name.
 
     Raises:
-        ConfigurationError: the name cannot be one.
+        ConfigurationError: the name is not valid.
     """
     name = check_text(name, what)
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name):
@@ -52,7 +52,7 @@ def check_word(word: str, what: str) -> str:
     """Return the name of a fleet or an agent.
 
     Raises:
-        ConfigurationError: the name cannot be one.
+        ConfigurationError: the name is not valid.
     """
     word = check_text(word, what)
     if len(word) > MAX_NAME_CHARACTERS or not _WORD.fullmatch(word):
@@ -64,7 +64,7 @@ def check_pattern(pattern: str) -> str:
     """Return a pattern of cameras' names: ``*`` is one part, ``**`` any number of them.
 
     Raises:
-        ConfigurationError: the pattern cannot be one.
+        ConfigurationError: the pattern is not valid.
     """
     pattern = check_text(pattern, "pattern")
     chunks = pattern.split("/")
@@ -77,7 +77,7 @@ def check_pattern(pattern: str) -> str:
 
 
 def missing_certificates(folder: Path) -> str:
-    """Return a text on the files that a folder of certificates lacks; empty if it has all."""
+    """Return a text on the missing files of a folder of certificates; empty if there are none."""
     missing = [name for name in CERTIFICATE_FILES if not (folder / name).is_file()]
     return f"{folder} has no {', no '.join(missing)}" if missing else ""
 
@@ -89,10 +89,10 @@ class FleetAddress(NamedTuple):
         scheme: ``fleet``, or ``fleet+tls``.
         host: name or address of an agent, or of a router.
         port: port of the agent, or of the router.
-        fleet: name of the fleet; None: the only one that is there.
+        fleet: name of the fleet; None: the only one.
         camera: name of the camera; empty for the fleet.
         certificates: folder with the certificates of this program, for ``fleet+tls``.
-        program: what people call this program, such as ``robot1``; None: its script.
+        program: name of this program for people, such as ``robot1``; None: that of its script.
     """
 
     scheme: str
@@ -108,7 +108,7 @@ class FleetAddress(NamedTuple):
         """Read a URL such as ``fleet://plant-server/line1/cam3?fleet=plant``.
 
         Raises:
-            ConfigurationError: says which part is wrong and what is accepted.
+            ConfigurationError: a part is wrong; the text names it and what is accepted.
         """
         url = check_text(url, "fleet address", least=1)
         shown = masked(url)
@@ -169,7 +169,7 @@ class FleetAddress(NamedTuple):
         return BusLink(connect=(f"{kind}/{host}:{self.port}",), certificates=self.certificates)
 
     def of(self, camera: str) -> Address:
-        """Return the address of a camera of it."""
+        """Return the address of a camera of the fleet."""
         said = {} if self.fleet is None else {"fleet": self.fleet}
         if self.certificates is not None:
             said["certificates"] = self.certificates

@@ -1,11 +1,11 @@
-"""The bus of a fleet: programs and agents say things under keys, and hear what others say.
+"""The bus of a fleet: programs and agents send messages under keys, and receive others'.
 
-A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. What
-one says comes to each who hears, in the order of saying, or not at all: a bus may lose, and never
-waits for anybody. So whoever needs to know numbers what it says.
+A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. A
+message reaches each subscriber in the order of sending, or not at all: a bus may lose messages, and
+never waits. So senders number messages whose loss matters.
 
-:class:`MemoryBus` is the one inside a process; :mod:`smartcam.fleet._bus.zenoh` has the one between
-them. Everything here belongs to one event loop, and every callback runs in it.
+:class:`MemoryBus` is the bus inside a process; :mod:`smartcam.fleet._bus.zenoh` has the bus between
+processes. Everything here belongs to one event loop, and every callback runs in it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def always(_: str) -> bool:
 
 
 class Handle(abc.ABC):
-    """Something that lasts until it is closed."""
+    """A declaration that lasts until it is closed."""
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -45,12 +45,12 @@ class Handle(abc.ABC):
 
 
 class Publisher(Handle):
-    """An end that publishes under one key, again and again."""
+    """An end that publishes under one key."""
 
     @property
     @abc.abstractmethod
     def heard(self) -> bool:
-        """True if anybody hears the publisher, as far as is known."""
+        """True if the publisher has a known subscriber."""
 
     @abc.abstractmethod
     def put(self, payload: bytes) -> None:
@@ -58,11 +58,11 @@ class Publisher(Handle):
 
 
 class Bus(abc.ABC):
-    """One end of a bus: a program's, or an agent's.
+    """One end of a bus, of a program or an agent.
 
     Attributes:
-        local: whether all ends are in this event loop: parts are then handed on without a copy, and
-            all ends have one clock.
+        local: whether all ends are in this event loop: then parts are passed on without a copy, and
+            all ends share one clock.
         identity: identity in the certificate of this end; None without a certificate.
     """
 
@@ -71,7 +71,7 @@ class Bus(abc.ABC):
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that wait to be said; 0 where nothing ever waits."""
+        """Number of bytes that wait to be sent; 0 if nothing ever waits."""
         return 0
 
     @property
@@ -81,7 +81,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
-        """Come to the bus.
+        """Connect to the bus.
 
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
@@ -89,22 +89,22 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     async def close(self) -> None:
-        """Leave the bus; all declarations of this end are gone then. Idempotent."""
+        """Leave the bus, which ends all declarations of this end. Idempotent."""
 
     @abc.abstractmethod
     def put(self, key: str, payload: bytes) -> None:
-        """Say something that somebody waits for; never blocks."""
+        """Send a message that a receiver waits for; never blocks."""
 
     @abc.abstractmethod
     def put_part(self, key: str, head: bytes, data: Data) -> None:
-        """Send a part of something large behind all else, with a head that describes the part.
+        """Send a part of large data after all other messages, with a head that describes the part.
 
-        It is dropped where there is no room; never blocks. Nobody may write into ``data`` later.
+        It is dropped if there is no room; never blocks. ``data`` must not be changed later.
         """
 
     @abc.abstractmethod
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        """Have ``hear(key, head, data)`` called for parts that are said under ``pattern``."""
+        """Call ``hear(key, head, data)`` for parts that are sent under ``pattern``."""
 
     @abc.abstractmethod
     def publisher(
@@ -114,20 +114,20 @@ class Bus(abc.ABC):
 
         Args:
             key: key of the messages.
-            on_heard: callback told whether anybody hears the key, when that changes.
-            urgent: whether messages wait in one line with those of :meth:`put`; else behind them.
+            on_heard: callback for whether the key has subscribers, when that changes.
+            urgent: whether messages wait in one line with those of :meth:`put`; else after them.
         """
 
     @abc.abstractmethod
     def subscribe(
         self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        """Have ``hear(key, payload)`` called for messages under ``pattern``.
+        """Call ``hear(key, payload)`` for messages under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
             hear: the callback.
-            patient: whether messages wait behind all others, with a bound of their own.
+            patient: whether messages wait after all others, with a bound of their own.
         """
 
     @abc.abstractmethod
@@ -138,13 +138,13 @@ class Bus(abc.ABC):
         *,
         patient: Callable[[str], bool] = never,
     ) -> Handle:
-        """Have ``answer(question)`` called for questions under ``pattern``.
+        """Call ``answer(question)`` for questions under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
             answer: the callback.
-            patient: whether a question with a key waits as one that is said, see :meth:`subscribe`.
-                It is called in any thread.
+            patient: function, called in any thread, that returns whether a question with a key
+                waits like a message, see :meth:`subscribe`.
         """
 
     @abc.abstractmethod
@@ -153,23 +153,23 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def be_present(self, key: str) -> Handle:
-        """Have all know that this end is there, until it is not."""
+        """Announce this end's presence until the handle is closed."""
 
     @abc.abstractmethod
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        """Return the keys of the ends that are there, as known within ``timeout`` seconds."""
+        """Return the keys of the present ends that become known within ``timeout`` seconds."""
 
     @abc.abstractmethod
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        """Have ``see(key, present)`` called for ends that are there, and that come and go."""
+        """Call ``see(key, present)`` for present ends, and for those that come and go."""
 
 
 class BusQuestion(abc.ABC):
     """A question on the bus, waiting for its answer.
 
     Attributes:
-        key: key that is asked for, or a pattern.
-        payload: bytes that come with the question.
+        key: requested key, or a pattern.
+        payload: bytes of the question.
     """
 
     key: str
@@ -177,14 +177,14 @@ class BusQuestion(abc.ABC):
 
     @abc.abstractmethod
     def reply(self, key: str, payload: bytes) -> None:
-        """Answer; several times if there is more than one key to answer for.
+        """Send an answer; more than once if several keys are asked for.
 
-        It may be that nothing is said before the question is closed.
+        Answers may be sent only when the question is closed.
         """
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Close the end, since there is nothing more to say; never block. Idempotent."""
+        """End the question after its last answer; never block. Idempotent."""
 
 
 # ---------------------------------------------------------------------- inside a process
@@ -213,7 +213,7 @@ P = TypeVar("P", bound=_Patterned)
 
 
 class _ByPattern(Generic[P]):
-    """The declarations of one kind at an end, by pattern: of thousands, those that a key means."""
+    """The declarations of one kind at an end, by pattern, to find the few that match a key."""
 
     def __init__(self) -> None:
         self._exact: dict[str, dict[P, None]] = {}
@@ -242,7 +242,7 @@ class _ByPattern(Generic[P]):
         self._wild.clear()
 
     def meeting(self, pattern: str) -> list[P]:
-        """Return the entries whose patterns have a key in common with a pattern, or with a key."""
+        """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
             return [one for one in self if meets(one.pattern, pattern)]
         wild = [one for one in self._wild if meets(one.pattern, pattern)]
@@ -262,7 +262,7 @@ class _MemoryDeclared(Handle):
         place.add(self)
 
     def then(self, after: Callable[[], None]) -> Self:
-        """Have ``after`` called once it is closed."""
+        """Call ``after`` once the declaration is closed."""
         self._after = after
         return self
 
@@ -312,14 +312,14 @@ class MemoryEnd(Bus):
             place.clear()
 
     def attach(self) -> None:
-        """Come to the bus, or back to it."""
+        """Join the bus, or join it again."""
         if not self.attached:
             self._bus.ends.append(self)
             self._tell_presence(True)
             self._tell_heard("**")
 
     def detach(self) -> None:
-        """Be cut off from it, as by a broken cable: both sides see the other go."""
+        """Leave the bus as by a broken cable: both sides see that the other is gone."""
         if self.attached:
             self._tell_presence(False)
             self._bus.ends.remove(self)
@@ -391,11 +391,11 @@ class MemoryEnd(Bus):
     # ------------------------------------------------------------------ among ends
 
     def _others(self) -> list[MemoryEnd]:
-        """Return the ends that hear this one: all on the bus, itself too."""
+        """Return the ends that receive from this one: all on the bus, including itself."""
         return list(self._bus.ends) if self.attached else []
 
     def _tell_presence(self, present: bool) -> None:
-        """Tell all what of this end is there or not, and this one what of all."""
+        """Report this end's presences to all ends, and theirs to this one."""
         for end in self._others():
             for one in end.present_here:
                 if end is not self:
@@ -410,13 +410,13 @@ class MemoryEnd(Bus):
                 self._loop.call_soon(_call, one, key, present)
 
     def _tell_heard(self, pattern: str) -> None:
-        """Have whoever says what a pattern means see whether anybody hears."""
+        """Make the publishers under a pattern check for subscribers."""
         for end in self._bus.ends:
             for one in end.publishers.meeting(pattern):
                 one.look()
 
     def is_heard(self, key: str) -> bool:
-        """Return True if anybody hears this end's messages under ``key``."""
+        """Return True if this end's messages under ``key`` have a subscriber."""
         return any(end.heard.meeting(key) for end in self._others())
 
 
@@ -440,7 +440,7 @@ class _MemoryPublisher(Publisher):
         return self._heard
 
     def look(self) -> None:
-        """See whether anybody hears."""
+        """Check for subscribers, and report a change."""
         heard = self._end.is_heard(self.pattern)
         if heard != self._heard:
             self._heard = heard
@@ -469,7 +469,7 @@ class _MemoryQuestion(BusQuestion):
 
 
 def _call(one: _MemoryDeclared, *arguments: object) -> None:
-    """Call back what is still wanted; an error in it is nobody else's."""
+    """Call a callback that is still wanted; its error ends nothing else."""
     if not one.closed:
         one.call(*arguments)
 

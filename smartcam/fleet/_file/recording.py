@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class RecordSection(Fields):
-    """Recording beside the agent: files that follow each other, of each camera, in one folder."""
+    """Recording beside the agent: consecutive files for each camera, in one folder."""
 
     folder: str = Field(
         "recordings",
@@ -51,7 +51,7 @@ class RecordSection(Fields):
         """Return the folder of the files.
 
         Args:
-            folder: folder that the fleet file is in.
+            folder: folder of the fleet file.
         """
         return folder / Path(self.folder).expanduser()
 
@@ -63,8 +63,8 @@ def mistakes_of(
 
     Args:
         section: section of a fleet file.
-        folder: folder that the fleet file is in.
-        seeing: names of the cameras that have frames.
+        folder: folder of the fleet file.
+        seeing: names of the cameras with frames.
     """
     recorded = any(name.endswith("/**") or section.chooses(name) for name in seeing)
     if section.pictures != "none" and not recorded:

@@ -1,4 +1,4 @@
-"""Features of a shared camera's device, as an agent tells and sets them."""
+"""Read and set features of a shared camera's device through its agent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._program.caller import Caller
 
 CALL_TIMEOUT: Final = 60.0
-"""Seconds for a call, where whoever asked has no earlier deadline of its own."""
+"""Seconds for a call, unless the caller has an earlier deadline."""
 
 MAX_FEATURES: Final = 10_000
 
@@ -31,7 +31,7 @@ def feature_fields(feature: Feature) -> dict[str, Any]:
 
 
 def read_feature(said: object, who: str) -> Feature:
-    """Return the feature that an agent's fields describe.
+    """Return the feature in an agent's fields.
 
     Raises:
         RemoteProtocolError: the fields describe none.
@@ -56,7 +56,7 @@ def read_feature(said: object, who: str) -> Feature:
 
 
 def read_value(said: object, who: str) -> FeatureValue:
-    """Return a value that an agent says.
+    """Return a value in an agent's reply.
 
     Raises:
         RemoteProtocolError: the value is not valid.
@@ -73,11 +73,11 @@ def _number(said: object) -> float:
 
 
 class FleetFeatures(DeviceFeatures):
-    """The features of a camera's device, asked of its agent.
+    """The features of a camera's device, through its agent.
 
     Args:
         name: name of the camera.
-        caller: calls the agent.
+        caller: caller of the agent.
     """
 
     def __init__(self, name: str, caller: Caller) -> None:
@@ -109,7 +109,7 @@ class FleetFeatures(DeviceFeatures):
         return [read_feature(one, self._name) for one in self._list(said, "features")]
 
     def _list(self, said: dict[str, Any], name: str) -> list[Any]:
-        """Return a list of what an agent says.
+        """Return the items of an agent's list.
 
         Raises:
             RemoteProtocolError: the list is not valid, or has too many items.

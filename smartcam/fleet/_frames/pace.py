@@ -1,8 +1,8 @@
-"""Choose the frame that a stream is given: one that has not waited for the link.
+"""Choose the next frame of a stream: one that has not waited for the link.
 
-A frame that came while the link was taken has grown old by up to a period before it can go. So the
-next one goes instead, as soon as it is there: that costs a part of the frame rate, and each frame
-that arrives is only as old as its own way.
+A frame that came while the link was busy is up to a period old before it can be sent. So the next
+one is sent instead, as soon as it is there: that costs a part of the frame rate, but each frame
+arrives only as late as its own transfer takes.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ from __future__ import annotations
 import math
 
 MAX_WAIT_SHARE = 0.04
-"""Share of a frame's time on the way that a frame may have waited before."""
+"""A frame may have waited before for this share of its time on the way."""
 
 MIN_WAIT_SECONDS = 0.002
-"""Seconds that each frame may have waited in any case."""
+"""A frame may have waited this many seconds in any case."""
 
 PATIENCE = 1.25
-"""Periods in which the next frame is expected; then the older one goes after all."""
+"""Number of periods to wait for the next frame; then the older one is sent after all."""
 
 
 class FramePace:
-    """Pace of one stream. All times are of one clock."""
+    """Pace of one stream. All times are from one clock."""
 
     def __init__(self) -> None:
         self._gave: float | None = None
-        self._ways = (0.0, 0.0)  # what the last two took to get there
+        self._ways = (0.0, 0.0)  # seconds on the way of the last two frames
         self._last: tuple[float, int] | None = None
-        self._period = 0.0  # of the source; 0: unknown
+        self._period = 0.0  # period of the source; 0: unknown
         self._due = -math.inf
         self._rest = 0.0
 
     def asked(self, now: float, came: float, rest: float = 0.0) -> tuple[float, float]:
-        """Return since when the next frame has to have come, and until when it is waited for.
+        """Return the time after which the next frame must have come, and the end of the wait.
 
         Args:
-            now: the next frame is asked for; so the last one is there.
-            came: when the newest frame came.
-            rest: seconds from one frame to the next at least.
+            now: time of the request for the next frame, when the last one has arrived.
+            came: time at which the newest frame came.
+            rest: least number of seconds from one frame to the next.
         """
         if self._gave is not None:
             self._ways, self._gave = (self._ways[1], now - self._gave), None
@@ -51,7 +51,7 @@ class FramePace:
         return since, until
 
     def took(self, came: float, offered: int) -> None:
-        """Take down which frame it is.
+        """Note which frame was taken.
 
         Args:
             came: time at which the frame came.
@@ -63,5 +63,5 @@ class FramePace:
         self._due = max(self._due, came - self._rest) + self._rest
 
     def gave(self, now: float) -> None:
-        """Take down that it goes on its way."""
+        """Note that the frame is sent now."""
         self._gave = now

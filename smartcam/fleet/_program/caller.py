@@ -1,4 +1,4 @@
-"""Call the agent of a fleet's camera: which one it is, its presence, its clock."""
+"""Find and call the agent of a fleet's camera; follow its presence and its clock."""
 
 from __future__ import annotations
 
@@ -42,24 +42,23 @@ MAX_DRIFT_RATIO = 1e-4
 """Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
-"""Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
+"""Seconds for the answer to a hello; then it is sent again, as long as the agent is present."""
 
 
 SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
-"""Names of calls, where a user knows them by another one."""
+"""Names of calls for users, if they differ."""
 LOOK_ELSEWHERE = 0.25
-"""Seconds between two looks whether another agent has a session, where the one that was met has
-none."""
+"""Seconds between two checks for another agent with a session, if the present one has none."""
 
 ASK_ANEW = 5.0
-"""Seconds until the one that was met is asked whether it has one by now: that it said so may be
-lost, and a camera that nobody triggers says nothing more."""
+"""Seconds until the present agent is asked whether it has a session by now: its message may be
+lost, and a camera without triggers causes no further ones."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
 
 INSIST_AFTER = 1.0
-"""Seconds until something is said again that the agent has to know: it may have been lost."""
+"""Seconds until an unconfirmed message is sent again, since it may have been lost."""
 
 
 class Met:
@@ -68,7 +67,7 @@ class Met:
     Attributes:
         agent: name of the agent.
         epoch: number of the agent's start.
-        hello: fields that the agent answered on the camera.
+        hello: fields on the camera in the agent's answer.
     """
 
     def __init__(self, agent: str, epoch: int, hello: dict[str, Any]) -> None:
@@ -82,8 +81,8 @@ class Lease:
 
     Attributes:
         epoch: number of the start of the agent that made the reservation.
-        lost: why the reservation is lost; empty while it is not lost, as far as is known.
-        told: whether there was an event for the loss.
+        lost: reason why the reservation is lost; empty while no loss is known.
+        told: whether an event has reported the loss.
     """
 
     __slots__ = ("epoch", "lost", "told")
@@ -95,7 +94,7 @@ class Lease:
 
 
 class _HelloHeard(NamedTuple):
-    """An agent's answer to a hello, with the loop times around its clock."""
+    """An agent's answer to a hello, with the loop times before and after its clock's time."""
 
     agent: str
     epoch: int
@@ -109,19 +108,19 @@ class Caller:
     """Calls one camera's agent.
 
     Args:
-        name: the camera's, for texts.
+        name: the camera's name, for texts.
         camera: the camera's name in the fleet.
         program: program that makes the calls.
         counters: counters of the messages.
-        on_met: callback for an agent that has answered, before anything else is called.
-        on_lost: callback for the error by which the agent is gone.
+        on_met: callback for an agent that has answered, before any other call.
+        on_lost: callback for the loss of the agent, with its error.
         on_lease_lost: callback for the loss of this program's reservations, once for each loss.
 
     Attributes:
         met: the agent; None while there is none.
-        trouble: why there is no agent.
-        end: why there will be no agent any more.
-        linked: whether the agent has a session with the camera, as far as it has said.
+        trouble: reason why there is no agent.
+        end: reason why there will be no further agent.
+        linked: whether the agent has a session with the camera, as far as is known.
         leases: the reservations whose blocks run, oldest first, by the calls that made them.
     """
 
@@ -145,23 +144,23 @@ class Caller:
         self.end: LinkError | None = None
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
-        self._epochs: dict[str, int] = {}  # epochs of agents that were met
+        self._epochs: dict[str, int] = {}  # epochs of agents that have answered
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
         self._stirred = asyncio.Event()
         self._watch: Handle | None = None
         self._task: asyncio.Task[None] | None = None
-        self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
+        self._ahead = 0.0  # least seconds by which the agent's clock is ahead of the loop's
         self._measured = 0.0
-        self._most = math.inf  # and at most so far
+        self._most = math.inf  # largest seconds by which it is ahead
         self._bounded = 0.0
-        self._removed = ""  # why the agent that was met shares the camera no more
+        self._removed = ""  # reason why the present agent no longer shares the camera
         self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
 
     def open(self) -> None:
-        """Look for the agent from now on."""
+        """Start looking for the agent."""
         keys, bus = self.program.keys, self.program.bus
         self._watch = bus.watch(keys.camera("*", self.camera), self._on_presence)
         self._task = asyncio.get_running_loop().create_task(
@@ -169,7 +168,7 @@ class Caller:
         )
 
     async def close(self, error: LinkError | None = None) -> None:
-        """Look for the agent no more. Idempotent."""
+        """Stop looking for the agent. Idempotent."""
         self.finish(error or ConnectionClosedError(f"{self.name}: the connection is closed"))
         if self._watch is not None:
             self._watch.close()
@@ -178,10 +177,10 @@ class Caller:
             task.cancel()
             await asyncio.wait({task})
         if self._insisting:
-            await asyncio.wait(self._insisting)  # what they wait for has failed
+            await asyncio.wait(self._insisting)  # calls wait for an answer that has failed
 
     def finish(self, error: LinkError) -> None:
-        """End for good: there will be no agent any more."""
+        """End for good: there will be no further agent."""
         if self.end is None:
             self.end = error
         self.met = None
@@ -194,7 +193,7 @@ class Caller:
 
         Raises:
             ConnectionLostError: the agent is away.
-            ConnectionClosedError: not opened, or closed.
+            ConnectionClosedError: the caller is not open, or closed.
         """
         if self.met is not None:
             return self.met
@@ -218,7 +217,7 @@ class Caller:
             self.agent_left(agent)
 
     def agent_left(self, agent: str) -> None:
-        """End the calls of an agent that shares the camera no more. Idempotent."""
+        """End the calls of an agent that no longer shares the camera. Idempotent."""
         self._agents.pop(agent, None)
         if self.met is not None and self.met.agent == agent:
             why = self._removed
@@ -227,11 +226,11 @@ class Caller:
         self._stirred.set()
 
     def removed(self, why: str) -> None:
-        """Note why the agent shares the camera no more; the agent's presence ends next."""
+        """Note why the agent no longer shares the camera; the agent's presence ends next."""
         self._removed = why
 
     def lose(self, why: str) -> None:
-        """End every call under way, its outcome unknown, since the agent is gone."""
+        """End every running call with an unknown outcome, since the agent is gone."""
         if self.met is None:
             return
         self.met, self.linked = None, False
@@ -241,7 +240,7 @@ class Caller:
         self._on_lost(error)
 
     async def _attend(self) -> None:
-        """Meet the agent whenever there is one; of several, the one that has a session."""
+        """Connect to an agent whenever there is one; of several, to the one with a session."""
         loop, quiet_since = asyncio.get_running_loop(), 0.0
         while True:
             look = None
@@ -272,7 +271,7 @@ class Caller:
                         self._stirred.set()
 
     async def _choose(self, agents: list[str], met: Met | None) -> None:
-        """Meet one of the agents: with several, or instead of another, one that has a session."""
+        """Choose an agent: of several, or instead of another, one that has a session."""
         only_linked = met is not None
         heard: list[_HelloHeard] = []
         failed: SmartCamError | None = None
@@ -285,7 +284,7 @@ class Caller:
             if heard[-1].hello.get("connected") and not heard[-1].hello.get("trying"):
                 break  # a camera has one session
         if self.met is not met:
-            return  # it came or went meanwhile
+            return  # the agent came or went meanwhile
         if not heard:
             if failed is not None:
                 raise failed
@@ -298,7 +297,7 @@ class Caller:
         self._meet(best)
 
     async def _ask_anew(self, met: Met) -> None:
-        """Meet the agent again if it has a session by now."""
+        """Ask the agent again, and take its state if it has a session by now."""
         with contextlib.suppress(SmartCamError):
             heard = await self._say_hello(met.agent)
             if self.met is met and not self.linked and heard.hello.get("connected"):
@@ -330,33 +329,33 @@ class Caller:
             self._on_met(self.met)
 
     def restarted(self, epoch: int) -> bool:
-        """Return True if an epoch is that of a newer start of the agent that was met."""
+        """Return True if an epoch is that of a newer start of the present agent."""
         met = self.met
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
         return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
 
     def unlink(self) -> None:
-        """Leave an agent without a session: another one may have it, or this one will again."""
+        """Leave an agent without a session: another one may have a session, or this one later."""
         self.linked = False
         self._stirred.set()
 
     # ------------------------------------------------------------------ the clock
 
     def sample(self, clock: float) -> None:
-        """Take the time of the agent's clock that a message just now told."""
+        """Use the time of the agent's clock in a message that has just come."""
         now = asyncio.get_running_loop().time()
         least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
 
     def bound(self, clock: float, said: float) -> None:
-        """Bound the agent's clock, which showed ``clock`` after it heard a message of ours."""
+        """Bound the agent's clock, which showed ``clock`` after a message from this program."""
         now = asyncio.get_running_loop().time()
         most = self._most + MAX_DRIFT_RATIO * (now - self._bounded)
         self._most, self._bounded = min(most, clock - said), now
 
     def here(self, clock: float) -> tuple[float, float]:
-        """Return between which times of the loop's it was when the agent's clock said ``clock``."""
+        """Return the loop's times between which the agent's clock showed ``clock``."""
         if self.program.bus.local:
             return clock, clock
         now = asyncio.get_running_loop().time()
@@ -377,10 +376,10 @@ class Caller:
     # ------------------------------------------------------------------ reservations
 
     def lease(self, number: int) -> Lease:
-        """Return a reservation of ours whose block runs.
+        """Return a reservation of this program whose block runs.
 
         Raises:
-            ReservationLostError: the reservation is lost, as far as is known here.
+            ReservationLostError: the reservation is lost, as far as this program knows.
         """
         lease, met = self.leases[number], self.met
         if not lease.lost and met is not None and met.epoch != lease.epoch:
@@ -394,12 +393,12 @@ class Caller:
         return lease
 
     def lose_lease(self, number: int, why: str) -> None:
-        """Know that a reservation of ours is lost: no command of its block is sent any more."""
+        """Note that a reservation is lost: no further command of its block is sent."""
         self.leases[number].lost = why
         self.tell_leases_lost()
 
     def tell_leases_lost(self) -> None:
-        """Tell that what this program has reserved is lost, unless that was told before."""
+        """Report that this program's reservations are lost, unless that was reported before."""
         untold = [one for one in self.leases.values() if not one.told]
         for one in untold:
             one.told = True
@@ -407,7 +406,7 @@ class Caller:
             self._on_lease_lost()
 
     def look_at_leases(self) -> None:
-        """Look whether reservations of ours are lost, now that an agent has answered."""
+        """Check whether reservations are lost, now that an agent has answered."""
         for number in self.leases:
             with contextlib.suppress(ReservationLostError):
                 self.lease(number)
@@ -435,7 +434,7 @@ class Caller:
         number: int | None = None,
         timeout: float | None = None,
     ) -> BusMessage:
-        """Have something done by the agent; return its reply.
+        """Make a call at the agent; return its reply.
 
         Args:
             do: name of the call.
@@ -443,10 +442,10 @@ class Caller:
             arguments: arguments of the call, by name.
             blobs: byte strings that belong to the call.
             number: number of the call; the next one by default.
-            timeout: seconds that the user gave; what there is until ``deadline`` by default.
+            timeout: seconds that the user gave; by default the time until ``deadline``.
 
         Raises:
-            SmartCamError: as the agent says; or the agent is gone, or silent.
+            SmartCamError: the agent replied with this error, or is gone or silent.
 
         Cancellation: the agent is told.
         """
@@ -495,12 +494,12 @@ class Caller:
         number: int,
         timeout: float,
     ) -> TriggerReply:
-        """Have the agent trigger; return its reply.
+        """Trigger by the agent; return its reply.
 
         Args:
-            request: work that the trigger is to do.
-            application: application to have running for the trigger; None for any.
-            expected: application that the results are to be of; None for any.
+            request: options of the trigger.
+            application: application that must run for the trigger; None for any.
+            expected: application whose results are expected; None for any.
             number: number of the call.
             timeout: seconds.
 
@@ -546,7 +545,7 @@ class Caller:
         agent: str,
         met: Met | None,
     ) -> Reply:
-        """Say a call, and return the reply to it; ``deadline`` is this side's."""
+        """Send a call, and return the reply; ``deadline`` is that of this side."""
         self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self)
@@ -577,13 +576,13 @@ class Caller:
         return reply
 
     def tell(self, do: str, arguments: dict[str, Any]) -> None:
-        """Have something done without waiting for it, if there is an agent."""
+        """Make a call without waiting for it, if there is an agent."""
         if self.met is not None and self._allowed(do):
             fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
             self._insist(self._key(self.met.agent, do), fields)
 
     def come(self, number: int, offset: int | None) -> None:
-        """Say up to where the frame of a call has come; None: no more of it is wanted."""
+        """Report up to which byte a call's frame has come; None: no further bytes are wanted."""
         if self.met is not None:
             fields = {"call": number, "come": offset}
             self.program.send(self._key(self.met.agent, "frame"), fields)
@@ -594,7 +593,7 @@ class Caller:
     def _insist(self, key: str, fields: dict[str, Any]) -> None:
         """Send a message that may come twice, now and again until the agent confirms it.
 
-        An agent that is gone, or was gone for a time, has nothing any more that has to end.
+        An agent that is gone, or was gone for a time, has already ended everything.
         """
         program, met = self.program, self.met
 
@@ -630,7 +629,7 @@ class Caller:
         return do not in COMMANDS or identity is None or may_command(identity.role)
 
     def _check_allowed(self, do: str) -> None:
-        """Refuse what the bus would swallow.
+        """Refuse a call that the bus would drop silently.
 
         Raises:
             NotAllowedError: the role of this program's certificate forbids it.
@@ -646,7 +645,7 @@ class Caller:
             )
 
     def _perhaps(self, do: str) -> str:
-        """Return a text on another reason for silence; empty if there is none."""
+        """Return a text on another possible reason for silence; empty if there is none."""
         identity = self.program.bus.identity
         if identity is None:
             return ""

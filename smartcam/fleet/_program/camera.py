@@ -1,4 +1,4 @@
-"""A camera that an agent shares, as a program uses it."""
+"""Use a camera that an agent shares."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ if TYPE_CHECKING:
     from smartcam.settings import Address, CameraSettings
 
 ASK_AGAIN = 2.0
-"""Seconds for the answer to a question that waits; then it is asked again until its deadline."""
+"""Seconds for the answer to a question; then it is asked again until its deadline."""
 
 REACH_TIMEOUT = 0.5
-"""Seconds to wait for the events that the agent sent before a reply, which were lost if they are
-late."""
+"""Seconds to wait for the events that the agent sent before a reply, which count as lost if they
+come later."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ class ReservationLost(CameraEvent):
     """A program has lost its reservation of the camera before the end of its block.
 
     Attributes:
-        by: the program in words, as errors have it: ``robot1 on host7, pid 31``.
+        by: the program in words, as in errors: ``robot1 on host7, pid 31``.
     """
 
     by: str
@@ -96,15 +96,14 @@ class FleetCamera(Camera[ValueT]):
     :class:`~smartcam.fleet.Fleet`. The agent carries out commands, each once; results are read
     in this process.
 
-    The link may be the one to the agent: one that is lost is a
-    :exc:`~smartcam.ConnectionLostError` that names it. A call that was under way then may have been
-    done or not, which nobody knows.
+    The link is that to the agent, too: its loss is a :exc:`~smartcam.ConnectionLostError` that
+    names it. It is then unknown whether a running call was carried out.
 
     Args:
         settings: validated options; those of the session with the camera are the agent's.
         camera: name of the camera in the fleet.
         program: program with an end of the bus.
-        shared: whether others use that end, too; it is then not closed with the camera.
+        shared: whether other cameras use that end, too; then it is not closed with this camera.
         observers: observers of the camera.
     """
 
@@ -118,7 +117,7 @@ class FleetCamera(Camera[ValueT]):
         observers: Iterable[Observer] = (),
     ) -> None:
         self._agents_layout: Any = None  # layout for results if this program gives none
-        self._unreadable: ConfigurationError | None = None  # why that cannot be used
+        self._unreadable: ConfigurationError | None = None  # reason why that layout cannot be used
         self._met = False
         super().__init__(settings, observers=observers)
         self._program, self._shared = program, shared
@@ -133,7 +132,7 @@ class FleetCamera(Camera[ValueT]):
             self._on_lease_lost,
         )
         self._expected = settings.application
-        self._switch_in_doubt = False  # one was cut off: the camera may be in either application
+        self._switch_in_doubt = False  # a switch was interrupted: either application may be active
         self._receiver = Receiver(
             settings.name,
             camera,
@@ -145,10 +144,10 @@ class FleetCamera(Camera[ValueT]):
             lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
-        self.opening: asyncio.Task[None] | None = None  # whoever made it waits for its agent
+        self.opening: asyncio.Task[None] | None = None  # its maker waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
-        self._trying = True  # the agent's first try to connect is not over
+        self._trying = True  # whether the agent's first attempt to connect has not ended
         self._status: Status | None = None
         self._active: int | None = None
         self._about: dict[str, Any] = {}  # facts about the camera from its agent
@@ -169,10 +168,10 @@ class FleetCamera(Camera[ValueT]):
         return self._provisional(spec, own)
 
     def _provisional(self, spec: object, own: bool) -> Interpretation:
-        """Return the interpretation of results until the agent has said what it knows.
+        """Return the interpretation of results until the agent's answer.
 
         Raises:
-            ConfigurationError: ``spec`` cannot work, whatever the agent will say.
+            ConfigurationError: ``spec`` cannot work with any agent.
         """
         settings = self.settings
         if spec is None and settings.calibration is not None:
@@ -195,7 +194,7 @@ class FleetCamera(Camera[ValueT]):
     # ------------------------------------------------------------------ life
 
     def _abandoned(self) -> bool:
-        # the bus refers to it until it is closed; where nobody has it, that is gone as well
+        # the bus refers to the camera until it is closed; its own bus is dropped with it
         own = vars(self)
         opened = own.get("_opened", False) and own.get("_closed") is None
         return opened and not own.get("_shared", True)
@@ -217,11 +216,11 @@ class FleetCamera(Camera[ValueT]):
         return self
 
     async def attend(self, timeout: float, *, session: bool = True) -> None:
-        """Begin to hear of the camera; whether it is there yet or not.
+        """Start to follow the camera, even if it is not there yet.
 
         Args:
-            timeout: seconds for the way to the bus, and for the first answer of an agent.
-            session: wait also until the agent has tried to have a session with it.
+            timeout: seconds for connecting to the bus, and for an agent's first answer.
+            session: whether to wait also for the agent's first attempt of a session.
         """
         self._opened = True
         deadline = self._deadline(timeout)
@@ -248,7 +247,7 @@ class FleetCamera(Camera[ValueT]):
                 await self._stirred_until(settled)
 
     async def _stirred_until(self, condition: Callable[[], bool]) -> None:
-        """Wait until something is true of what the agent says."""
+        """Wait until a condition on the agent's messages is true."""
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
         try:
@@ -258,7 +257,7 @@ class FleetCamera(Camera[ValueT]):
             self._watching.discard(queue)
 
     def _check_session(self) -> None:
-        """Raise what says why there is no session, or nothing that can be used."""
+        """Raise the reason why there is no session, or no usable one."""
         if self._closed is not None:
             raise self._closed.with_traceback(None)
         if self._unreadable is not None:
@@ -287,7 +286,7 @@ class FleetCamera(Camera[ValueT]):
                 await self._program.close()
 
     def _finish(self, error: LinkError) -> None:
-        """End for good: there will be no session any more."""
+        """End for good: there will be no further session."""
         if self._closed is not None:
             return
         self._closed = error
@@ -317,11 +316,11 @@ class FleetCamera(Camera[ValueT]):
                         continue
                     left = max(0.0, deadline - loop.time())
                     try:
-                        # what the agent restores, or goes back to, is done then
+                        # by then the agent has restored the state, or gone back
                         await self._do("wait_connected", min(left, ASK_AGAIN))
                     except ConnectionLostError:
                         continue
-                    except ResponseTimeoutError as exc:  # or it was lost on the way
+                    except ResponseTimeoutError as exc:  # or the message was lost on the way
                         why = exc
                         if left <= ASK_AGAIN:
                             raise TimeoutError from exc
@@ -356,7 +355,7 @@ class FleetCamera(Camera[ValueT]):
         if subscribers is not self._listeners.results or self._closed is not None:
             return
         if not self._opened:
-            return  # open() sees to it
+            return  # open() does this
         since = self._caller.clock(asyncio.get_running_loop().time())
         for stream in self._listeners.results:
             if stream.since == -math.inf:
@@ -380,7 +379,7 @@ class FleetCamera(Camera[ValueT]):
         self._caller.look_at_leases()
         self._about = hello
         self._read_as(hello)
-        # what came since is newer; what was missed says it all, in order
+        # later events are newer; the missed ones bring everything in order
         if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
         self._receiver.meet(met)
@@ -388,7 +387,7 @@ class FleetCamera(Camera[ValueT]):
             self._listens(self._listeners.results)
 
     def _read_as(self, hello: dict[str, Any]) -> None:
-        """Take over what the agent knows of what results hold, where this program does not say."""
+        """Use the agent's knowledge of the results' contents, unless this program gives its own."""
         settings, layout = self.settings, hello.get("interpret_as")
         if isinstance(layout, dict):
             layout = {int(key): value for key, value in layout.items()}
@@ -406,14 +405,14 @@ class FleetCamera(Camera[ValueT]):
             self._unreadable = exc
 
     def _on_lease_lost(self) -> None:
-        """Tell that this program has lost what it reserved."""
+        """Report that this program has lost its reservation."""
         self._publish_reservation_lost(self._program.name, datetime.now(UTC))
 
     def _publish_reservation_lost(self, program: str, at: datetime) -> None:
         self._listeners.publish(ReservationLost(camera=self.name, at=at, by=in_words(program)))
 
     def agent_left(self, agent: str) -> None:
-        """End the session with an agent that shares the camera no more, where it is that one's."""
+        """End the session, if it is that of an agent that no longer shares the camera."""
         self._caller.agent_left(agent)
 
     def _on_lost(self, error: LinkError) -> None:
@@ -442,7 +441,7 @@ class FleetCamera(Camera[ValueT]):
         )
 
     def _fail(self, error: LinkError) -> None:
-        """Give everybody who waits the error by which there is no session."""
+        """End all waiting calls with the error that ended the session."""
         self._listeners.fail(error)
         self._stir(error)
 
@@ -452,7 +451,7 @@ class FleetCamera(Camera[ValueT]):
             queue.put_nowait(what)
 
     def _on_state(self, said: dict[str, Any]) -> None:
-        """Take in an event of the camera, with the camera's state now."""
+        """Process an event of the camera, with its present state."""
         if self._closed is not None:
             return
         at = _time(said)
@@ -490,14 +489,14 @@ class FleetCamera(Camera[ValueT]):
             self._take_status(Status(int(status)), at, said["kind"])
 
     def _take_notice(self, said: dict[str, Any], at: datetime) -> None:
-        """Publish a remark of the camera's own."""
+        """Publish a notice from the camera."""
         self._counters.note_notice()
         kind, code, text = str(said.get("kind")), int(said.get("code", 0)), str(said.get("text"))
         event = NoticeReceived(camera=self.name, at=at, kind=kind, code=code, text=text)
         self._listeners.publish(event)
 
     def _take_reservation_lost(self, program: str, at: datetime) -> None:
-        """Note whose reservation is lost, by the agent's word; ours may have been told before."""
+        """Take the agent's report of a lost reservation; this program's may be known already."""
         if program == self._program.name and self._caller.leases:
             self._caller.tell_leases_lost()
         else:
@@ -552,12 +551,12 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def ended(self) -> bool:
-        """True if there will be no session any more: closed, taken, or given up."""
+        """True if there will be no further session: closed, taken, or given up."""
         return self._closed is not None
 
     @property
     def met(self) -> bool:
-        """True if the camera's agent has answered, and is there."""
+        """True if the camera's agent has answered, and is present."""
         return self._caller.met is not None
 
     @property
@@ -581,7 +580,7 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def endian(self) -> int:
-        """The byte order that the camera's status told when its agent was met."""
+        """Byte order in the camera's status at the first answer of its agent."""
         return int(self._about.get("endian", 0))
 
     @property
@@ -602,7 +601,7 @@ class FleetCamera(Camera[ValueT]):
         call: int | None = None,
         **arguments: Any,
     ) -> BusMessage:
-        """Have the agent do something; take the events that it sent before its reply first."""
+        """Make a call at the agent; first process the events that it sent before its reply."""
         limit = self._limit(timeout, self.settings.request_timeout)
         deadline = self._deadline(limit)
         await self._met_first(deadline)
@@ -614,7 +613,7 @@ class FleetCamera(Camera[ValueT]):
         return reply
 
     async def _met_first(self, deadline: float) -> None:
-        """Wait for an agent that was not met yet; bounded."""
+        """Wait for an agent that has not answered yet; bounded."""
         opening = self.opening
         if opening is not None:
             await asyncio.wait({opening}, timeout=deadline - asyncio.get_running_loop().time())
@@ -622,7 +621,7 @@ class FleetCamera(Camera[ValueT]):
                 self.opening = None
 
     async def _reach(self, states: int, results: int, deadline: float) -> None:
-        """Wait for what the agent has said before its reply."""
+        """Wait for the messages that the agent sent before its reply."""
         if not self._receiver.has(states, results):
             soon = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
             await self._receiver.reach("states", states, soon)
@@ -658,7 +657,7 @@ class FleetCamera(Camera[ValueT]):
         self._expected, self._switch_in_doubt = reply.fields["answer"]["application"], False
 
     async def _settle_switch(self, timeout: float) -> float:
-        """Ask which application is active now, from which results are expected then.
+        """Ask for the active application, whose results are expected then.
 
         Returns:
             The seconds that are left for a trigger.
@@ -687,7 +686,7 @@ class FleetCamera(Camera[ValueT]):
         self._expected = before
         if self.connected:
             await self._do("leave", limit, entered=number)
-        else:  # the next session goes back first
+        else:  # the next session restores the application first
             self._caller.tell("leave", {"entered": number, "wait": False})
 
     @contextlib.asynccontextmanager
@@ -703,10 +702,10 @@ class FleetCamera(Camera[ValueT]):
             self._caller.tell("release", {"reservation": number})
 
     async def _check_kept(self, reservation: int) -> None:
-        """Have the agent confirm that a reservation of ours has not ended; bounded.
+        """Check with the agent that a reservation has not ended; bounded.
 
         Raises:
-            ReservationLostError: the reservation has ended, or nobody knows.
+            ReservationLostError: the reservation has ended, or this is unknown.
         """
         caller = self._caller
         deadline = self._deadline(self.settings.request_timeout)
@@ -719,7 +718,7 @@ class FleetCamera(Camera[ValueT]):
             except ResponseTimeoutError as exc:
                 why: SmartCamError = exc
                 if soon < deadline:
-                    continue  # it was lost on the way
+                    continue  # the message was lost on the way
             except SmartCamError as exc:
                 why = exc
             else:
@@ -761,7 +760,7 @@ class FleetCamera(Camera[ValueT]):
         try:
             present = self.status
             reply = await self._do("refresh", timeout)
-            if reply.fields["answer"]["asked"]:  # a status from before is not the current one
+            if reply.fields["answer"]["asked"]:  # an earlier status is not the current one
                 present = self.status
                 while not queue.empty():
                     status = queue.get_nowait()
@@ -853,7 +852,8 @@ class FleetCamera(Camera[ValueT]):
 
     async def reboot(self) -> None:
         await self._do("reboot", None)
-        with contextlib.suppress(TimeoutError, LinkError):  # it is told that the session is over
+        # the source learns that the session is over
+        with contextlib.suppress(TimeoutError, LinkError):
             async with asyncio.timeout(REACH_TIMEOUT):
                 await self._stirred_until(lambda: not self.connected)
 

@@ -1,8 +1,8 @@
 """Subscribe once for many cameras, in place of once for each.
 
-A camera of a fleet subscribes to its own keys, and is given what is said under them. As soon as
-many are wanted, :meth:`Exchange.cover` declares one subscription for all, and what comes is handed
-out here by its key; a dictionary costs less than the engine's subscription does, on both sides.
+A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.cover` declares
+one subscription for all, and the messages are distributed here by their keys; a dictionary costs
+less than the engine's subscription does, on both sides.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 ASK_AGAIN = 0.5
-"""Seconds for the answer to where an agent's numbers stand; then it is asked again."""
+"""Seconds for an agent's answer about its next numbers; then it is asked again."""
 
 MAX_AGENTS_NUMBERED = 1000
-"""Largest number of agents whose bundles are known by their numbers."""
+"""Largest number of agents whose bundles' numbers are remembered."""
 
 
 class _BusPlace(Handle):
@@ -56,27 +56,28 @@ class Exchange(Bus):
     """The end of a bus that the cameras of one fleet share.
 
     Args:
-        bus: the end.
-        keys: function for the fleet's keys, once the end is open.
+        bus: end of the bus.
+        keys: function that returns the fleet's keys once the end is open.
     """
 
     def __init__(self, bus: Bus, keys: Callable[[], Keys]) -> None:
         self._bus, self._keys = bus, keys
         self.local = bus.local
-        self._places: dict[str, dict[str, list[_BusPlace]]] = {}  # places of a kind, by their keys
+        # receivers of each kind, by their keys
+        self._places: dict[str, dict[str, list[_BusPlace]]] = {}
         self._covers: dict[str, Handle] = {}
-        self._present: dict[str, set[str]] = {}  # presences that are there, by the camera's name
+        self._present: dict[str, set[str]] = {}  # present agents, by the camera's name
         # epoch and next expected number of each agent
         self._bundles: dict[str, tuple[int, int]] = {}
         # functions that take the presences of all cameras
         self._seers: list[Callable[[str, bool], None]] = []
-        self._lacking: set[str] = set()  # agents of whose bundles something is missing
+        self._lacking: set[str] = set()  # agents with missing bundles
         self._asking: dict[str, asyncio.Task[None]] = {}
 
     # ------------------------------------------------------------------ for many
 
     def see_all(self, see: Callable[[str, bool], None]) -> None:
-        """Hear of all cameras' presences from now on, for watchers of one camera or of all.
+        """Follow all cameras' presences from now on, for watchers of one camera or of all.
 
         ``see(key, present)`` is called for each.
         """
@@ -84,7 +85,7 @@ class Exchange(Bus):
         self.cover("presence/camera")
 
     def cover(self, kind: str) -> None:
-        """Hear everything of a kind from now on: ``states``, ``results``, ``presence/camera``."""
+        """Receive all messages of a kind: ``states``, ``results`` or ``presence/camera``."""
         if kind in self._covers:
             return
         keys, bus = self._keys(), self._bus
@@ -96,7 +97,8 @@ class Exchange(Bus):
             made = bus.watch(keys.camera("*", "**"), self._on_presence)
         self._covers[kind] = made
         for places in [*self._places.get(kind, {}).values()]:
-            for place in places:  # what comes twice meanwhile is taken once: it has a number
+            # a message that comes twice meanwhile is taken once, by its number
+            for place in places:
                 own, place.own = place.own, None
                 if own is not None:
                     own.close()
@@ -122,11 +124,11 @@ class Exchange(Bus):
         return place
 
     def _name(self, key: str) -> str:
-        """Return by what a place is found: a presence's has the agent in its key, any one."""
+        """Return the name of a receiver's key; for a presence it is that of any agent."""
         return key.split("/", 5)[5] if "/presence/camera/" in key else key
 
     def drop(self, place: _BusPlace) -> None:
-        """Nobody is there any more."""
+        """Drop a receiver that is no longer used."""
         kind, name = self._kind(place.key), self._name(place.key)
         there = self._places[kind]
         there[name].remove(place)
@@ -174,7 +176,7 @@ class Exchange(Bus):
                 place.call(key, runs)
 
     def _find_gaps(self, agent: str) -> None:
-        """Something that an agent said was lost, or the first of it."""
+        """Ask for an agent's numbers after a lost bundle, or its first one."""
         asking = self._asking.get(agent)
         if asking is None or asking.done():
             self._asking[agent] = asyncio.get_running_loop().create_task(
@@ -187,7 +189,7 @@ class Exchange(Bus):
             del self._asking[agent]
 
     async def _ask_numbers(self, agent: str) -> None:
-        """Tell subscribers the next result numbers of an agent's cameras, to find gaps by."""
+        """Ask for the next result numbers of an agent's cameras, by which gaps are found."""
         keys, bus = self._keys(), self._bus
         while agent in self._lacking:
             self._lacking.discard(agent)
@@ -228,7 +230,7 @@ class Exchange(Bus):
 
     @property
     def identity(self) -> Identity | None:  # type: ignore[override]
-        """Identity in the certificate that the end shows."""
+        """Identity in the certificate of the end."""
         return self._bus.identity
 
     async def open(self, timeout: float) -> Self:
@@ -236,7 +238,7 @@ class Exchange(Bus):
         return self
 
     async def leave(self) -> None:
-        """Hear nothing more. Idempotent."""
+        """Stop receiving. Idempotent."""
         tasks = [*self._asking.values()]
         for task in tasks:
             task.cancel()

@@ -300,7 +300,7 @@ class Receiver:
                 things = _things(kind, reply)
             except (ProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
-                first = following = feed.expected + 1  # or it would be asked for for ever
+                first = following = feed.expected + 1  # or it would be asked for forever
                 things = []
             feed.fill(epoch, first, following, things)
             self._wake()
@@ -494,4 +494,4 @@ def _things(kind: str, reply: BusMessage) -> list[Any]:
 
 
 def _ignore(_count: int, _then: ToldState | None) -> None:
-    """Ignore states that are missed for ever: the next one tells the camera's state."""
+    """Ignore states that are missed forever: the next one tells the camera's state."""

@@ -56,7 +56,7 @@ class CertificateWatch:
         self._trouble = ""
 
     async def run(self) -> None:
-        """Look at the files now and then, for ever."""
+        """Look at the files now and then, forever."""
         seen = self._end.identity
         while True:
             await asyncio.sleep(LOOK_EVERY)

@@ -77,7 +77,7 @@ def unpack(rows: NDArray[np.uint8], width: int, packing: Packing) -> NDArray[np.
 
     Args:
         rows: (H, N), at least the bytes of ``width`` pixels in each row.
-        width: pixels in a row.
+        width: number of pixels in a row.
         packing: places of the pixels' bits.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A device that is open: what it is, what it can stream, and its refusals as errors of ours."""
+"""A device that is open: what it is, what it can stream, and its refusals as errors of smartcam."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ class V4L2Driver(FrameDriver):
     async def _do(self, job: Callable[[], Value], what: str) -> Value:
         """Have the thread do something, after all that it was given before.
 
-        Cancellation: it is done all the same, and what it leaves the next :meth:`stop` ends.
+        Cancellation: it is done nevertheless, and what it leaves the next :meth:`stop` ends.
         """
         if self._thread is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`")

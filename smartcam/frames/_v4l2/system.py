@@ -1,4 +1,4 @@
-"""All calls of the system, in one place: tests answer in its stead."""
+"""Wrap all calls of the system in one place, which tests replace."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SYSFS: Final = Path("/sys/class/video4linux")
 
 
 def open(path: str) -> int:
-    """Open a device; no call on it will wait."""
+    """Open a device; without blocking calls."""
     return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
@@ -27,11 +27,11 @@ def close(device: int) -> None:
 
 
 def ioctl(device: int, request: Ioctl, argument: bytearray) -> None:
-    """Ask the driver; its answer stands in ``argument``."""
+    """Send a request to the driver; its answer is in ``argument``."""
     while True:
         try:
             fcntl.ioctl(device, request.number, argument)
-        except InterruptedError:  # by a signal, before anything was done
+        except InterruptedError:  # interrupted by a signal, before anything was done
             continue
         return
 
@@ -42,13 +42,13 @@ def pages(device: int, length: int, offset: int) -> mmap.mmap:
 
 
 def nodes() -> dict[str, str]:
-    """Return the video devices that are here, path to name; none is opened."""
+    """Return the names of the existing video devices by path; none is opened."""
     found = sorted(SYSFS.glob("video*"), key=lambda one: (len(one.name), one.name))
     return {f"/dev/{one.name}": _name(one) for one in found}
 
 
 def now() -> float:
-    """Return the time of the clock that drivers stamp with, seconds."""
+    """Return the time of the clock that drivers use for frames, seconds."""
     return time.clock_gettime(time.CLOCK_MONOTONIC)
 
 

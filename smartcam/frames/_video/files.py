@@ -38,7 +38,7 @@ UNBUFFERED_WAIT_TIME: Final = 0.01
 """Seconds after which a packet that was waited for came just now, and not out of a buffer."""
 
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
-"""Codecs whose bytes are a format of ours, and so can be handed on as they are."""
+"""Codecs whose bytes are a format of smartcam, and so can be passed on unchanged."""
 
 _ONE_BY_ONE: Final = frozenset({"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"})
 """Codecs in which a damaged picture spoils no other picture."""

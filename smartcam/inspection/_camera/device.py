@@ -199,7 +199,7 @@ class SoftwareDevice(Server):
             raise
 
     async def stop(self) -> None:
-        """Close the port and the source. Harmless when done twice.
+        """Close the port and the source. Harmless when called twice.
 
         Cancellation: everything is closed nevertheless.
         """

@@ -37,9 +37,9 @@ class JudgedResults(Observer):
     of which is lost. A result whose bytes are not those of the container has no picture.
 
     Args:
-        session: returns the number of the device's session, 0 where it has none, and its last
-            report of a run.
-        received: returns how many containers the client has got so far.
+        session: function that returns the number of the device's session, 0 where it has none, and
+            its last report of a run.
+        received: function that returns how many containers the client has got so far.
         found: function that is called with each result whose picture is known, before others see
             the result.
         kept: number of last results whose pictures are kept for :meth:`judged_of`.

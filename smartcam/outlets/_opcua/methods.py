@@ -67,7 +67,7 @@ class Methods:
         nodes: nodes of the camera.
         values: values of the server.
         book: results that clients may ask for.
-        settled: returns when what was put before is published.
+        settled: function that returns when what was put before is published.
     """
 
     def __init__(

@@ -203,7 +203,7 @@ class CameraNodes:
             result: the result.
             recipe: name of its recipe.
             columns: names, types and units of its values.
-            keep: called with what is to be kept of it, before the event.
+            keep: function that is called with what is to be kept of it, before the event.
         """
 
         async def publish() -> None:

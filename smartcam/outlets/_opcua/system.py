@@ -83,9 +83,9 @@ class VisionSystem:
         settings: settings of the server.
         command: does a command by the camera's name, a verb and its fields.
         face: the side that clients see.
-        picture: returns the file of a result's picture.
-        new_job: returns an id for a job.
-        names: returns the names of the camera's own applications, with their numbers.
+        picture: function that returns the file of a result's picture.
+        new_job: function that returns an id for a job.
+        names: function that returns the names of the camera's own applications, with their numbers.
         simulated: True for an emulated camera, False for a real one, None if that is not known.
     """
 

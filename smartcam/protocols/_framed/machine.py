@@ -213,8 +213,8 @@ class Machine:
         transport: stream or datagrams.
         max_length: bytes of the largest payload that is accepted.
         policy: policy in place of the role's own; the emulator's quirks use it.
-        trace: called with the sender and each whole frame, in both directions, and with the error
-            for bytes that make no frame.
+        trace: function that is called with the sender and each whole frame, in both directions, and
+            with the error for bytes that make no frame.
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
             that the answer to Connect does not fit are left out when it comes; where several are
             left, :meth:`adopt` decides.

@@ -52,7 +52,8 @@ class AnswerReader(LineReader):
 
     Args:
         max_length: longest text of an answer that says its length, bytes.
-        on_pieces: called with pieces that came, and whether a line end stood behind each.
+        on_pieces: function that is called with pieces that came, and whether a line end stood
+            behind each.
     """
 
     def __init__(

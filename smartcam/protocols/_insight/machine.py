@@ -119,8 +119,8 @@ class InSightMachine:
         role: the client's.
         transport: TCP.
         max_length: longest data of an answer, bytes; of an image 64 MiB.
-        trace: called with each piece in both directions, see :class:`Piece`, and with the error for
-            what broke the protocol; never with the password.
+        trace: function that is called with each piece in both directions, see :class:`Piece`, and
+            with the error for what broke the protocol; never with the password.
         kin: unused, there is one dialect.
 
     Raises:

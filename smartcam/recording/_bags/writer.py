@@ -127,7 +127,7 @@ def _is_of_bag(folder: Path, path: Path) -> bool:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a bag of ours, which nobody writes any more."""
+    """Remove a bag of smartcam that is no longer written."""
     for path in (folder / METADATA, folder / _HALF, mcap_of(folder)):
         path.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # somebody has put something there

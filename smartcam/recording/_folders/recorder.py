@@ -58,8 +58,8 @@ class FleetRecorder(Server):
     Args:
         server: server whose cameras are recorded; not started yet.
         section: what is recorded, and where; default: what the server's file says.
-        on_trouble: called in the event loop with why nothing is written any more, and with None
-            when it is again.
+        on_trouble: function that is called in the event loop with why nothing is written any more,
+            and with None when it is again.
 
     Attributes:
         path: the folder.

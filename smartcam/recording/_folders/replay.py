@@ -40,7 +40,8 @@ class FleetReplay(Server):
         speed: factor by which to play faster than recorded, 0.001 to 1000.
         loop: begin again where something is over.
         listen: endpoint of the agent; port 0 takes a free one.
-        on_over: called once for each camera, with its name, when nothing of it is left.
+        on_over: function that is called once for each camera, with its name, when nothing of it is
+            left.
 
     Attributes:
         skipped: reasons why cameras are not played, by name: there was no session, or no camera of
@@ -142,7 +143,7 @@ class FleetReplay(Server):
             self._server, self._stack = server, stack.pop_all()
 
     async def stop(self) -> None:
-        """Stop the agent and the cameras. Harmless when done twice."""
+        """Stop the agent and the cameras. Harmless when called twice."""
         self._server = None
         await self._stack.aclose()
 

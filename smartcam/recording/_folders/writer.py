@@ -44,7 +44,7 @@ MIN_FREE_BYTES = 4 * CHUNK
 """Least number of bytes that must be free on a disk that was full before it is tried again."""
 
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
-"""Seconds until a disk that did not take something is tried again; the last for ever."""
+"""Seconds until a disk that did not take something is tried again; the last forever."""
 
 EVENT_ROOM = 2
 """Factor by which more may wait before events are left out, too: they tell the camera's state."""
@@ -76,7 +76,8 @@ class FolderWriter:
         folder: folder that holds the files.
         limits: bounds on the files.
         compress: function that packs a chunk.
-        tell: called in the thread with why nothing is written, and with None when it is again.
+        tell: function that is called in the thread with why nothing is written, and with None when
+            it is again.
         clock: function that returns seconds, for the files' age and delays.
 
     Attributes:

@@ -56,8 +56,8 @@ class RotatingRecorder:
         size: bytes of a file, behind which the next one begins.
         age: seconds of a file, behind which the next one begins.
         keep: bytes of all files together; beyond them the oldest recordings are deleted.
-        on_trouble: called in the writer's thread with why nothing is written, and with None when
-            it is again.
+        on_trouble: function that is called in the writer's thread with why nothing is written, and
+            with None when it is again.
 
     Attributes:
         path: path that was given.

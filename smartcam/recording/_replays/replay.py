@@ -176,7 +176,8 @@ class ReplayedCamera(EmulatedCamera):
             fields of :class:`~smartcam.emulator.Quirks`.
         clock: clock that the replay runs by; default: real time.
         name: name for logs; default the recorded one.
-        on_over: called once, in the event loop, when nothing is left; never with ``loop``.
+        on_over: function that is called once, in the event loop, when nothing is left; never with
+            ``loop``.
 
     Attributes:
         plan: plan of what is played.
@@ -462,7 +463,8 @@ def replay(
         camera: name of the camera in it; default the only one there is.
         speed: factor by which to play faster than recorded, 0.001 to 1000.
         loop: begin again where something is over.
-        on_over: called once, in the event loop, when no trigger is left; never with ``loop``.
+        on_over: function that is called once, in the event loop, when no trigger is left; never
+            with ``loop``.
         options: options of :class:`ReplayedCamera`, or of a :class:`~smartcam.emulator.LineCamera`.
 
     Raises:

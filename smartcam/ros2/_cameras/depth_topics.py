@@ -55,8 +55,8 @@ class DepthTopics:
     ``/tf_static`` from the first pair on.
 
     Args:
-        stereo: makes a :class:`smartcam.depth.StereoDepth`, not open, each time that somebody
-            begins to hear; or one that is open, which stays the caller's, and streams on.
+        stereo: function that makes a :class:`smartcam.depth.StereoDepth`, not open, each time that
+            somebody begins to hear; or one that is open, which stays the caller's, and streams on.
         node: open node of ROS.
         frame_id: frame id of the left camera after rectification; "": the node's name with
             ``_left_optical``.
@@ -112,7 +112,7 @@ class DepthTopics:
     async def close(self) -> None:
         """Be gone; a pair of the caller's stays open. Idempotent.
 
-        Cancellation: all is closed all the same.
+        Cancellation: all is closed nevertheless.
         """
         stream, self._stream = self._stream, None
         try:

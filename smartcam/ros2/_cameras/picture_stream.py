@@ -77,7 +77,7 @@ class HeardPictures(Generic[Item]):
     async def close(self) -> None:
         """Read no longer. Idempotent.
 
-        Cancellation: it ends all the same.
+        Cancellation: it ends nevertheless.
         """
         self.end()
         if self._task is not None:

@@ -133,7 +133,7 @@ class CameraPictures:
     async def close(self) -> None:
         """Be gone; a source of the caller's stays open. Idempotent.
 
-        Cancellation: all is closed all the same.
+        Cancellation: all is closed nevertheless.
         """
         streams, self._streams = self._streams, []
         for one in streams:

@@ -30,7 +30,8 @@ PICTURE_WAIT: Final = 25.0
 """Seconds that a picture on a topic is waited for."""
 
 MAX_APART: Final = 60.0
-"""Seconds between a stamp and this computer's clock beyond which the stamp is no time of ours."""
+"""Seconds between a stamp and this computer's clock beyond which the stamp is no time of this
+clock."""
 
 
 class CameraGraph:

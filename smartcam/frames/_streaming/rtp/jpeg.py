@@ -1,4 +1,4 @@
-"""JPEGs of RTP packets (RFC 2435)."""
+"""Assemble JPEGs from RTP packets (RFC 2435)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Final
 from smartcam.frames._streaming.rtp.assembling import OpenUnit
 
 HEAD: Final = 8
-"""Bytes before a packet's piece of a picture."""
+"""Number of bytes before a packet's piece of a picture."""
 
 RESTARTS: Final = range(64, 128)
 """Types of pictures with restart markers."""
 
 MAX_QUANTIZATION_TABLES: Final = 64
-"""Sets of quantization tables that are remembered, by their quality."""
+"""Largest number of remembered sets of quantization tables, by their quality."""
 
 _LUMA: Final = (
     "16 11 12 14 12 10 16 14 13 14 18 17 16 19 24 40 26 24 22 22 24 49 35 37 29 40 58 51 61 60 57 "
@@ -26,7 +26,7 @@ _CHROMA: Final = (
     "99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 "
     "99 99"
 )
-"""Tables of quality 50 in the order of their zigzag (ITU-T T.81, annex K.1)."""
+"""Quantization tables of quality 50 in zigzag order (ITU-T T.81, annex K.1)."""
 
 _HUFFMAN: Final = tuple(
     (place, bytes.fromhex(counts), bytes.fromhex(values))
@@ -51,14 +51,14 @@ _HUFFMAN: Final = tuple(
         ),
     )
 )
-"""Tables of the codes that every such picture has (annex K.3): where they go, counts, values."""
+"""Huffman tables of every such picture (annex K.3): class and id, counts, values."""
 
 
 class JpegUnits:
     """The kind of a stream of JPEGs; it remembers tables that are sent once.
 
     Args:
-        size: size of the pictures where the packets have no room for it: above 2040 pixels.
+        size: size of the pictures, if it is above 2040 pixels and so not in the packets.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:
@@ -81,7 +81,7 @@ class JpegUnit(OpenUnit):
     def __init__(self, kind: JpegUnits, timestamp: int, whole: bool, arrived: float) -> None:
         super().__init__(timestamp, whole, arrived)
         self._of = kind
-        self._next = 0  # offset of the next piece
+        self._next = 0  # offset of the next piece in the picture
 
     def data(self) -> bytes:
         """Return the picture as a file."""
@@ -108,7 +108,7 @@ class JpegUnit(OpenUnit):
         return bool(piece)
 
     def _tables(self, payload: bytes, place: int) -> tuple[int, tuple[bytes, ...]] | None:
-        """Return the place behind the tables, and the tables; None: they are not known."""
+        """Return the offset after the tables, and the tables; None: they are not known."""
         quality = payload[5]
         if quality < 128:
             return (place, scaled(quality)) if 1 <= quality < 100 else None
@@ -155,7 +155,7 @@ def scaled(quality: int) -> tuple[bytes, ...]:
 
 
 def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
-    """Return the tables in ``data``: each has 64 bytes, or 128 where its bit in ``wide`` is set."""
+    """Return the tables in ``data``: each has 64 bytes, or 128 if its bit in ``wide`` is set."""
     found: list[bytes] = []
     while data and len(found) < 4:
         size = 128 if wide >> len(found) & 1 else 64
@@ -167,7 +167,7 @@ def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
 
 
 def size_in(picture: bytes) -> tuple[int, int] | None:
-    """Return the size that a picture's head says; it is one of ours."""
+    """Return the size in the header of a picture that was assembled here."""
     place = picture.find(b"\xff\xc0\0\x11\x08")
     if place < 0 or len(picture) < place + 9:
         return None

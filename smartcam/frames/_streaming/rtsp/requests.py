@@ -1,4 +1,4 @@
-"""Do what each method asks of the server (RFC 2326, section 10)."""
+"""Carry out the requests to the server (RFC 2326, section 10)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_SESSIONS: Final = 8
 """Largest number of sessions of one connection."""
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
-"""Seconds for the frame that a description is made of; FFmpeg waits longer for an answer."""
+"""Seconds to wait for the frame from which a description is made; FFmpeg waits longer."""
 
 ELSEWHERE: Final = ("ANNOUNCE", "RECORD", "REDIRECT")
 """Methods of RTSP that this server does not have."""
@@ -41,10 +41,10 @@ class RtspAnswer(NamedTuple):
 
 
 async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
-    """Do what a request asks for.
+    """Carry out a request.
 
     Raises:
-        RtspError: the request is answered with that.
+        RtspError: the request is answered with this error.
     """
     method = request.method
     if method not in METHODS:
@@ -56,7 +56,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
         raise RtspError(
             551, f"no option is known, {wanted[:80]!r} neither", (("Unsupported", wanted),)
         )
-    if method == "OPTIONS":  # anybody may ask that
+    if method == "OPTIONS":  # this request needs no password
         return await _options(connection, request)
     connection.gate.check(request)
     for session in connection.sessions.values():
@@ -170,7 +170,7 @@ async def _teardown(connection: RtspConnection, request: RtspRequest) -> RtspAns
 
 
 async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
-    """Note that the client is there, which is what it is for; we have no parameters."""
+    """Note that the client is alive, the purpose of this request: there are no parameters."""
     if request.url != "*":
         target_of(request.url)
     headers: tuple[tuple[str, str], ...] = ()
@@ -189,7 +189,7 @@ def _session(connection: RtspConnection, request: RtspRequest) -> RtspSession:
 
 
 def _aimed(connection: RtspConnection, request: RtspRequest) -> tuple[RtspTarget, RtspSession]:
-    """Return the target of a request, and its session."""
+    """Return a request's target and session."""
     target = target_of(request.url)
     stream = connection.owner.stream(target.name)
     if "session" not in request.headers and not connection.sessions:

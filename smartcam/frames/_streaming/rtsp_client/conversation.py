@@ -250,7 +250,7 @@ class RtspConversation:
         link.abort()
 
     def _elsewhere(self, location: str) -> str:
-        """Return the URL that a redirect leads to; another host gets no password of ours."""
+        """Return the URL that a redirect leads to; another host gets no password."""
         try:
             to = urlsplit(urljoin(self._url, location))
             if to.scheme not in PORTS or not to.hostname or to.port == 0:

@@ -1,4 +1,4 @@
-"""Cameras that are asked by RTSP as sources of frames."""
+"""Use cameras with RTSP as sources of frames."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ KNOWN: Final = ("delay", "elsewhere", "format", "name", "timeout", "transport")
 
 
 class RtspDriver(FrameDriver):
-    """A camera that is asked by RTSP: ``rtsp://admin:PASSWORD@camera/stream?channel=1``.
+    """A camera with RTSP: ``rtsp://admin:PASSWORD@camera/stream?channel=1``.
 
-    H.264, H.265 and JPEG; what else a camera may send is left to FFmpeg. The query belongs to the
-    camera, so our parameters stand behind ``#``: ``...#transport=udp&timeout=3``.
+    It reads H.264, H.265 and JPEG; other codings are left to FFmpeg. The query belongs to the
+    camera, so smartcam's parameters follow ``#``: ``...#transport=udp&timeout=3``.
 
     ================= =============================================================================
     ``transport``     ``tcp``, over the connection, or ``udp``; usual: over the connection, or by
@@ -53,14 +53,14 @@ class RtspDriver(FrameDriver):
     ``name``          of the camera
     ================= =============================================================================
 
-    Only whole pictures come, each with its last packet. After a loss nothing is shown until the
-    picture is whole again: with the next key frame, for which the camera is asked, or at the end of
-    a refresh. ``frame.lost`` counts the frames that were lost or left out.
+    Only whole pictures come, each with its last packet. After a loss no picture comes until one is
+    whole again: with the next key frame, which is requested, or at the end of a refresh.
+    ``frame.lost`` counts the frames that were lost or left out.
 
-    ``captured`` is when a frame's first packet arrived. As soon as the camera told what its clock
-    says (RTCP sender reports), ``device_time`` is the frame's time on it, in seconds since 1970.
+    ``captured`` is the arrival of a frame's first packet. Once the camera has reported its clock
+    (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
 
-    Its features are parameters of RTSP, by the names that its maker tells.
+    Its features are parameters of RTSP, by their names in its maker's documents.
     """
 
     lists_features = False
@@ -92,7 +92,7 @@ class RtspDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """The address without password, query and fragment, or as the URL says."""
+        """Address without password, query and fragment, or the name in the URL."""
         return self._name
 
     @property
@@ -101,7 +101,7 @@ class RtspDriver(FrameDriver):
         return RtspParameters(self._name, self._ask)
 
     async def _ask(self, method: str, body: bytes) -> ServerAnswer:
-        """Ask on the connection that plays, or on one for this request."""
+        """Send a request on the playing connection, or on one for this request."""
         if self._other is not None:
             raise UnsupportedError(
                 f"{self._name}: FFmpeg reads this stream, and asks for no parameters"
@@ -119,7 +119,7 @@ class RtspDriver(FrameDriver):
         return RtpStatistics() if self._playing is None else self._playing.statistics()
 
     async def open(self) -> StreamFormat:
-        """Wait for a picture, and let the camera go again.
+        """Wait for a picture, and disconnect from the camera again.
 
         Raises:
             FrameFormatError: there is no video.
@@ -201,8 +201,8 @@ class _Playing:
     """The tasks and the connection of a driver while a camera plays.
 
     Args:
-        watched: whether silence ends it; who opens it has a timeout of its own, and says more.
-        proofs: frames of the camera whose marker was right before.
+        watched: whether silence ends it; ``open`` has its own timeout with a fuller error.
+        proofs: number of the camera's frames whose marker was right before.
     """
 
     def __init__(
@@ -231,7 +231,7 @@ class _Playing:
         conversation.link.on_end = self._over
 
     async def begin(self) -> None:
-        """Have the camera play, and decode its packets."""
+        """Start playing, and decode the camera's packets."""
         await self._decoding.begin(self._receiver)
         await self.conversation.play()
         if self._watched:
@@ -239,7 +239,7 @@ class _Playing:
             self._watching = asyncio.create_task(watching, name=f"silence of {self._plan.name}")
 
     async def end(self) -> None:
-        """End all; the sink hears no more."""
+        """End everything; the sink gets nothing more."""
         watching, self._watching = self._watching, None
         if watching is not None:
             watching.cancel()
@@ -254,7 +254,7 @@ class _Playing:
 
     @property
     def proofs(self) -> int:
-        """Frames of the camera whose marker was right."""
+        """Number of the camera's frames whose marker was right."""
         return self._receiver.proofs
 
     def statistics(self) -> RtpStatistics:

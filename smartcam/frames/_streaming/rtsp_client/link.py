@@ -46,9 +46,9 @@ class RtspLink(asyncio.Protocol):
         credentials: name and password, for a server that asks for them.
 
     Attributes:
-        on_packet: takes a channel and a packet.
+        on_packet: function that takes a channel and a packet.
         on_read: function that is called after the packets that came together.
-        on_end: takes why the server ended it, once.
+        on_end: function that takes why the server ended it, once.
     """
 
     def __init__(self, name: str, credentials: Credentials) -> None:

@@ -1,4 +1,4 @@
-"""Parameters of an RTSP camera as features (RFC 2326, sections 10.8 and 10.9).
+"""Read and set parameters of an RTSP camera as features (RFC 2326, sections 10.8 and 10.9).
 
 The protocol reads and sets a parameter by its name, as text. It has no list of them, no kinds,
 ranges or units, and no commands; many cameras know no parameter at all.
@@ -25,20 +25,20 @@ READ_ONLY: Final = 458
 INVALID: Final = 457
 
 WITHOUT_METHOD: Final = (405, 501, 551)
-"""Answers of a camera that reads, or sets, no parameters."""
+"""Status codes of a camera that does not read or set parameters."""
 
 MAX_SHOWN_CHARACTERS: Final = 80
-"""Characters of a name, value or answer in an error's text."""
+"""Largest number of characters of a name, value or answer in an error's text."""
 
 
 class RtspParameters(DeviceFeatures):
-    """The parameters of a camera, by the names that its maker tells.
+    """The parameters of a camera, by their names in its maker's documents.
 
-    A name goes to the camera as it is given, since there is no list to find another spelling in.
+    A name is sent unchanged, since there is no list in which another spelling could be found.
 
     Args:
         name: name of the source, for errors.
-        ask: sends a method with a body, and returns the answer.
+        ask: function that sends a method with a body, and returns the answer.
     """
 
     def __init__(self, name: str, ask: Callable[[str, bytes], Awaitable[ServerAnswer]]) -> None:
@@ -49,7 +49,7 @@ class RtspParameters(DeviceFeatures):
         self._cannot("list its parameters: read one by the name that its maker tells")
 
     async def describe(self, name: str) -> Feature:
-        """Return a parameter with its value; that is a text, of which the camera tells no range."""
+        """Return a parameter with its value; it is a text, and the camera reports no range."""
         return Feature(name, "string", "rw", value=await self.get(name))
 
     async def get(self, name: str) -> FeatureValue:
@@ -70,7 +70,7 @@ class RtspParameters(DeviceFeatures):
         raise self._wrong(name, f"expected its value from {READ}, {got}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a parameter; return what the camera says of it then, or the value where it does not.
+        """Set a parameter; return the camera's new value, or the given one if it reports none.
 
         A value of more than one line is refused.
         """
@@ -81,7 +81,7 @@ class RtspParameters(DeviceFeatures):
         await self._answered(SET, name, f"{name}: {text}\r\n")
         try:
             return await self.get(name)
-        except (FrameFeatureError, UnsupportedError):  # it can be set, and not be read
+        except (FrameFeatureError, UnsupportedError):  # the parameter can be set, but not read
             return value
 
     async def execute(self, name: str) -> None:
