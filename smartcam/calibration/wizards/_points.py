@@ -268,7 +268,7 @@ class PointSource(Touches, ABC):
         return refused(error.code or "", str(error))
 
     def _fits_without(self, index: int) -> bool:
-        """Return whether the touches fit, and one is left to show it, without one of them."""
+        """Return True if the touches fit without one of them, and one more is left to show it."""
         rest = copy.copy(self)
         rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
