@@ -44,8 +44,8 @@ class KeepsFences(ShortDispatch):
 class LooksAtSizes(ShortMachine):
     """Takes any delivery of a known size for the known one."""
 
-    def _note_delivery(self, *arguments: Any) -> None:
-        super()._note_delivery(*arguments)
+    def _note_delivery(self, buffer: bytes, owed: tuple[set[int], set[int]]) -> None:
+        super()._note_delivery(buffer, owed)
         for size, known in self._deliveries.items():
             self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
 
