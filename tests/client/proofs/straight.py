@@ -74,7 +74,7 @@ _QUERY = m.Query()
 class JudgingDispatch(Dispatch):
     """Hands on each event by itself."""
 
-    def _take_round(self, *_: object) -> bool:
+    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
         return False
 
 
@@ -83,8 +83,8 @@ class ShortDispatch(Dispatch):
 
     taken = 0
 
-    def _take_round(self, *arguments: Any) -> bool:
-        taken = super()._take_round(*arguments)
+    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._take_round(events, now, at)
         ShortDispatch.taken += taken
         return taken
 

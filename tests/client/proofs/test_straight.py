@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any
 
 import pytest
@@ -22,9 +23,9 @@ def test_short_way_gives_what_the_long_one_gives(caplog: pytest.LogCaptureFixtur
 class ForgetsStatuses(ShortDispatch):
     """Does not count the statuses around a result."""
 
-    def _take_round(self, *arguments: Any) -> bool:
+    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
         heard = self._state.statuses_heard
-        taken = super()._take_round(*arguments)
+        taken = super()._take_round(events, now, at)
         if taken:
             self._state.statuses_heard = heard
         return taken
@@ -33,8 +34,8 @@ class ForgetsStatuses(ShortDispatch):
 class KeepsFences(ShortDispatch):
     """Still waits for the answers that it has taken."""
 
-    def _take_round(self, *arguments: Any) -> bool:
-        taken = super()._take_round(*arguments)
+    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._take_round(events, now, at)
         if taken:
             self._waits.expect_fences(2)
         return taken
@@ -43,8 +44,8 @@ class KeepsFences(ShortDispatch):
 class LooksAtSizes(ShortMachine):
     """Takes any delivery of a known size for the known one."""
 
-    def _note_delivery(self, *arguments: Any) -> None:
-        super()._note_delivery(*arguments)
+    def _note_delivery(self, buffer: bytes, owed: tuple[set[int], set[int]]) -> None:
+        super()._note_delivery(buffer, owed)
         for size, known in self._deliveries.items():
             self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
 
