@@ -121,7 +121,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
-        outcome: makes what one task may wait for, to be set by the receive task, or by others.
+        outcome: function that makes a future for one task to wait for, which the receive task or
+            another one sets.
         heard_at: loop time of the last byte received.
     """
 
