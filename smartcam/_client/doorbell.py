@@ -5,11 +5,11 @@ each delivery of bytes that costs more than processing them. A caller that rings
 a callback of the loop, as a transport does, makes the task go on at once. It is still a task: an
 exception in it ends the task, and never reaches the caller.
 
-A caller that waits for an :class:`Outcome` goes on in the same way, once the receive task sleeps
-again: no task can begin a step within another one's. Outcomes that come otherwise, such as a
-timeout, wake by way of the loop.
+A caller that waits for a :class:`DirectFuture` goes on in the same way, once the receive task
+sleeps again: no task can begin a step within another one's. A result that comes otherwise, such as
+a timeout, wakes the caller by way of the loop.
 
-:class:`Doorbell` and :class:`Outcome` use the protocol between asyncio's tasks and futures
+:class:`Doorbell` and :class:`DirectFuture` use the protocol between asyncio's tasks and futures
 (``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` uses
 only futures: it is chosen by the environment variable ``SMARTCAM_DOORBELL=plain``, for a Python or
 an event loop that does not have this protocol.
@@ -44,7 +44,7 @@ class Doorbell:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         # what came in the present delivery; None: outcomes wake by way of the loop
-        self.due: list[Outcome[Any]] | None = None
+        self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
         # function that wakes the waiting task; None if nobody waits
         self._wake: Callable[[Doorbell], None] | None = None
@@ -83,9 +83,9 @@ class Doorbell:
             except ENDS_PROGRAM as exc:
                 loop.call_soon(_raise, exc)
 
-    def outcome(self) -> Outcome[Any]:
+    def outcome(self) -> DirectFuture[Any]:
         """Return an outcome that one task may wait for."""
-        return Outcome(self)
+        return DirectFuture(self)
 
     # ------------------------------------------------------------------ for the task's machinery
 
@@ -114,7 +114,7 @@ class Doorbell:
         """Return nothing: a ring carries no value."""
 
 
-class Outcome(Generic[T]):
+class DirectFuture(Generic[T]):
     """A result or an error that one task waits for, once; as a future is used.
 
     Cancellation: safe; the task is woken by the loop.
@@ -131,7 +131,7 @@ class Outcome(Generic[T]):
         self._done = self._cancelled = False
         self._value: T | None = None
         self._error: BaseException | None = None
-        self._wake: Callable[[Outcome[T]], None] | None = None  # None: nobody waits
+        self._wake: Callable[[DirectFuture[T]], None] | None = None  # None: nobody waits
         self._context: contextvars.Context | None = None
 
     def done(self) -> bool:
@@ -185,7 +185,7 @@ class Outcome(Generic[T]):
 
     # ------------------------------------------------------------------ for the task's machinery
 
-    def __await__(self) -> Generator[Outcome[T], None, T]:
+    def __await__(self) -> Generator[DirectFuture[T], None, T]:
         if not self._done:
             self._asyncio_future_blocking = True
             yield self  # which raises the error
@@ -197,7 +197,7 @@ class Outcome(Generic[T]):
         return self._bell.get_loop()
 
     def add_done_callback(
-        self, wake: Callable[[Outcome[T]], None], *, context: contextvars.Context
+        self, wake: Callable[[DirectFuture[T]], None], *, context: contextvars.Context
     ) -> None:
         """Note that the task sleeps now; ``wake`` has it go on."""
         self._wake, self._context = wake, context

@@ -36,7 +36,7 @@ from smartcam.protocols.messages import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam._client.doorbell import Outcome
+    from smartcam._client.doorbell import DirectFuture
     from smartcam.protocols import Frame, Protocol
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
@@ -121,7 +121,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
-        outcome: makes what one task may wait for, to be set by the receive task, or by others.
+        outcome: function that makes a future for one task to wait for, which the receive task or
+            another one sets.
         heard_at: loop time of the last byte received.
     """
 
@@ -158,7 +159,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._busy_since: float | None = None
         self._busy_with = 0
         self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
-        self.outcome: Callable[[], Outcome[Any] | asyncio.Future[Any]] = bell.outcome
+        self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
         self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()

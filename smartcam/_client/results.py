@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
-    from smartcam._client.doorbell import Outcome
+    from smartcam._client.doorbell import DirectFuture
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.listeners import Listeners
     from smartcam.protocols._inside import ResultBurst
@@ -64,7 +64,7 @@ class PendingTrigger(SentTrigger):
             fate ``triggered`` are its own then), and the containers behind them.
     """
 
-    outcome: Outcome[list[Result]] | asyncio.Future[list[Result]]
+    outcome: DirectFuture[list[Result]] | asyncio.Future[list[Result]]
     interpretation: Interpretation
     has_input: bool
     sent_at: float

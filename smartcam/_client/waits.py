@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam._client.counters import ClientCounters
-    from smartcam._client.doorbell import Outcome
+    from smartcam._client.doorbell import DirectFuture
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
@@ -36,7 +36,7 @@ def told(error: ErrorT) -> ErrorT:
     return made
 
 
-Waiter: TypeAlias = "Outcome[None] | asyncio.Future[None]"
+Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"
 
 
 class OwedAnswer(asyncio.Future[Answer]):

@@ -124,7 +124,7 @@ async def after_it_was_taken(box: HandmadeCamera, camera: Camera) -> object:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DirectFuture:
     """The end of a trigger."""
 
     error: type[SmartCamError]  # with what
@@ -138,57 +138,57 @@ class Outcome:
 SILENT = answers()
 FAST: dict[str, Any] = {"reconnect": Backoff(initial=0.001, jitter=0.0)}
 BY_HAND = {
-    "overtriggered": Outcome(
+    "overtriggered": DirectFuture(
         OvertriggeredError, "it cannot be told whose", answers(RUNNING | OVERTRIGGERED)
     ),
-    "stopped": Outcome(NotRunningError, "application 7 is stopped", status=0),
-    "stopped meanwhile": Outcome(
+    "stopped": DirectFuture(NotRunningError, "application 7 is stopped", status=0),
+    "stopped meanwhile": DirectFuture(
         NotRunningError, "somebody else stopped application 7 during", answers(RUNNING, 0)
     ),
-    "loaded meanwhile": Outcome(
+    "loaded meanwhile": DirectFuture(
         NotRunningError, "somebody else stopped application 7 during", answers(RUNNING, BUSY)
     ),
-    "busy": Outcome(
+    "busy": DirectFuture(
         CameraBusyError, "does not wait for a trigger", status=BUSY, play=without_patience
     ),
-    "inspecting": Outcome(
+    "inspecting": DirectFuture(
         CameraBusyError, "does not wait for a trigger", status=RUNNING, play=without_patience
     ),
-    "fault": Outcome(CameraFaultError, "System Error", status=READY | SYSTEM_ERROR),
-    "fault meanwhile": Outcome(
+    "fault": DirectFuture(CameraFaultError, "System Error", status=READY | SYSTEM_ERROR),
+    "fault meanwhile": DirectFuture(
         CameraFaultError, "System Error", answers(RUNNING, RUNNING | SYSTEM_ERROR)
     ),
-    "input out of step": Outcome(
+    "input out of step": DirectFuture(
         InputContainerError, "out of step", answers(RUNNING | INPUT_CONTAINER), play=with_input
     ),
-    "no result": Outcome(TriggerTimeoutError, "no result within", SILENT, play=short),
-    "never waits": Outcome(TriggerTimeoutError, "runs free", status=RUNNING, play=short),
-    "result of another application": Outcome(
+    "no result": DirectFuture(TriggerTimeoutError, "no result within", SILENT, play=short),
+    "never waits": DirectFuture(TriggerTimeoutError, "runs free", status=RUNNING, play=short),
+    "result of another application": DirectFuture(
         WrongApplicationError,
         "a result of application 3 came, application 7 was expected",
         answers(RUNNING, result=b"?", application=3),
         options={"application": 7},
     ),
-    "result of another application than was active": Outcome(
+    "result of another application than was active": DirectFuture(
         WrongApplicationError,
         "a result of application 3 came, application 7 was expected",
         answers(RUNNING, result=b"?", application=3),
     ),
-    "application that the mapping lacks": Outcome(
+    "application that the mapping lacks": DirectFuture(
         WrongApplicationError,
         r"interpret_as knows \[1, 3\]",
         options={"interpret_as": {1: "raw", 3: "raw"}},
     ),
-    "result that does not fit": Outcome(InterpretationError, "got 5", play=of_a_number),
-    "application that is not there": Outcome(
+    "result that does not fit": DirectFuture(InterpretationError, "got 5", play=of_a_number),
+    "application that is not there": DirectFuture(
         CommandRejectedError, "application 99", play=in_application_99
     ),
-    "lost": Outcome(ConnectionLostError, "is gone", SILENT, play=while_the_link_is_lost),
-    "taken": Outcome(
+    "lost": DirectFuture(ConnectionLostError, "is gone", SILENT, play=while_the_link_is_lost),
+    "taken": DirectFuture(
         ConnectionTakenError, "another client has the camera", play=after_it_was_taken, options=FAST
     ),
-    "closed": Outcome(ConnectionClosedError, "is closed", play=after_it_was_closed),
-    "closed meanwhile": Outcome(
+    "closed": DirectFuture(ConnectionClosedError, "is closed", play=after_it_was_closed),
+    "closed meanwhile": DirectFuture(
         ConnectionClosedError, "is closed", SILENT, play=while_it_is_closed
     ),
 }

@@ -12,7 +12,7 @@ import pytest
 import smartcam
 from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
 from smartcam._client import link
-from smartcam._client.doorbell import Doorbell, Outcome
+from smartcam._client.doorbell import DirectFuture, Doorbell
 from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
@@ -401,7 +401,7 @@ async def bell() -> Doorbell:
     return Doorbell(asyncio.get_running_loop())
 
 
-async def ask(outcome: Outcome[str], heard: list[str]) -> str:
+async def ask(outcome: DirectFuture[str], heard: list[str]) -> str:
     found = await outcome
     heard.append(found)
     return found
@@ -425,7 +425,7 @@ async def delivered(bell: Doorbell, do: Callable[[], object], heard: list[str]) 
 
 async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: Outcome[str] = bell.outcome()
+    outcome: DirectFuture[str] = bell.outcome()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     assert await delivered(bell, lambda: outcome.set_result("here"), heard) == ["here"]
@@ -434,7 +434,7 @@ async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) ->
 
 async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: Outcome[str] = bell.outcome()
+    outcome: DirectFuture[str] = bell.outcome()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     await delivered(bell, lambda: outcome.set_exception(ZeroDivisionError()), heard)
@@ -446,7 +446,7 @@ async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
 
 async def test_outcome_that_comes_otherwise_wakes_by_the_loop(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: Outcome[str] = bell.outcome()
+    outcome: DirectFuture[str] = bell.outcome()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     outcome.set_result("here")
@@ -458,7 +458,7 @@ async def test_outcome_that_comes_otherwise_wakes_by_the_loop(bell: Doorbell) ->
 @pytest.mark.parametrize("first", ["cancel", "result"])
 async def test_cancelled_caller_of_an_outcome_is_cancelled_once(first: str, bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: Outcome[str] = bell.outcome()
+    outcome: DirectFuture[str] = bell.outcome()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
 
