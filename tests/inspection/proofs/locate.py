@@ -13,7 +13,8 @@ and 1.05; where the error is at most 1.2 times the bound; and where nothing is m
 beside its place.
 
 FOLDER of ``--photographs`` has JPEG or PNG files without any of the parts, such as
-``BSDS500/data/images`` of github.com/BIDS/BSDS500: nothing may be found there. ``--others`` puts
+``BSDS500/data/images`` of github.com/BIDS/BSDS500, or EliSchwartz/imagenet-sample-images there,
+with which nothing was chosen: nothing may be found there. ``--others`` puts
 OpenCV's ways of finding a part beside it, in the same scenes.
 """
 
