@@ -69,8 +69,11 @@ class RawFrame:
         sender: Sender,
         frame: Frame | TraceEntry,
     ) -> None:
-        self.at, self.camera = at, camera
-        self.dialect, self.sender, self.frame = dialect, sender, frame
+        self.at: datetime = at
+        self.camera: str = camera
+        self.dialect: Dialect = dialect
+        self.sender: Sender = sender
+        self.frame: Frame | TraceEntry = frame
 
     @property
     def size(self) -> int:

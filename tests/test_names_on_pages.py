@@ -18,6 +18,7 @@ from tests.strategies import over
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
@@ -168,3 +169,9 @@ def test_renamed_function_is_found() -> None:
     assert set(missing(text)) == {
         "Machine.no_such_method", "_client/gone.py", "Link.no_such", "_client.gone",
     }  # fmt: skip
+
+
+@over("page", [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"])
+def test_links_on_a_page_have_a_text(page: Path) -> None:
+    """Sphinx gives a link without one the title of its page; elsewhere nothing is to be seen."""
+    assert re.findall(r"\[\]\([^)]*\)", page.read_text(encoding="utf-8")) == []

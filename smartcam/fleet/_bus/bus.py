@@ -284,12 +284,12 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard_parts = _ByPattern[_MemoryDeclared]()
-        self.heard = _ByPattern[_MemoryDeclared]()
-        self.answered = _ByPattern[_MemoryDeclared]()
-        self.watched = _ByPattern[_MemoryDeclared]()
-        self.present_here = _ByPattern[_MemoryDeclared]()
-        self.publishers = _ByPattern[_MemoryPublisher]()
+        self.heard_parts: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.heard: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.answered: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.watched: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.present_here: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.publishers: _ByPattern[_MemoryPublisher] = _ByPattern[_MemoryPublisher]()
 
     @property
     def attached(self) -> bool:
