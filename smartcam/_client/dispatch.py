@@ -179,7 +179,7 @@ class Dispatch:
         if (
             self._notes_events
             or listeners.events.references
-            or listeners.statuses.references
+            or listeners.hears_statuses
             or not self._waits.awaits_fences(2)
             or not state.stays(known.application, known.bits, known.endian)
             or container.application != known.application

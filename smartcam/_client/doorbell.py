@@ -77,11 +77,20 @@ class Doorbell:
             loop.call_soon(_raise, exc)
         finally:
             due, self.due = self.due, None
-        for outcome in due:
+        for outcome in due or ():
             try:
                 outcome.wake()
             except ENDS_PROGRAM as exc:
                 loop.call_soon(_raise, exc)
+
+    def wake_in_order(self) -> None:
+        """Have the callers of this delivery go on by way of the loop, behind who waits already.
+
+        Subscribers then have a result before its trigger's caller goes on.
+        """
+        due, self.due = self.due, None
+        for outcome in due or ():
+            outcome.wake_soon()
 
     def outcome(self) -> DirectFuture[Any]:
         """Return an outcome that one task may wait for."""
@@ -153,7 +162,7 @@ class DirectFuture(Generic[T]):
         self._done, self._value = True, value
         due = self._bell.due
         if due is None:
-            self._wake_soon()
+            self.wake_soon()
         else:
             due.append(self)
 
@@ -166,7 +175,7 @@ class DirectFuture(Generic[T]):
         if self._done:
             raise asyncio.InvalidStateError("the outcome is there")
         self._done, self._error = True, error
-        self._wake_soon()
+        self.wake_soon()
 
     def exception(self) -> BaseException | None:
         """Return the error; None for a result."""
@@ -178,7 +187,8 @@ class DirectFuture(Generic[T]):
         if wake is not None and self._context is not None:
             self._context.run(wake, self)
 
-    def _wake_soon(self) -> None:
+    def wake_soon(self) -> None:
+        """Have the task go on in the loop's next turn, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None:
             self.get_loop().call_soon(wake, self, context=self._context)
@@ -208,7 +218,7 @@ class DirectFuture(Generic[T]):
             return False
         self._done = self._cancelled = True
         self._error = asyncio.CancelledError(*([] if msg is None else [msg]))
-        self._wake_soon()
+        self.wake_soon()
         return True
 
     def result(self) -> T:
@@ -247,6 +257,9 @@ class PlainDoorbell:
     def deliver(self) -> None:
         """Have the task go on; callers whose outcome comes go on behind it, by way of the loop."""
         self.ring()
+
+    def wake_in_order(self) -> None:
+        """Do nothing: all go on by way of the loop."""
 
     def outcome(self) -> asyncio.Future[Any]:
         """Return an outcome that one task may wait for."""

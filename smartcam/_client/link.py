@@ -123,6 +123,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         loop: the event loop that the link is used in.
         outcome: function that makes a future for one task to wait for, which the receive task or
             another one sets.
+        wake_in_order: function that has callers of the present delivery go on behind subscribers.
         heard_at: loop time of the last byte received.
     """
 
@@ -160,6 +161,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._busy_with = 0
         self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
         self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
+        self.wake_in_order: Callable[[], None] = bell.wake_in_order
         self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()

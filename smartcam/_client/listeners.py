@@ -76,6 +76,12 @@ class Listeners:
         return self._may_await and any(not future.done() for future in self._next_results)
 
     @property
+    def has_subscribers(self) -> bool:
+        """True if a task beside the callers of commands may wait for what comes."""
+        subscribed = self.results.references or self.statuses.references or self.events.references
+        return bool(subscribed) or self._may_await
+
+    @property
     def hears_statuses(self) -> bool:
         """True if a status would be handed to anybody."""
         return bool(self.statuses.references)

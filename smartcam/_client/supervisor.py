@@ -349,6 +349,8 @@ class Supervisor:
                 chunk = await link.receive()
             except ConnectionLostError as error:
                 return error
+            if self._listeners.has_subscribers:
+                link.wake_in_order()
             self._dispatch.dispatch(chunk)
             del chunk  # the next one may take its time
 

@@ -51,7 +51,7 @@ def test_live_page_has_its_numbers() -> None:
     assert f"The last {MAX_RESULTS}." in LIVE_PAGE
     assert MAX_BARS * BAR_SECONDS == 10 * 3600  # "Last ten hours"
     assert f"the last {MAX_PICTURES} pictures of failures" in LIVE_PAGE
-    assert f"faster than {MAX_NEWS / streams.PERIOD:g} a second" in LIVE_PAGE
+    assert f"More than {MAX_NEWS / streams.PERIOD:g} per second" in LIVE_PAGE
     words = PASS_WORDS | FAIL_WORDS
     named = set(
         re.findall(r"`(\w+)`", LIVE_PAGE.partition("## Pass and fail")[2].partition("##")[0])

@@ -61,7 +61,7 @@ def test_picture_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_picture_with_too_many_pixels_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "MAX_SIDE", 40)
+    monkeypatch.setattr(pictures, "MAX_SIDE_PX", 40)
     with refused("BAD_PICTURE", "expected 40 pixels along each side, got 48x32"):
         decode_picture(encoded())
 
@@ -97,7 +97,7 @@ class Growing(PictureFolder):
 async def test_folder_waits_for_a_file_that_grows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pictures, "PERIOD", 0.001)
+    monkeypatch.setattr(pictures, "LISTING_PERIOD", 0.001)
     folder = Growing(tmp_path, encoded())
     assert len(folder.parts) > 3
     assert np.array_equal(await folder.take(), GREY)
