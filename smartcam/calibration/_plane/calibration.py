@@ -571,8 +571,8 @@ def fit_plane(
     kept = np.arange(len(marks))
     least = MODELS["similarity" if model == "auto" else model].least
     # the message that points are the same must speak of the points as they came
-    if len(marks) < len(camera) and not robust:
-        check_samples(camera, robot, least, touch_sigma)
+    if len(marks) < len(camera):
+        check_samples(camera, robot, least, touch_sigma, strays=robust)
     if robust:
         kept = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
     check_samples(marks[kept], touched[kept], least, touch_sigma)

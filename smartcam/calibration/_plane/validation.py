@@ -125,16 +125,25 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
         )
 
 
-def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | None) -> None:
+def check_samples(
+    camera: Array,
+    robot: Array,
+    least: int,
+    touch_sigma: float | None,
+    *,
+    strays: bool = False,
+) -> None:
     """Raise if points do not determine a plane and a map onto it.
 
     ``camera`` (N, 2); ``robot`` (N, 3), metres; the model needs ``least`` points; ``touch_sigma``
     is that of one coordinate, metres, or None if it is not known. Raises TOO_FEW, UNIT_UNKNOWN,
-    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER.
+    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``strays``: some touches may be far off, so a
+    large field is no question of units.
     """
     if len(camera) < least:
         raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
-    check_field(robot)
+    if not strays:
+        check_field(robot)
     for points, what in ((camera, "camera points"), (robot, "robot points")):
         _check_distinct(points, what, least)
         _check_width(points, what)
