@@ -141,7 +141,9 @@ async def test_cameras_with_a_page_of_their_own_are_bounded(
 async def test_camera_of_an_agent_that_comes_back_goes_on() -> None:
     async with Plant() as plant:
         options = {"interpret_as": LAYOUT, "reconnect": FAST}
-        fleet = Fleet(plant.bus.end(), None, "plant", None, 2.0, options)
+        fleet = Fleet(
+            plant.bus.end(), None, "plant", None, 60.0, options
+        )  # given up later than it is back
         async with served(fleet, control=True) as world, world.events(NAME) as events:
             row = world.site.view.rows[NAME]
             assert (await world.post("/trigger", camera=NAME)).status == 200
