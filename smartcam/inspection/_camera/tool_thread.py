@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final
@@ -26,7 +27,11 @@ class ToolThread:
 
     def __init__(self, name: str) -> None:
         self._jobs: collections.deque[tuple[Future[Any], Callable[[], Any]]] = collections.deque()
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()  # of the jobs
+        # Locked while there is nothing to do. A condition would wake the thread into its own lock,
+        # which takes one change of threads more.
+        self._bell = threading.Lock()
+        self._bell.acquire()
         self._closing = False
         self._at_work = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -40,29 +45,38 @@ class ToolThread:
     def submit(self, do: Callable[[], Any]) -> Future[Any]:
         """Have something done, after all that waits; what was cancelled waits no longer."""
         future: Future[Any] = Future()
-        with self._changed:
-            waiting = [job for job in self._jobs if not job[0].cancelled()]
-            self._jobs = collections.deque([*waiting, (future, do)])
-            self._changed.notify()
+        with self._lock:
+            if self._jobs:
+                waiting = [job for job in self._jobs if not job[0].cancelled()]
+                self._jobs = collections.deque(waiting)
+            self._jobs.append((future, do))
+        self._ring()
         return future
 
     def close(self) -> None:
         """Have the thread end after the work that waits, and return at once."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
+        self._closing = True
+        self._ring()
+
+    def _ring(self) -> None:
+        with contextlib.suppress(RuntimeError):  # it has been rung, and the thread will look
+            self._bell.release()
 
     def _run(self) -> None:
         while True:
-            with self._changed:
-                while not self._jobs and not self._closing:
-                    self._changed.wait()
-                if not self._jobs:
-                    return
-                future, do = self._jobs.popleft()
-                self._at_work = True
-            self._do(future, do)
-            del future, do  # they hold a picture
+            self._bell.acquire()
+            while (job := self._next_job()) is not None:
+                self._do(*job)
+                del job  # it holds a picture
+            if self._closing and not self._jobs:
+                return
+
+    def _next_job(self) -> tuple[Future[Any], Callable[[], Any]] | None:
+        with self._lock:
+            if not self._jobs:
+                return None
+            self._at_work = True
+            return self._jobs.popleft()
 
     def _do(self, future: Future[Any], do: Callable[[], Any]) -> None:
         if not future.set_running_or_notify_cancel():
