@@ -48,10 +48,10 @@ class TraceEntry(NamedTuple):
     hex: str
 
 
-class RawFrame:
+class RawFrame(NamedTuple):
     """One frame as it went over the wire, which nobody has decoded yet.
 
-    Args:
+    Attributes:
         at: time, UTC.
         camera: name of the camera.
         dialect: dialect that the frame is decoded in.
@@ -59,21 +59,11 @@ class RawFrame:
         frame: the frame; bytes that make none are an entry already.
     """
 
-    __slots__ = ("at", "camera", "dialect", "frame", "sender")
-
-    def __init__(
-        self,
-        at: datetime,
-        camera: str,
-        dialect: Dialect,
-        sender: Sender,
-        frame: Frame | TraceEntry,
-    ) -> None:
-        self.at: datetime = at
-        self.camera: str = camera
-        self.dialect: Dialect = dialect
-        self.sender: Sender = sender
-        self.frame: Frame | TraceEntry = frame
+    at: datetime
+    camera: str
+    dialect: Dialect
+    sender: Sender
+    frame: Frame | TraceEntry
 
     @property
     def size(self) -> int:

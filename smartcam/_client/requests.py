@@ -176,9 +176,24 @@ class Requests:
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
         """
+        if self.is_free(key):
+            return self._send(message, key, deadline)
+        await self.await_turn(key, message, deadline)
+        return self._send(message, key, deadline)  # at once, before whoever is next in the line
+
+    def is_free(self, key: type[m.Message] | int) -> bool:
+        """Return True if no answer of this kind is owed, and nobody waits to send its request."""
+        return not (self._waits.owes(key) or self._locks[key].locked())
+
+    async def await_turn(
+        self, key: type[m.Message] | int, message: m.Message, deadline: float
+    ) -> None:
+        """Wait in line with requests of this kind until none is open; send at once then.
+
+        Raises:
+            ResponseTimeoutError: an earlier one was open until ``deadline``; as :meth:`await_owed`.
+        """
         lock = self._locks[key]
-        if not lock.locked() and not self._waits.owes(key):
-            return self._send(message, key, deadline)  # nothing is waited for
         try:
             async with asyncio.timeout_at(deadline):
                 await lock.acquire()
@@ -186,7 +201,6 @@ class Requests:
             raise self._unsent(message) from exc
         try:
             await self.await_owed(key, message, deadline)
-            return self._send(message, key, deadline)
         finally:
             lock.release()
 

@@ -76,7 +76,8 @@ class PendingTrigger(SentTrigger):
     def fail(self, error: Exception) -> None:
         """End the trigger: its caller gets the error instead of results."""
         self.ended = True
-        self.outcome.set_exception(error)
+        if not self.outcome.done():  # an interpreter may have cancelled the caller
+            self.outcome.set_exception(error)
 
 
 @dataclass(eq=False)

@@ -239,14 +239,18 @@ class Triggers:
             correlation.heard()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
+        waited = False  # in line with Queries, so none of either kind keeps the other one waiting
         while True:
             status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
                 await self._wait_for_trigger(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
+            elif features.fences and not (waited or self._requests.is_free(m.QueryAnswer)):
+                await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
+                waited = True
             elif features.fences and self._waits.owes(m.QueryAnswer):  # one can be open
-                await self._requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+                await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
         link = connection.require_link()
@@ -309,7 +313,7 @@ class Triggers:
             if features.acknowledged and self._waits.owes(m.TriggerAnswer):
                 await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
             elif features.fences and self._waits.owes(m.QueryAnswer):
-                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+                await requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
 

@@ -185,3 +185,31 @@ def test_trigger_beside_any_request_has_an_outcome_of_the_list(kind: str, seeds:
                 raise
             triggers += some
     assert triggers["result"] > 0
+
+
+@pytest.mark.parametrize(
+    ("dialect", "processing_time"),
+    [("handbook", 0.0), ("handbook", 0.02), ("b16", 0.0), ("bid", 0.0)],
+)
+async def test_triggers_and_queries_without_a_pause_take_turns(
+    dialect: str, processing_time: float
+) -> None:
+    app = {"id": 1, "layout": "n: int32", "constant": {"n": 1}, "processing_time": processing_time}
+    async with (
+        EmulatedCamera([app], builtins=False, running=True, dialect=dialect) as emulator,
+        smartcam.connect(emulator.url, application=1, interpret_as="n: int32") as camera,
+    ):
+
+        async def repeat(ask: Callable[[], Coroutine[Any, Any, object]]) -> None:
+            while True:
+                await ask()
+
+        trigger, query = partial(camera.trigger, timeout=1.0), camera.query_application
+        for rare, often in ((trigger, query), (query, trigger)):
+            working = asyncio.create_task(repeat(often))
+            for _ in range(10):
+                await rare()
+            assert not working.done()
+            working.cancel()
+            await asyncio.wait({working})
+        balance(camera.statistics())

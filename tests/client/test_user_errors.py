@@ -150,6 +150,30 @@ async def test_what_reads_a_result_raises_in_its_trigger(
         balance(account)
 
 
+@pytest.mark.parametrize("raises", [False, True])
+async def test_interpreter_may_cancel_the_trigger_that_it_reads_for(raises: bool) -> None:
+    callers: list[asyncio.Task[Any]] = []
+
+    def read(reader: Any) -> int:
+        if callers:
+            callers.pop().cancel()
+            if raises:
+                raise ValueError("the caller is gone")
+        return int(reader.get_int32(0))
+
+    async with box() as emulator, smartcam.connect(emulator.url, interpret_as=read) as camera:
+        first = await camera.trigger(1)
+        caller = asyncio.create_task(camera.trigger(1))
+        callers.append(caller)
+        await asyncio.wait({caller})
+        assert caller.cancelled()
+        second = await camera.trigger(1)
+        account = camera.statistics()
+        assert (account.sessions, account.uninterpretable) == (1, int(raises))
+        assert second.value == first.value + 2
+        balance(account)
+
+
 @ANY_ERROR
 async def test_what_reads_many_results_raises_in_the_stream(
     error: Callable[[], BaseException],
