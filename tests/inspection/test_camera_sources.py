@@ -72,6 +72,20 @@ async def test_pictures_of_other_sizes_and_kinds_in_a_folder_have_their_turn(
         assert found == [10, 20, 7, 15, 10]
 
 
+async def test_a_damaged_picture_in_a_folder_is_left_out_and_the_others_have_their_turn(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("av")
+    write_pictures(tmp_path / "shots", [10, 20, 30])
+    second = sorted((tmp_path / "shots").iterdir())[1]
+    second.write_bytes(second.read_bytes()[:50])
+    (tmp_path / "cell.yaml").write_text(FOLDER.format(frames="shots"))
+    async with smartcam.connect(f"software:{tmp_path / 'cell.yaml'}") as camera:
+        found = [(await camera.trigger(timeout=PATIENCE)).value.level for _ in range(4)]
+    assert found == [10, 30, 10, 30]
+    assert f"left out: {second}" in caplog.text
+
+
 async def test_a_free_run_goes_round_a_folder_in_order(tmp_path: Path) -> None:
     pytest.importorskip("av")
     write_pictures(tmp_path / "shots", [10, 20, 30])

@@ -82,7 +82,7 @@ class VideoDriver(FrameDriver):
     ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
                       files in a folder
     ``mixed``         of files: ``yes`` takes pictures of other sizes and formats than the first
-                      one's, too; usual ``no``
+                      one's, too, and counts damaged ones as lost; usual ``no``
     ``verify``        of TLS: ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
     ``elsewhere``     of a server: ``yes`` goes where it sends us, by a redirect to another host or
@@ -194,6 +194,7 @@ class VideoDriver(FrameDriver):
             network=network,
             elsewhere=self._elsewhere,
             tls=self._tls,
+            skips_damaged=self._mixed,
         )
         return PictureFiles(plan) if pictures else VideoReading(plan)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import glob
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from smartcam.frames._pixels.formats import PixelFormat
 
+
+_log: Final = logging.getLogger("smartcam.frames")
 
 PICTURES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".jxl", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
@@ -82,6 +85,7 @@ class VideoPlan:
         network: True if the video comes from a server; without a length it is a live stream.
         elsewhere: whether FFmpeg may go where the server sends it, by a redirect or a playlist.
         tls: context that checks the server's certificate; None: the default check.
+        skips_damaged: whether damaged files of a folder are left out and counted as lost.
     """
 
     name: str
@@ -92,6 +96,7 @@ class VideoPlan:
     network: bool = False
     elsewhere: bool = False
     tls: ssl.SSLContext | None = None
+    skips_damaged: bool = False
 
     def wrong(self, text: str) -> FrameFormatError:
         """Return the error of bytes that are not as they should be."""
@@ -376,6 +381,7 @@ class PictureFiles(PictureReading):
 
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
+        self._given_any = False
         self._files = deque(picture_files(plan.url))
         if not self._files:
             raise FrameSourceError(f"{plan.name}: there is no picture", source=plan.name)
@@ -392,9 +398,22 @@ class PictureFiles(PictureReading):
 
     def read(self) -> Read | None:
         """Return the next picture."""
-        if not self._files or self.stopped.is_set():
-            return None
-        path = self._files.popleft()
+        lost = 0
+        while self._files and not self.stopped.is_set():
+            path = self._files.popleft()
+            try:
+                read = self._read(path)
+            except FrameSourceError as exc:
+                if not (self.plan.skips_damaged and (self._files or self._given_any)):
+                    raise
+                _log.warning("! %s: left out: %s", self.plan.name, exc)
+                lost += 1
+            else:
+                self._given_any = True
+                return None if read is None else read._replace(lost=lost)
+        return None
+
+    def _read(self, path: str) -> Read | None:
         if is_jpegxl(path):
             return Read(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
