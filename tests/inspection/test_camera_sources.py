@@ -72,7 +72,7 @@ async def test_pictures_of_other_sizes_and_kinds_in_a_folder_have_their_turn(
         assert found == [10, 20, 7, 15, 10]
 
 
-async def test_a_damaged_picture_in_a_folder_is_left_out_and_the_others_have_their_turn(
+async def test_a_damaged_picture_in_a_folder_is_one_system_error_and_the_others_have_their_turn(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("av")
@@ -80,8 +80,16 @@ async def test_a_damaged_picture_in_a_folder_is_left_out_and_the_others_have_the
     second = sorted((tmp_path / "shots").iterdir())[1]
     second.write_bytes(second.read_bytes()[:50])
     (tmp_path / "cell.yaml").write_text(FOLDER.format(frames="shots"))
+    found: list[float] = []
     async with smartcam.connect(f"software:{tmp_path / 'cell.yaml'}") as camera:
-        found = [(await camera.trigger(timeout=PATIENCE)).value.level for _ in range(4)]
+        for _ in range(2):
+            found.append((await camera.trigger(timeout=PATIENCE)).value.level)
+            with pytest.raises(smartcam.CameraFaultError, match="damaged"):
+                await camera.trigger(timeout=PATIENCE)
+            await camera.wait_status(
+                lambda status: not status & smartcam.Status.SYSTEM_ERROR, timeout=PATIENCE
+            )
+            found.append((await camera.trigger(timeout=PATIENCE)).value.level)
     assert found == [10, 30, 10, 30]
     assert f"left out: {second}" in caplog.text
 

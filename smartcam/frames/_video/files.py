@@ -381,7 +381,6 @@ class PictureFiles(PictureReading):
 
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
-        self._given_any = False
         self._files = deque(picture_files(plan.url))
         if not self._files:
             raise FrameSourceError(f"{plan.name}: there is no picture", source=plan.name)
@@ -404,12 +403,11 @@ class PictureFiles(PictureReading):
             try:
                 read = self._read(path)
             except FrameSourceError as exc:
-                if not (self.plan.skips_damaged and (self._files or self._given_any)):
+                if not (self.plan.skips_damaged and self._files):
                     raise
                 _log.warning("! %s: left out: %s", self.plan.name, exc)
                 lost += 1
             else:
-                self._given_any = True
                 return None if read is None else read._replace(lost=lost)
         return None
 

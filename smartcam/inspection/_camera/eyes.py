@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import logging
 import math
 import time
@@ -228,6 +229,12 @@ class Eyes(Inspector):
                 except StopAsyncIteration:
                     return came
                 came, held = True, None
+                if self._recorded and frame.lost:  # a damaged picture is a run's, and no result
+                    held = dataclasses.replace(frame, lost=0)
+                    self._lose(f"{frame.lost} damaged pictures before picture {frame.sequence}")
+                    await asyncio.sleep(RETRY.initial)
+                    self._regain()
+                    continue
                 self._regain()
                 order = self._order
                 if order is None or order.frame is not None:
