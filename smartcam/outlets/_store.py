@@ -168,6 +168,13 @@ class _StoreFile:
 
     def open(self) -> None:
         """Open the file, and bring its tables to this version."""
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._database = database = open_database(self.path, timeout=10.0)
         (version,) = database.execute("PRAGMA user_version").fetchone()
