@@ -12,10 +12,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from datetime import datetime
 
+    from smartcam import protocols
     from smartcam.exceptions import SmartCamError
     from smartcam.frames import Frame as Picture
     from smartcam.models import CameraEvent, Result
-    from smartcam.protocols import Dialect, Frame
+    from smartcam.protocols import Dialect
     from smartcam.protocols.messages import Sender
 
 __all__ = ["Observer", "RawFrame", "TraceEntry"]
@@ -63,7 +64,7 @@ class RawFrame(NamedTuple):
     camera: str
     dialect: Dialect
     sender: Sender
-    frame: Frame | TraceEntry
+    frame: protocols.Frame | TraceEntry
 
     @property
     def size(self) -> int:
