@@ -246,11 +246,12 @@ class Triggers:
                 await self._wait_for_trigger(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
-            elif features.fences and not (waited or self._requests.is_free(m.QueryAnswer)):
+            elif features.fences and (
+                self._waits.owes(m.QueryAnswer)  # one can be open
+                or not (waited or self._requests.is_free(m.QueryAnswer))
+            ):
                 await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
                 waited = True
-            elif features.fences and self._waits.owes(m.QueryAnswer):  # one can be open
-                await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
         link = connection.require_link()

@@ -66,7 +66,7 @@ class ProjectionUncertainty:
 
     @property
     def across(self) -> Array:
-        """The same as a length at the distance, across the line of sight, (h, w), metres.
+        """Standard deviation at the distance, across the line of sight, (h, w), metres.
 
         For points at infinity it is an angle, radians.
         """
