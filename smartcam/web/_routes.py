@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NoReturn, Typ
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, LinkError
 from smartcam.models import jsonable
 from smartcam.web._connections import visitor_of
 from smartcam.web._errors import RefusedError, refused_fields, shown
@@ -228,17 +228,24 @@ def middleware(guard: Guard, prefix: str) -> Any:
             refusal = exc
         except web.HTTPException as exc:
             refusal = _translated(exc, prefix)
+        except LinkError:  # a ConnectionError, but of a camera and not of the client
+            refusal = _fault(request)
         except ConnectionError:
             refusal = RefusedError(400, "a connection that ended", "the whole of a request")
         except ConfigurationError as exc:
             refusal = RefusedError(422, str(exc), "what this camera has")
         except Exception:  # noqa: BLE001  the last place: the client is told
-            _log.exception("! %s %s: a fault of ours", request.method, request.path)
-            refusal = RefusedError(500, "a fault of ours", "this to be reported, with the log")
+            refusal = _fault(request)
         tried = f"{request.method} {request.path}"
         return _json(refusal.status, refusal.as_json(shown(tried)[1:-1]), refusal.headers)
 
     return placed
+
+
+def _fault(request: web.Request) -> RefusedError:
+    """Log the exception that is being handled, and return what the client is told of it."""
+    _log.exception("! %s %s: a fault of ours", request.method, request.path)
+    return RefusedError(500, "a fault of ours", "this to be reported, with the log")
 
 
 def _translated(error: web.HTTPException, prefix: str) -> RefusedError:

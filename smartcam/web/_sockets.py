@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from smartcam.exceptions import LinkError
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._site import FAREWELL
 
@@ -88,6 +89,8 @@ class PageSocket(ABC):
             )
             if self._request.transport is not None:
                 self._request.transport.abort()
+        except LinkError:  # a ConnectionError, but of a camera
+            raise
         except ConnectionError:
             pass  # the page is gone
         return self._socket

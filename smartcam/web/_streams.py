@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aiohttp import web
 
+from smartcam.exceptions import LinkError
 from smartcam.models import jsonable
 from smartcam.web._errors import RefusedError
 
@@ -82,6 +83,8 @@ class Streams:
             _log.info("= %s: event stream ended, its reader is too slow", request.remote)
             if request.transport is not None:
                 request.transport.abort()
+        except LinkError:  # a ConnectionError, but of the camera that has the news
+            raise
         except ConnectionError:
             pass  # the reader is gone
         finally:

@@ -141,9 +141,7 @@ async def test_cameras_with_a_page_of_their_own_are_bounded(
 async def test_camera_of_an_agent_that_comes_back_goes_on() -> None:
     async with Plant() as plant:
         options = {"interpret_as": LAYOUT, "reconnect": FAST}
-        fleet = Fleet(
-            plant.bus.end(), None, "plant", None, 60.0, options
-        )  # given up later than it is back
+        fleet = Fleet(plant.bus.end(), None, "plant", None, 60.0, options)
         async with served(fleet, control=True) as world, world.events(NAME) as events:
             row = world.site.view.rows[NAME]
             assert (await world.post("/trigger", camera=NAME)).status == 200
@@ -158,6 +156,22 @@ async def test_camera_of_an_agent_that_comes_back_goes_on() -> None:
             assert (await world.post("/trigger", camera=NAME)).status == 200
             await until(lambda: row.count == 2)
             assert row.errors == 1
+
+
+async def test_camera_whose_agent_is_back_before_it_keeps_its_page() -> None:
+    async with Plant() as plant:
+        fleet = Fleet(plant.bus.end(), None, "plant", None, 60.0, {"reconnect": FAST})
+        async with served(fleet) as world, world.events(NAME) as events:
+            await events.until("camera", lambda told: told["connection"] == "connected")
+            known = fleet[NAME].capabilities
+            await plant.stop_agent()
+            await plant.box.stop()
+            await plant.start_agent()
+            await asyncio.sleep(2.0)  # the agent has answered, and has no session with the camera
+            assert not fleet[NAME].connected
+            assert fleet[NAME].capabilities == known
+            await plant.box.start()
+            await events.until("camera", lambda told: told["connection"] == "connected")
 
 
 async def test_camera_given_up_is_followed_as_its_next_object() -> None:

@@ -317,6 +317,22 @@ async def test_lost_camera_is_told_and_found_again(emulator: EmulatedCamera) -> 
     assert serials == [0, 1]
 
 
+async def test_a_cameras_own_connection_error_is_not_taken_for_a_reader_that_is_gone(
+    emulator: EmulatedCamera, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def lost() -> Any:
+        raise smartcam.ConnectionLostError("the camera is gone")
+
+    async with shown(emulator.url) as world:
+        async with world.events() as events:
+            await events.next("camera")
+            monkeypatch.setattr(world.site.view, "state", lost)
+            await until(lambda: "a fault of ours" in caplog.text)
+        answer = await world.caller.call("GET", "/api/camera")
+    assert answer.status == 500
+    assert "the camera is gone" in caplog.text
+
+
 async def test_camera_taken_by_another_client_is_told(emulator: EmulatedCamera) -> None:
     async with (
         shown(emulator.url) as world,

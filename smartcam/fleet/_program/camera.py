@@ -377,7 +377,8 @@ class FleetCamera(Camera[ValueT]):
             return
         hello = met.hello
         self._caller.look_at_leases()
-        self._about = hello
+        known = self._about.get("capabilities")  # an agent's camera may have no session yet
+        self._about = hello if known is None else {"capabilities": known, **hello}
         self._read_as(hello)
         # later events are newer; the missed ones bring everything in order
         if not self._receiver.misses_states(met):
