@@ -19,8 +19,8 @@ import numpy as np
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection import Picture, Program, Teaching, load_cell
-from smartcam.inspection._camera import eyes
-from smartcam.inspection._camera.eyes import failed_values
+from smartcam.inspection._camera import frame_inspector
+from smartcam.inspection._camera.frame_inspector import failed_values
 from smartcam.inspection._program import MAX_REASON_BYTES
 from smartcam.inspection._read import gs1
 from smartcam.inspection._read.gs1 import GS
@@ -31,8 +31,8 @@ from tests.inspection.inside import elements
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection
 
-EYES = eyes
-"""The module that cuts reasons."""
+INSPECTOR = frame_inspector
+"""Module of the function that cuts reasons."""
 
 PROGRAMS = """
 cameras:
@@ -50,7 +50,7 @@ ODD: tuple[Any, ...] = (
     *(0, 1, -1, 255, 1 << 15, 1 << 31, 1 << 32, 1 << 64, 0.5, math.nan, math.inf, -math.inf),
     *("", "x", "\0", "a" * 100, "\u00fc" * 50, "\udc80", True, None, b"x", [], (1, 2)),
 )
-"""Values that a tool of somebody's may give."""
+"""Values that a user's tool may return."""
 
 
 def check_cell_file(data: bytes) -> None:
@@ -88,12 +88,12 @@ def check_teaching(name: str, number: int, program: Program) -> None:
 
 
 def first_element(text: str) -> tuple[tuple[str, str], ...]:
-    """Return no more than the first element: a mistake."""
+    """Return only the first element, as a planted mistake."""
     return gs1.elements(text)[:1]
 
 
 def check_gs1(data: bytes) -> None:
-    """Cut a text into elements: each is whole, and together they are the text."""
+    """Check that a text's elements are whole, and that joined they are the text."""
     text = text_of(data)
     found = elements(text)
     assert "".join(one + other for one, other in found).replace(GS, "") == text.replace(GS, "")
@@ -119,7 +119,7 @@ def inspections() -> tuple[tuple[Program, Inspection], ...]:
 
 
 def check_program_result(data: bytes) -> None:
-    """Build containers of odd values: bytes that can be read, or a typed error."""
+    """Check that containers of odd values are readable, or a typed error."""
     choices = Choices(data)
     program, seen = choices.pick(inspections())
     values = dict(seen.values)
