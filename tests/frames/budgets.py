@@ -33,11 +33,16 @@ from smartcam.frames._streaming.rtp.packets import RtpPacket, parse_rtcp
 from smartcam.frames._streaming.rtp.parameters import picture_size
 from smartcam.frames._streaming.rtsp.addresses import target_of, wish_of
 from smartcam.frames._streaming.rtsp.authentication import _parts as digest_parts
-from smartcam.frames._streaming.rtsp.messages import ROOM, RequestParser, RtspError, RtspRequest
+from smartcam.frames._streaming.rtsp.messages import (
+    MAX_MESSAGE_BYTES,
+    RequestParser,
+    RtspError,
+    RtspRequest,
+)
 from smartcam.frames._streaming.rtsp_client import answers as _answers
 from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
+from smartcam.frames._streaming.rtsp_client.channels import options_of
 from smartcam.frames._streaming.rtsp_client.description import described, url_of
-from smartcam.frames._streaming.rtsp_client.ways import options_of
 from smartcam.frames._video import multipart as _multipart
 from smartcam.frames._video import redirects as _redirects
 from tests.budgets.inputs import UDP_BYTES
@@ -59,7 +64,7 @@ def _rtsp(pieces: list[bytes]) -> None:
 
 
 class _Pieces(socket.socket):
-    """A socket on which the pieces of an answer come, one at a time, and then the end."""
+    """A socket that gives the pieces of an answer one at a time, and then the end."""
 
     def __init__(self, pieces: list[bytes]) -> None:
         super().__init__()
@@ -597,8 +602,8 @@ PARSERS: tuple[Parser, ...] = (
         "RTSP: requests",
         _rtsp,
         streamed(_RTSP),
-        ROOM,
-        "frames._streaming.rtsp.messages.ROOM",
+        MAX_MESSAGE_BYTES,
+        "frames._streaming.rtsp.messages.MAX_MESSAGE_BYTES",
         size=1000,
         refuses=(RtspError,),
     ),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_HELD_FRAMES: Final = 32
+MAX_WAITING_FRAMES: Final = 32
 """A decoder keeps the data of at most this many encoded frames until their pictures come out."""
 
 
@@ -159,7 +159,7 @@ class H264Decoder:
         # number of frames until the picture is whole; None: unknown
         self._missing: int | None = None
         self._begun = False  # whether something was decoded that a refresh can refer to
-        self._held: dict[int, Frame] = {}
+        self._waiting: dict[int, Frame] = {}
         self._count = 0
 
     @property
@@ -227,7 +227,7 @@ class H264Decoder:
             "max_pixels": str(room),
             "err_detect": "explode",  # half a picture must be refused
         } | ({} if self._reorders else {"flags": "low_delay"})
-        self._held.clear()
+        self._waiting.clear()
         self._missing, self._begun = None, False
 
     def _follow(self, data: bytes) -> int | None:
@@ -250,13 +250,13 @@ class H264Decoder:
         packet = load("av").Packet(frame.data)
         self._count += 1
         packet.pts = self._count
-        self._held[self._count] = frame
-        if len(self._held) > MAX_HELD_FRAMES:
-            del self._held[next(iter(self._held))]
+        self._waiting[self._count] = frame
+        if len(self._waiting) > MAX_WAITING_FRAMES:
+            del self._waiting[next(iter(self._waiting))]
         return packet
 
     def _made(self, picture: Any) -> Frame:
-        frame = self._held.pop(picture.pts)
+        frame = self._waiting.pop(picture.pts)
         picture = picture.reformat(format=self._to) if self._to else picture
         pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):

@@ -1,4 +1,4 @@
-"""Web cameras: streams of JPEGs on our own, and what else a web server has through FFmpeg."""
+"""Use web cameras as sources of frames: JPEG streams directly, other streams by FFmpeg."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
 
 
-WITH_BODY: Final = (200, 203, 206)
-"""Status of answers with a stream."""
+STREAM_STATUSES: Final = (200, 203, 206)
+"""Status codes of answers with a stream."""
 
 
 class WebDriver(VideoDriver):
-    """A web camera or a recording on a web server; parameters as :class:`VideoDriver` has them.
+    """A web camera or a recording on a web server; parameters as in :class:`VideoDriver`.
 
-    The parts of a stream of JPEGs are cut here, so that each picture comes with its last byte.
+    A multipart stream of JPEGs is read without FFmpeg, so that each picture comes with its last
+    byte.
     """
 
     _playing: _PartsStream | None = None
@@ -62,10 +63,10 @@ class WebDriver(VideoDriver):
         return StreamFormat(frame.format, *self._size)
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect anew and read; a recording begins at its beginning.
+        """Connect and read; a recording starts at its beginning.
 
         Raises:
-            FrameSourceError: the source is gone, or silent.
+            FrameSourceError: the source is gone, or does not answer.
         """
         if not self._is_parts:
             await super().start(sink)
@@ -76,14 +77,14 @@ class WebDriver(VideoDriver):
             )
 
     async def stop(self) -> None:
-        """Read no longer."""
+        """Stop reading."""
         playing, self._playing = self._playing, None
         if playing is not None:
             await playing.end()
         await super().stop()
 
     async def _begin_parts(self, sink: FrameSink) -> bool:
-        """Begin to read; return False for another stream, or where a proxy has to be asked."""
+        """Start reading parts; return False for other streams, or if a proxy is needed."""
         if self._elsewhere or _by_proxy(self.address.scheme, self.address.host):
             return False
         url = self.address.url.partition("#")[0]
@@ -108,7 +109,7 @@ class WebDriver(VideoDriver):
 
     def _check(self, stream: WebStream) -> None:
         answer = stream.answer
-        if answer.status not in WITH_BODY:
+        if answer.status not in STREAM_STATUSES:
             shown = f"{answer.status} {answer.reason}".strip()
             raise self._wrong(f"cannot be read: {shown}")
         coding = answer.header("content-encoding").lower()
@@ -141,7 +142,7 @@ class _PartsStream:
         self._shown = self._heard = self._loop.time()
 
     async def begin(self) -> None:
-        """Cut and decode what comes."""
+        """Start cutting and decoding pictures."""
         await self._decoding.begin(self)
         self._tasks = [
             asyncio.create_task(work, name=f"{what} of {self._name}")
@@ -149,7 +150,7 @@ class _PartsStream:
         ]
 
     async def end(self) -> None:
-        """End all; the sink hears no more."""
+        """Stop; the sink is not called any more."""
         self._stream.close()
         for task in self._tasks:
             task.cancel()
@@ -164,10 +165,10 @@ class _PartsStream:
         return None
 
     def want_picture(self) -> None:
-        """Do nothing: each picture is whole."""
+        """Do nothing: every picture is a key frame."""
 
     def shown(self) -> None:
-        """Note that a picture could be decoded."""
+        """Note that a picture was decoded."""
         self._shown = self._loop.time()
 
     async def _read(self) -> None:
@@ -205,10 +206,10 @@ def _size_in(picture: bytes) -> tuple[int, int] | None:
     try:
         width, height, _ = jpeg_header(picture, "a part")
     except FrameFormatError:
-        return None  # of the last one: what is wrong shows when it is decoded
+        return None  # decoding reports the error
     return width, height
 
 
 def _by_proxy(scheme: str, host: str) -> bool:
-    """Return True if the environment names a proxy for a host, which FFmpeg asks."""
+    """Return True if the environment names a proxy for a host, which FFmpeg uses."""
     return bool(urllib.request.getproxies().get(scheme)) and not urllib.request.proxy_bypass(host)

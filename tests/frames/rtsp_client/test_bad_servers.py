@@ -51,7 +51,7 @@ class Bad(NamedTuple):
     """A server that does wrong.
 
     Attributes:
-        said: part of the error's text.
+        message: part of the error's text.
         do: makes a camera this server.
         timeout: seconds, as the URL has them.
         user: user and password of the URL.
@@ -60,7 +60,7 @@ class Bad(NamedTuple):
         scheme: scheme of the URL.
     """
 
-    said: str
+    message: str
     do: Callable[[Camera], None]
     timeout: float = LONG
     user: str = ""
@@ -69,9 +69,9 @@ class Bad(NamedTuple):
     scheme: str = "rtsp"
 
 
-def answers(**said: Any) -> Callable[[Camera], None]:
+def answers(**given: Any) -> Callable[[Camera], None]:
     """Have methods answered so: by a status, by bytes, or by silence (None)."""
-    return lambda camera: camera.answers.update(said)
+    return lambda camera: camera.answers.update(given)
 
 
 def describes(text: str) -> Callable[[Camera], None]:
@@ -156,8 +156,8 @@ def challenges(shown: str) -> Callable[[Camera], None]:
     """Refuse each request with a challenge, a new one each time."""
 
     def refuse(request: Request) -> bytes:
-        said = shown.replace("NUMBER", request.cseq)
-        return answered(request, "401 Unauthorized", f"WWW-Authenticate: {said}")
+        challenge = shown.replace("NUMBER", request.cseq)
+        return answered(request, "401 Unauthorized", f"WWW-Authenticate: {challenge}")
 
     return answers(OPTIONS=refuse, DESCRIBE=refuse)
 
@@ -378,21 +378,21 @@ async def read_all(url: str) -> None:
 
 
 @pytest.mark.parametrize("name", BAD)
-async def test_bad_server_is_told_in_time(encoded: list[bytes], name: str) -> None:
+async def test_bad_server_is_reported_in_time(encoded: list[bytes], name: str) -> None:
     bad, camera = BAD[name], Camera(encoded)
     bad.do(camera)
     loop = asyncio.get_running_loop()
     began = loop.time()
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"{bad.scheme}://{bad.user}{where}#timeout={bad.timeout}{bad.how}"
-        with pytest.raises(bad.error, match=re.escape(bad.said)) as got:
+        with pytest.raises(bad.error, match=re.escape(bad.message)) as got:
             await read_all(url)
     assert "s3cret" not in str(got.value)
     assert loop.time() - began < LIMIT
     assert len(camera.asked) < 20
 
 
-async def test_server_of_another_size_is_told(encoded: list[bytes]) -> None:
+async def test_server_of_another_size_is_reported(encoded: list[bytes]) -> None:
     camera = Camera(encoded)
     async with frames.Codecs(threads=1) as codecs:
         small = await codecs.h264_encoder().encode(frame_of(stamped(0, 256, 64), "Mono8"))
@@ -418,10 +418,10 @@ async def socket_that(listens: bool) -> AsyncIterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("listens", "said"),
+    ("listens", "message"),
     [(False, "cannot be read: Connection refused"), (True, "an answer to OPTIONS, got none")],
 )
-async def test_server_that_is_not_there_or_takes_nobody_is_told(listens: bool, said: str) -> None:
+async def test_missing_or_full_server_is_reported(listens: bool, message: str) -> None:
     async with asyncio.timeout(LIMIT), socket_that(listens) as where:
-        with pytest.raises(FrameSourceError, match=said):
+        with pytest.raises(FrameSourceError, match=message):
             await read_all(f"rtsp://{where}/cam#timeout={SHORT}")
