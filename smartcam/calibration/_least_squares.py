@@ -69,7 +69,7 @@ class Normal(NamedTuple):
         )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-        """Eliminate the poses; return the shared equations, and what the poses follow from.
+        """Eliminate the poses; return the shared equations, and the factors that give the poses.
 
         The result is a matrix (S, S) and a right side (S,), then (P, K, S) and (P, K): the change
         of a pose is the last minus the third times the shared change. ``damping``: part of the
@@ -105,7 +105,7 @@ class Normal(NamedTuple):
             return np.full_like(self.shared, np.nan), np.full_like(self.own, np.nan)
         # With residuals of variance 1 the covariance is the inverse of J^T J. Its upper left block
         # is that of Schur's complement, S^-1; those of the poses are C_p^-1 + D_p S^-1 D_p^T, with
-        # D_p = C_p^-1 B_p: their own, and what the shared unknowns' errors do to them.
+        # D_p = C_p^-1 B_p: their own part, and that of the shared unknowns' errors.
         # Source: Hartley and Zisserman, section 5.2 and appendix 6.
         matrix, _, by_shared, _ = self.reduced()
         shared = inverse_scaled(matrix)

@@ -1,4 +1,4 @@
-"""Hold the linear algebra to one thread while something is calibrated.
+"""Limit linear algebra to one thread during a calibration.
 
 The matrices have up to some hundred rows. OpenBLAS divides the work on such a matrix among threads
 that wait for each other without sleeping. That takes several times the CPU time, and a hundred

@@ -1,4 +1,4 @@
-"""Hold the points of a target in one image."""
+"""Store the points of a target that were found in one image."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class TargetView(storage.Stored):
     warnings: storage.Remarks = ()
 
     def __post_init__(self) -> None:
-        """Take read-only copies, and check them."""
+        """Copy the arrays as read-only ones, and check them."""
         checked(self.name, str, "view of a target: name")
         called = f"target in {self.name}" if self.name else "view of a target"
         target = checked(self.target, get_args(Target), f"{called}: target")
@@ -138,7 +138,7 @@ def described(value: Any) -> str:
 
 
 def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
-    """Return views as a list; raise SHAPE if something else is among them, or it is no list."""
+    """Return views as a list; raise SHAPE for no list, or for another kind of element."""
     return as_list(views, TargetView, f"{what}: view")
 
 

@@ -290,7 +290,7 @@ def _number_part(
     """Return the numbering of a part of a board by its mark; None if no mark is seen.
 
     Beside the dark dot at the origin the paper is light: around the dot, and along both of the
-    board's edges that meet there. So a place inside the board, or on something else, is not taken
+    board's edges that meet there. So a place inside the board, or on another object, is not taken
     for its corner.
     """
     found = []

@@ -291,7 +291,7 @@ def _number(
 
 
 def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
-    """Return an error that says what is seen instead."""
+    """Return an error that reports the dots seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:
         what = "saw more than these in rows and columns, as of a larger grid"

@@ -198,7 +198,7 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
     return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
 
 
-def strays_told(numbers: Sequence[int]) -> tuple[Remark, ...]:
+def remarks_on_strays(numbers: Sequence[int]) -> tuple[Remark, ...]:
     """Return the remark that names the markers left out; nothing if none were."""
     if not numbers:
         return ()

@@ -179,7 +179,7 @@ def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
     """Yield labels that cover no other label; those without room are left out."""
-    taken: list[tuple[float, float, float, float]] = []
+    occupied: list[tuple[float, float, float, float]] = []
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
@@ -188,8 +188,8 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
             x, y = at + offset
             box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
-            if not outside and not any(_overlap(box, one) for one in taken):
-                taken.append(box)
+            if not outside and not any(_overlap(box, one) for one in occupied):
+                occupied.append(box)
                 if math.hypot(*offset) > 25:
                     yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')
                 yield text((x, y + 5), label, "halo", ' text-anchor="middle"')

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
-"""Pattern of a name: no dot, no slash, nothing that a file system gives a meaning to."""
+"""Pattern of a name: no dot, no slash, and no other letter with a meaning to a file system."""
 
 MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""

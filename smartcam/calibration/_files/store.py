@@ -59,7 +59,7 @@ class Document:
     Attributes:
         kind: kind of the data: ``plane``, ...
         data: the data.
-        context: what was said about the data: frames, tool, raw samples, ...
+        context: facts about the data: frames, tool, raw samples, ...
         written_at: time of writing, UTC, ISO 8601.
         software: versions of the programs that wrote it, by name.
         version: the file's schema version, major and minor.
@@ -148,9 +148,9 @@ def read_document(path: StrPath) -> Document:
     if content.get("schema") != SCHEMA:
         raise _broken(path, f"schema {content.get('schema')!r}, expected {SCHEMA!r}")
     version = _version(path, content.get("schema_version"))
-    said = content.pop("sha256", None)
-    if said != _digest(content):
-        raise _broken(path, "its hash is another: it was damaged, or changed by hand")
+    stated = content.pop("sha256", None)
+    if stated != _digest(content):
+        raise _broken(path, "its hash does not match: it was damaged, or changed by hand")
     for major in range(version[0], SCHEMA_VERSION[0]):
         content = MIGRATIONS[major](content)
     try:
@@ -183,7 +183,7 @@ def _version(path: StrPath, text: object) -> tuple[int, int]:
             text,
         )
     if any(major not in MIGRATIONS for major in range(version[0], SCHEMA_VERSION[0])):
-        raise _broken(path, f"schema_version {text!r}, which there never was")
+        raise _broken(path, f"schema_version {text!r}, which does not exist")
     return version
 
 

@@ -337,7 +337,7 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
 class BundleEquations:
     """The parts of a bundle's equations that do not change while the bundle is adjusted.
 
-    ``prior``: whether free points are held where they were meant to be, within
+    ``prior``: whether free points are held at their nominal places, within
     LOOSE_SIGMA_RATIO and TIGHT_SIGMA_RATIO.
     """
 
@@ -426,14 +426,14 @@ def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     return found
 
 
-def _prior(meant: Array) -> Array:
-    """Return the weights (3 T, 3 T) that hold a sheet's points near where they were meant to be.
+def _prior(nominal: Array) -> Array:
+    """Return the weights (3 T, 3 T) that hold a sheet's points near their nominal places.
 
     Single points are held loosely; their common shift, turn and scale, which move no pixel, firmly.
     """
-    spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
-    near, axes = meant - meant.mean(axis=0), np.eye(3)
+    spacing = float(np.linalg.norm(nominal[1:] - nominal[0], axis=1).min())
+    near, axes = nominal - nominal.mean(axis=0), np.eye(3)
     moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
     whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
     weights: Array = whole @ whole.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
-    return weights + np.eye(3 * len(meant)) / (LOOSE_SIGMA_RATIO * spacing) ** 2
+    return weights + np.eye(3 * len(nominal)) / (LOOSE_SIGMA_RATIO * spacing) ** 2

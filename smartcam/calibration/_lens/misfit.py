@@ -243,13 +243,13 @@ def misfit_remarks(
     others = ", ".join(
         f"{what} {before / max(after, 1e-300):.3g}" for what, (after, _) in explained.items()
     )
-    told = f"times smaller so; what else was tried explains less for what it takes: {others}"
+    rest = f"times smaller so; what else was tried explains less for what it takes: {others}"
     changed, after = _zoomed(reduced, usual)
     if before > ZOOM_COST_RATIO * after and score(after, 3) < best:
         yield Code.WRONG_LENS.remark(
             f"views of two focal lengths: those from {names[changed]} on are of another one than "
             f"those before, was the zoom or the focus moved? The squares of all are "
-            f"{before / max(after, 1e-300):.3g} {told}"
+            f"{before / max(after, 1e-300):.3g} {rest}"
         )
         return
     flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in FLIPS.values()]
@@ -264,7 +264,7 @@ def misfit_remarks(
         which = ", ".join(itertools.compress(names, fewer.tolist()))
         yield Code.MIRRORED.remark(
             f"pictures that look flipped {how} against the others, or those of another camera: "
-            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {told}"
+            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {rest}"
         )
 
 

@@ -325,10 +325,10 @@ class PlaneCalibration(storage.SavedCalibration):
         if not isinstance(localizations, list):
             localizations = [*localizations]
         found = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
-        told = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
-        if told and self.touch_sigma is not None:
+        with_sigma = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
+        if with_sigma and self.touch_sigma is not None:
             sigmas = robot_sigmas(
-                [localizations[n] for n in told],
+                [localizations[n] for n in with_sigma],
                 self.transform,
                 self.normal,
                 self._rows,
@@ -336,7 +336,7 @@ class PlaneCalibration(storage.SavedCalibration):
                 self.place.camera_size,
                 flip=flip,
             )
-            for n, sigma in zip(told, sigmas, strict=True):
+            for n, sigma in zip(with_sigma, sigmas, strict=True):
                 found[n] = found[n]._replace(pose=found[n].pose.with_sigma(sigma))
         return found
 

@@ -228,8 +228,8 @@ def _studentized(fitted: Fit) -> Array:
     """Return each residual's square over its own variance (N,), 0 if that is 0."""
     values, vectors = np.linalg.eigh(fitted.blocks)
     along = np.einsum("nij,ni->nj", vectors, fitted.residuals)
-    known = values > _TINY * values.max()
-    squared: Array = np.where(known, along**2 / np.where(known, values, 1.0), 0.0).sum(axis=1)
+    good = values > _TINY * values.max()
+    squared: Array = np.where(good, along**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
     return squared
 
 

@@ -106,7 +106,7 @@ def agreeing(
 ) -> NDArray[np.bool_]:
     """Return the mask (N,) of points that agree with one another, more than half of them.
 
-    All points agree if no subset determines a map; ``check_samples`` then says what is wrong with
+    All points agree if no subset determines a map; ``check_samples`` then reports the fault of
     them. ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over the
     relative variance of each. ``touch_sigma``: standard deviation of one coordinate, metres; None:
     estimated from the points that agree. Without it up to about (N - 3) / 2 wrong points are found,
@@ -210,19 +210,19 @@ def _settle(
 def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     """Return a mask (N,) of the points that noise explains, each beside a fit of the others."""
     rows = element_derivatives(fitted.matrix, pairs.camera)
-    known = rows @ fitted.unit_covariance @ rows.swapaxes(1, 2)
+    by_map = rows @ fitted.unit_covariance @ rows.swapaxes(1, 2)
     # A fitted point has pulled the map towards itself: its residual has the variance I / w - J C
     # J^T. For any other point the variance of the map is added: I / w + J C J^T.
     signs = np.where(mask, -1.0, 1.0)[:, None, None]
-    variances = np.eye(3) / pairs.weights[:, None, None] + signs * known
+    variances = np.eye(3) / pairs.weights[:, None, None] + signs * by_map
     residuals = pairs.robot - apply_homography(fitted.matrix, pairs.camera)
     values, vectors = np.linalg.eigh(variances)
     along = np.einsum("nij,ni->nj", vectors, residuals)
-    told = values > MIN_VARIANCE_RATIO / pairs.weights[:, None]
-    squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
+    determined = values > MIN_VARIANCE_RATIO / pairs.weights[:, None]
+    squared = np.where(determined, along**2 / np.where(determined, values, 1.0), 0.0).sum(axis=1)
     if sigma is not None:
         return np.asarray(squared <= max(sigma, ROUNDING_RATIO) ** 2 * _limit(len(mask), None))
-    # An outlier would enlarge the sum of squares, so the point's own share is taken out: the sum
+    # An outlier would enlarge the sum of squares, so the point's own share is subtracted: the sum
     # falls by r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
     total, freedom = squares(fitted.residuals, pairs.weights[mask]), fitted.freedom

@@ -122,7 +122,7 @@ class PageLayout:
         return max(self._clear(RULER_SPAN_MM, edge) + TICK_MM[1], self._areas)
 
     def _clear(self, end: float, edge: float) -> float:
-        """Return the distance from the target of a thing that reaches from the origin to ``end``.
+        """Return the distance from the target of a part that reaches from the origin to ``end``.
 
         The thing is placed between the areas at the corners, or beyond them if it does not fit.
         """
@@ -154,10 +154,10 @@ class PageLayout:
 def _along(
     pattern: tuple[float, float], bands: tuple[float, float], side: float
 ) -> tuple[float, float]:
-    """Return the origin's place along a side of the page, and the length which that side needs.
+    """Return the origin's place along a side of the page, and the least length of that side.
 
     ``pattern``: begin and end of the pattern, from its origin. ``bands``: space needed before and
-    behind the pattern.
+    after the pattern.
     """
     low, high = pattern
     needed = 2 * BORDER_MM + bands[0] + max(high - low + bands[1], RULER_SPAN_MM - low)

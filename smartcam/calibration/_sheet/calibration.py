@@ -238,9 +238,9 @@ class SheetCalibration(storage.SavedCalibration):
     def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
         flat = self.sheet.solve(Poses.of(parts)).put(parts)
-        told = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
-        if told and self.plane.touch_sigma is not None:
-            for n, sigma in zip(told, self._sigmas([parts[n] for n in told]), strict=True):
+        rows = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
+        if rows and self.plane.touch_sigma is not None:
+            for n, sigma in zip(rows, self._sigmas([parts[n] for n in rows]), strict=True):
                 flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
         return self.plane.to_robot(flat, tool_flip=flip)
 

@@ -295,5 +295,5 @@ def _scaling(points: Array) -> Array:
 def _no_fit(view: TargetView) -> CalibrationError:
     return Code.POOR_FIT.refusal(
         f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
-        "a plane before the camera",
+        "a plane in front of the camera",
     )

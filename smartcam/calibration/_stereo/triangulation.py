@@ -103,10 +103,10 @@ def _step(
     jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(off, axis=1)
     normal = jacobian.swapaxes(1, 2) @ jacobian
     right_side = jacobian.swapaxes(1, 2) @ residuals
-    known = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
+    finite = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
     step = np.full((len(points), 3), np.nan)
-    inverse = np.linalg.pinv(normal[known], hermitian=True)
-    step[known] = (inverse @ right_side[known])[..., 0]
+    inverse = np.linalg.pinv(normal[finite], hermitian=True)
+    step[finite] = (inverse @ right_side[finite])[..., 0]
     return normal, step
 
 

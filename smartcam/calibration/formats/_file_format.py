@@ -84,14 +84,14 @@ class Format(Generic[T]):
 
     def _in_metres(self, found: T | Measured[T], unit: str | None) -> T:
         by_file = isinstance(found, Measured)
-        said = cast("Measured[T]", found).unit if by_file else "m"
+        stated = cast("Measured[T]", found).unit if by_file else "m"
         value = cast("Measured[T]", found).value if by_file else cast("T", found)
         motions = _motions(value)
         if not motions:
             return value
-        if unit is None and said is None:
+        if unit is None and stated is None:
             raise no_unit("lengths")
-        factor = metres_of(unit or said or "m", "lengths")
+        factor = metres_of(unit or stated or "m", "lengths")
         if unit is None and not by_file:
             for motion in motions:
                 distance = factor * float(np.linalg.norm(motion.translation))

@@ -134,7 +134,7 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
     seen, size = camera.project(rim), np.array(camera.size)
     low, high = np.floor(seen.min(axis=0) - more), np.ceil(seen.max(axis=0) + more)
     if (low < -size / 2).any() or (high > 1.5 * size).any():
-        # this far outside of the image a lens model may fold the rim back
+        # a lens model may fold points this far outside of the image back into it
         return 0, 0, *camera.size
     left, top = np.maximum(low, 0).astype(int).tolist()
     right, bottom = np.minimum(high + 1, size).astype(int).tolist()
@@ -148,7 +148,7 @@ def _sheet(
     flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     rays = np.column_stack([flat, np.ones(len(flat))])
     normal = pose.rotation[:, 2]
-    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon, so far away
+    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon: far away
     seen = (rays * (normal @ pose.translation / slope)[:, None] - pose.translation) @ pose.rotation
     rows, columns = u.shape
     fine = (columns * SAMPLES_PER_SIDE, rows * SAMPLES_PER_SIDE)
@@ -287,7 +287,7 @@ def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
         places.append(place.clip(0, count - 1).astype(np.intp))
         parts.append(part / side)
         markers.append(inside * _share(np.minimum(part, side - part), grain))
-        # the nearer gap: before the marker, or behind it
+        # the nearer gap: before or after the marker
         near = np.where(part < side / 2, part + gap, part - side)
         whole = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
         between.append(whole * _share(np.minimum(near, gap - near), grain))

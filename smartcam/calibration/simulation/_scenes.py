@@ -187,8 +187,8 @@ class HandEyeScene:
             )
             for number, pose in enumerate(self.robot_poses)
         ]
-        said = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
-        return said, views
+        poses = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
+        return poses, views
 
     def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
         """Return the Cramer-Rao bound of the camera's pose.

@@ -94,7 +94,7 @@ class MarkCamera:
     def check_y_down(self, before: bool | None, what: str) -> None:
         """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
 
-        ``what``: name, for people, of the thing that was made before.
+        ``what``: name, for people, of the earlier picture or calibration.
         """
         if None not in {before, self.y_down} and before != self.y_down:
             raise Code.MIRRORED.refusal(

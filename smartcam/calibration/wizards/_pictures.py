@@ -135,7 +135,7 @@ class PictureFolder:
         """Text, for people, that says which picture :meth:`take` waits for."""
         return (
             f"the next file that comes into {self.path} counts, one that ends in "
-            f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
+            f"{', '.join(sorted(SUFFIXES))}; earlier files do not count. It is waited for "
             f"{self.deadline:g} s"
         )
 
@@ -184,12 +184,12 @@ class PictureFolder:
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
         """Return a note on files that came instead of a picture, and on those there before."""
-        said = [f"there before: {len(before)}"] if before else []
+        notes = [f"there before: {len(before)}"] if before else []
         came = sorted(self._names() - others)
         if came:
             more = f" and {len(came) - 3} more" if len(came) > 3 else ""
-            said.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
-        return f" ({'; '.join(said)})" if said else ""
+            notes.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
+        return f" ({'; '.join(notes)})" if notes else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:
         """Return the time of writing, ns, and the number of bytes of each picture."""

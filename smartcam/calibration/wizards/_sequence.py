@@ -60,7 +60,7 @@ class StepAnswer(dict[str, Any]):
     """Answers to a step by name, and the outcome of its action.
 
     Attributes:
-        outcome: what the action returned, as JSON has it (lists for tuples); None without one.
+        outcome: the action's result as JSON data (lists for tuples); None without an action.
     """
 
     def __init__(self, values: Mapping[str, Any], outcome: Any) -> None:
@@ -580,7 +580,7 @@ def _named(header: Mapping[str, Any]) -> str:
 
 
 def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
-    """Return a value as it will be read, so that a resumed sequence sees what this one saw."""
+    """Return a value as it will be read, so that a resumed sequence has the same one."""
     try:
         read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:

@@ -254,7 +254,7 @@ def _put_aside(path: Path) -> None:
     if not path.exists():
         return
     try:
-        Journal(path).close()  # nobody else writes this file
+        Journal(path).close()  # no other process writes this file
     except CalibrationError as exc:
         if exc.code != Code.BROKEN_FILE:
             raise

@@ -290,7 +290,7 @@ class _SheetSource(PointSource):
         if plane.touch_sigma is not None:
             errors = found.predicted_error(self._view.points)
             predicted = 1e3 * math.sqrt(float((errors**2).mean()))
-            unknown = "; what the lens distorts comes on top"
+            unknown = "; the lens' distortion comes on top"
             if found.camera is not None:
                 known = found.lens_covariance is not None
                 unknown = "" if known else "; the lens' own error, which is not known, comes on top"

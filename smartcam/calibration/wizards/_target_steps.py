@@ -97,7 +97,7 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
         name="kind",
         label="What is printed on the sheet",
         options={
-            "described": "what the description says",
+            "described": "the target of the description",
             "checkerboard": "a checkerboard",
             "charuco": "a ChArUco board: markers in the white squares",
             "circles": "dots in rows and columns",

@@ -153,7 +153,7 @@ class Touches:
     ) -> Touch:
         """Ask for a touch.
 
-        ``place``: text that says what to touch. ``mark``: mark that the camera sees there.
+        ``place``: text that names the place to touch. ``mark``: the camera's mark there.
         ``what``: attribute of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"

@@ -1,4 +1,4 @@
-"""The wizard that checks whether a calibration still holds: touch some marks again, and compare.
+"""Check whether a calibration still holds: touch some marks again, and compare.
 
 A camera that was knocked sees everything shifted, which a few touches show. Their offsets are
 compared with the noise of the touches, both of the new ones and of those in the calibration.
@@ -106,17 +106,17 @@ def touches_needed(
     """Return the number of touches of one mark that are needed to notice a knock.
 
     The result is None if :data:`MAX_TOUCHES` are not enough, since the calibration itself is too
-    uncertain there. ``camera_point`` (2,): place of the mark for the camera. ``knock``: shift of
-    the camera's plane, metres, in the direction that is hardest to notice. ``noticed``: part of all
-    checks, 0 to 1, that must find it. Raises SHAPE or NOT_FINITE; UNVERIFIED if the touches' sigma
-    is not known; MissingExtraError: SciPy is not installed.
+    uncertain at the mark. ``camera_point`` (2,): place of the mark for the camera. ``knock``: shift
+    of the camera's plane, metres, in the direction that is hardest to notice. ``noticed``: part of
+    all checks, 0 to 1, that must find it. Raises SHAPE or NOT_FINITE; UNVERIFIED if the touches'
+    sigma is not known; MissingExtraError: SciPy is not installed.
     """
-    known = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
+    own = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
-        variance = known + sigma**2 / count
+        variance = own + sigma**2 / count
         shift = min(knock**2 / max(variance, knock**2 / _MAX_SHIFT), _MAX_SHIFT)
         if _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift) >= noticed:
             return count
@@ -144,8 +144,7 @@ def _about(name: str, *, typed: bool) -> Step:
         id="about",
         title=f"Is {name} still true?",
         description="Touch a mark or several again, with the same tool held the same way. Offsets "
-        "are compared with what the touches' noise explains, that of now and that of the "
-        "calibration.",
+        "are compared with the noise of the new touches and of the calibration's.",
         inputs=(UNIT, sigma) if typed else (sigma,),
     )
 
@@ -274,7 +273,7 @@ class _DriftCheck(Touches):
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
         needed = [touches_needed(self.calibration, point) for point in self._seen()]
-        known = [one for one in needed if one is not None]
+        enough = [one for one in needed if one is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),
@@ -283,8 +282,8 @@ class _DriftCheck(Touches):
             "expected_mm": 1e3 * drift.expected,
             "z": drift.z,
             "chance": drift.chance,
-            "needed": min(known, default=None),
-            "needed_at": 1 + needed.index(min(known)) if known else None,
+            "needed": min(enough, default=None),
+            "needed_at": 1 + needed.index(min(enough)) if enough else None,
         }
 
     async def _end(
@@ -335,8 +334,8 @@ def _notes(figures: Mapping[str, Any]) -> list[str]:
         f"(z = {figures['z']:.2f})",
         f"{knock} with {_touches(needed)} of the mark of touch {figures['needed_at']}"
         if needed is not None
-        else f"{knock} with no number of touches of these marks: the calibration is known too "
-        "badly there",
+        else f"{knock} with no number of touches of these marks: the calibration is too "
+        "uncertain there",
     ]
 
 
