@@ -154,7 +154,7 @@ class Frame:
 
 
 _data: Final = JoinedOnUse(vars(Frame)["data"])
-setattr(Frame, "data", _data)  # noqa: B010 - checkers know the attribute as it is read
+setattr(Frame, "data", _data)  # noqa: B010 - type checkers use the field
 _NAMES: Final = tuple(one.name for one in fields(Frame))
 _OTHERS: Final = tuple(name for name in _NAMES if name != "data")
 _values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_OTHERS)

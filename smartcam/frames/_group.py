@@ -287,7 +287,7 @@ class _GroupReader(FrameReader):
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         self._delivered += 1
-        self._group._take(self._member, frame)  # noqa: SLF001 - the two are one
+        self._group._take(self._member, frame)  # noqa: SLF001 - same module
 
     def _end(self, error: FrameSourceError | None) -> None:
         super()._end(error)

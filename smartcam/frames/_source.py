@@ -425,7 +425,7 @@ class FrameSource(FrameSink):
         if frame.trigger is not None:
             self._triggers.came(frame)
         for reader in self._alive():
-            reader._offer(frame)  # noqa: SLF001 - the two are one
+            reader._offer(frame)  # noqa: SLF001 - its own reader
 
     def _timed(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on the host's clock, not later than now."""

@@ -158,7 +158,7 @@ class Code(enum.StrEnum):
         """Return an error; ``text`` names the expected value, and ``got`` is appended."""
         try:
             came = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
-        except Exception:  # noqa: BLE001 - whatever a class of somebody's raises there
+        except Exception:  # noqa: BLE001 - a foreign class may raise any
             came = shown(got)
         return self.refusal(f"{text}, got {came}", expected, got)
 

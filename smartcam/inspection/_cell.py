@@ -320,7 +320,7 @@ def _steps(
             steps[follow] = ProgramStep(follow, FollowedApplication(followed, setup), own=False)
         if step.name in steps:
             raise ProgramError(
-                f"there is a tool {step.name!r} already: expected a name behind the tool's, such "
+                f"there is a tool {step.name!r} already: expected a name after the tool's, such "
                 f"as '{key.split()[0]} left:'",
                 (*place, key),
             )

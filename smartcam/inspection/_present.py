@@ -142,7 +142,7 @@ class Present(Tool[PresentSettings]):
         if self.settings.colour is not None:
             mask = self.settings.colour.mask(view.rgb).view(np.uint8)
         else:
-            assert self.settings.grey is not None  # noqa: S101 - the settings say so
+            assert self.settings.grey is not None  # noqa: S101 - checked by the settings
             low, high = self.settings.grey
             mask = cv2.inRange(view.grey, low, high)
         mask = cv2.bitwise_and(mask, view.region.mask())

@@ -225,7 +225,7 @@ BAD = {
     "bytes of nothing": (PARTED + b"x" * 3_000_000, "bytes came that belong to no picture"),
     "packed": (
         HEAD % (b"multipart/x-mixed-replace; boundary=b", b"Content-Encoding: gzip\r\n"),
-        "expected bytes as they are, got Content-Encoding: gzip",
+        "expected no encoding, got Content-Encoding: gzip",
     ),
     "nothing but beginnings": (b"HTTP/1.1 102 Processing\r\n\r\n" * 9, "102 Processing"),
     "not found": (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "404 Not Found"),

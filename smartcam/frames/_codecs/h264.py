@@ -72,7 +72,7 @@ class H264Encoder:
             self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
         self._bitrate = bitrate
         self._turn = asyncio.Lock()
-        self._one = threading.Lock()  # the thread of a cancelled call may still be using it
+        self._in_use = threading.Lock()  # the thread of a cancelled call may still be using it
         self._codec: Any = None
         self._grey: Any = None  # frame of the last grey picture, of which x264 has made a copy
         self._kind: tuple[object, ...] = ()
@@ -100,7 +100,7 @@ class H264Encoder:
                 raise
 
     def _encode(self, frame: Frame, broken: int) -> Frame:
-        with self._one:
+        with self._in_use:
             if frame.format.name == "MJPEG":
                 frame = decoded(frame, "RGB8")
             video = to_video(frame, self._grey)
@@ -152,7 +152,7 @@ class H264Decoder:
         load("av")
         self._run, self._reorders, self._to = run, reorders, to
         self._turn = asyncio.Lock()
-        self._one = threading.Lock()
+        self._in_use = threading.Lock()
         self._codec: Any = None
         self._size = (0, 0)
         self._losses = self._losses_seen = 0
@@ -185,7 +185,7 @@ class H264Decoder:
                 after a loss.
 
         Raises:
-            FrameFormatError: the frame is damaged, or has another size than it says; that counts as
+            FrameFormatError: the frame is damaged, or its picture has another size; that counts as
                 a loss.
             LocalProtocolError: the codecs are closed.
 
@@ -199,7 +199,7 @@ class H264Decoder:
                 raise
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
-        with self._one:
+        with self._in_use:
             if self._size != (frame.width, frame.height):
                 self._begin(frame)
             if losses != self._losses_seen:

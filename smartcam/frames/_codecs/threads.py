@@ -250,7 +250,7 @@ class StreamRuns:
         """Run the work, and return its result."""
         if not self.short:
             return await self._codecs._run(partial(self._timed, work))  # noqa: SLF001
-        self._codecs._open_pool()  # noqa: SLF001 - what is closed runs nothing
+        self._codecs._open_pool()  # noqa: SLF001 - closed codecs run nothing
         return self._timed(work)
 
     def _timed(self, work: Callable[[], T]) -> T:

@@ -304,15 +304,15 @@ async def heartbeat(
         lost: function that is called once, at the end, with the error.
     """
     loop = asyncio.get_running_loop()
-    heard = loop.time()
+    answered = loop.time()
     while True:
         await asyncio.sleep(timeout / 3)
         try:
             privilege = await control.read_register(Register.CONTROL_PRIVILEGE)
         except FrameSourceError as exc:
-            if loop.time() - heard >= timeout:
+            if loop.time() - answered >= timeout:
                 error = FrameSourceError(
-                    f"{source}: it has not answered for {loop.time() - heard:.1f} s: {exc}",
+                    f"{source}: no answer for {loop.time() - answered:.1f} s: {exc}",
                     source=source,
                 )
                 error.__cause__ = exc
@@ -322,10 +322,10 @@ async def heartbeat(
         if not privilege & (CONTROL | EXCLUSIVE):
             lost(
                 FrameSourceError(
-                    f"{source}: control of it was lost: it restarted, or heard no heartbeat for "
+                    f"{source}: control was lost: the camera restarted, or got no heartbeat for "
                     f"{timeout:g} s",
                     source=source,
                 )
             )
             return
-        heard = loop.time()
+        answered = loop.time()

@@ -103,7 +103,7 @@ def _power(left: Number, right: Number) -> Number:
         return int(left**right)
     power = float(left) ** float(right)
     if isinstance(power, complex):
-        raise ValueError("a root of a negative number")  # noqa: TRY004 - as math's functions say it
+        raise ValueError("a root of a negative number")  # noqa: TRY004 - like math's functions
     return float(power)
 
 

@@ -185,7 +185,7 @@ class SharedH264:
             error = exc
         except SmartCamError as exc:  # source or codecs were closed
             error = FrameSourceError(f"{name}: {exc}", source=name)
-        except Exception as exc:  # noqa: BLE001 - viewers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - passed on to viewers
             _log.exception("%s: cannot be encoded", name)
             error = FrameSourceError(f"{name}: {exc!r}", source=name)
         return error

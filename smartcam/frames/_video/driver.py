@@ -71,29 +71,29 @@ class VideoDriver(FrameDriver):
     ``belt.mp4#pace=none``, ``shots/*.png#fps=5``.
 
     ================= =============================================================================
-    ``transport``     of RTSP: ``tcp`` (usual), where nothing is lost, or ``udp``, where what is
-                      lost may spoil pictures until the next key frame
-    ``timeout``       seconds for connecting, and without data before it counts as dead; usual 5
-    ``format``        pixels are converted to ``RGB8``, ``BGR8`` or ``Mono8``; ``MJPEG`` or ``H264``
-                      hands the bytes on that came, where it is that; usual: as the decoder has them
+    ``transport``     of RTSP: ``tcp`` (usual), without losses, or ``udp``, where a loss may spoil
+                      pictures until the next key frame
+    ``timeout``       seconds to connect, and without data until the source counts as dead; usual 5
+    ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
+                      passes such bytes on unchanged; usual: the decoder's format
     ``delay``         of a live stream: longest time from exposure to arrival, seconds; usual 1
     ``pace``          of a recording: ``real`` (usual) by its time stamps, or ``none``: each picture
-                      when the readers have taken the last one; none is skipped
+                      as soon as the readers have taken the last one, without skips
     ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
                       files in a folder
-    ``mixed``         of files: ``yes`` takes pictures of other sizes and formats than the first
-                      one's, too, and counts damaged ones as lost; usual ``no``
+    ``mixed``         of files: ``yes`` also accepts pictures with other sizes and formats than the
+                      first one's, and counts damaged ones as lost; usual ``no``
     ``verify``        of TLS: ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
-    ``elsewhere``     of a server: ``yes`` goes where it sends us, by a redirect to another host or
-                      port or by a playlist (HLS, DASH); usual ``no``
+    ``elsewhere``     of a server: ``yes`` follows a redirect to another host or port, and a
+                      playlist (HLS, DASH); usual ``no``
     ``name``          of the camera
     ================= =============================================================================
 
-    A live stream's frames are stamped with their arrival; frames that waited while FFmpeg analysed
-    the stream, with its begin. Only RTSP has a clock, ``device_time``. Frames have no numbers, so
-    ``sequence`` counts received pictures, and ``lost`` damaged ones. Damaged pictures, and pictures
-    that depend on them as far as the decoder reports it, are dropped.
+    A live stream's frames have the time of their arrival; frames that FFmpeg received during its
+    analysis have the time of the stream's begin. Only RTSP has a clock, ``device_time``. Frames
+    have no numbers, so ``sequence`` counts received pictures, and ``lost`` damaged ones. Damaged
+    pictures, and pictures that depend on them as far as the decoder reports it, are dropped.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -212,7 +212,7 @@ class VideoDriver(FrameDriver):
                 read = await thread.do(reading.read)
         except FrameSourceError as error:
             sink.ended(error)
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - passed on to readers
             failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
             failed.__cause__ = exc
             sink.ended(failed)
@@ -277,13 +277,13 @@ class _ReadingThread:
 
     async def ended(self, within: float) -> bool:
         """Close the source in the thread; return whether it was closed in time."""
-        last = asyncio.get_running_loop().run_in_executor(self._pool, self._give_back)
+        last = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reading)
         last.add_done_callback(_retrieve_error)
         self._pool.shutdown(wait=False)
         _, late = await asyncio.wait([last], timeout=within)
         return not late
 
-    def _give_back(self) -> None:
+    def _close_reading(self) -> None:
         reading, self._reading = self._reading, None
         if reading is not None:
             reading.close()

@@ -44,7 +44,7 @@ class WebDriver(VideoDriver):
         """Read one picture, and close the connection again.
 
         Raises:
-            FrameFormatError: the source is no video, or has pixels that we have no name for.
+            FrameFormatError: the source is no video, or has an unknown pixel format.
             FrameSourceError: the source is not there, refuses, or is silent.
             MissingExtraError: the extra ``video`` is not installed.
         """
@@ -72,7 +72,7 @@ class WebDriver(VideoDriver):
             await super().start(sink)
         elif not await self._begin_parts(sink):
             raise FrameFormatError(
-                f"{self.name}: expected parts, as it was opened, got something else: open it anew",
+                f"{self.name}: expected parts as at the opening, got another answer: open it anew",
                 source=self.name,
             )
 
@@ -114,7 +114,7 @@ class WebDriver(VideoDriver):
             raise self._wrong(f"cannot be read: {shown}")
         coding = answer.header("content-encoding").lower()
         if answer.is_pictures and coding not in ("", "identity"):
-            raise self._wrong(f"expected bytes as they are, got Content-Encoding: {coding[:40]}")
+            raise self._wrong(f"expected no encoding, got Content-Encoding: {coding[:40]}")
         if answer.is_pictures and self._format is not None and self._format.name == "H264":
             raise self._wrong("expected H264, got MJPEG")
 

@@ -113,7 +113,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         try:
             return await super()._trigger(application, request, timeout)
         except CameraFaultError as exc:
-            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is over'}") from exc
+            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is closed'}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
         return await self._picture(timeout, drawn=False)
@@ -205,4 +205,4 @@ def find_camera(url: str) -> CellCamera:
             f"{path} has no software camera {name!r:.80}; it has {there}"
             f"{did_you_mean(name, cameras)}"
         )
-    raise ConfigurationError(f"{path} has several software cameras: name one of {there} behind #")
+    raise ConfigurationError(f"{path} has several software cameras: name one of {there} after #")

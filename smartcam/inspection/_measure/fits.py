@@ -126,8 +126,8 @@ def _robust(
     if kept is not None:
         return _fitted(edges, kept, fit, _start(edges.some(kept), through, least), least)
     start = _start(edges, through, least)
-    everybody = np.ones(number, dtype=np.bool_)
-    found = _fitted(edges, everybody, fit, start, least)
+    all_edges = np.ones(number, dtype=np.bool_)
+    found = _fitted(edges, all_edges, fit, start, least)
     far = np.abs(found.residuals) / edges.sigmas
     if found.excess == 1.0 and far.max() <= OUTLIER_SIGMAS:
         return found

@@ -242,7 +242,7 @@ async def test_unplugged_camera_ends_the_stream_and_is_reopened() -> None:
         async with asyncio.timeout(20):
             await sink.over.wait()
         assert sink.numbers == [1, 2, 3, 4]
-        assert "not answered" in str(sink.error)
+        assert "no answer for" in str(sink.error)
         await one.stop()
         assert sink.counted == 1
         there.deaf, there.owner = False, None
@@ -260,7 +260,7 @@ async def test_control_taken_by_another_application_ends_the_stream() -> None:
         there.take_away("192.0.2.7")
         async with asyncio.timeout(20):
             await sink.over.wait()
-        assert "control of it was lost" in str(sink.error)
+        assert "control was lost" in str(sink.error)
         with pytest.raises(FrameSourceError, match=r"another application at 192\.0\.2\.7"):
             await one.start(sink)
         await one.close()

@@ -1,4 +1,4 @@
-"""Cameras that do odd things give all their pictures; test_bad_servers has worse ones."""
+"""Unusual cameras give all their pictures; test_bad_servers has faulty ones."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("no_leaks")]
 
 LIMIT = 30.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 WHO = "me:s3cret@"
 
@@ -63,7 +63,7 @@ def camera(encoded: list[bytes]) -> Camera:
 
 
 async def read(camera: Camera, count: int = 12, user: str = "", how: str = "") -> list[Frame]:
-    """Return frames, each of which is one that was drawn."""
+    """Check that frames are drawn ones, and return them."""
     got: list[Frame] = []
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"rtsp://{user}{where}#timeout=3{how}"
@@ -86,7 +86,7 @@ def in_a_row(got: list[Frame]) -> bool:
     return all((after - before) % COUNT == 1 for before, after in itertools.pairwise(found))
 
 
-# what cameras are like
+# kinds of cameras
 
 
 def sdp(old: str, new: str) -> dict[str, Any]:
@@ -150,7 +150,7 @@ async def test_an_odd_camera_gives_all_its_pictures(camera: Camera, name: str, h
 async def test_camera_may_send_from_the_address_in_its_answer(
     camera: Camera,
 ) -> None:
-    camera.sender = camera.source = "127.0.0.2"  # as behind a recorder
+    camera.sender = camera.source = "127.0.0.2"  # like a camera behind a recorder
     assert in_a_row(await read(camera, how="&transport=udp"))
     camera.source = ""
     with pytest.raises(FrameSourceError, match="expected a whole picture, got none"):

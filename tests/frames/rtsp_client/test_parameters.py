@@ -134,7 +134,7 @@ async def test_refusals_of_a_camera_are_errors(encoded: list[bytes]) -> None:
         with pytest.raises(UnsupportedError, match="cannot execute a command such as Reboot"):
             await features["Reboot"].execute()
         assert len(camera.asked) == asked
-        assert not source.has_features  # a list of them is not shown
+        assert not source.has_features  # the list of values is not shown
 
 
 @pytest.mark.parametrize(

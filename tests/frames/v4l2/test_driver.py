@@ -200,7 +200,7 @@ async def test_a_device_that_may_not_be_opened_is_found_with_the_reason(
     monkeypatch.setattr(system, "open", refuse)
     found = await scenarios.found()
     assert len(found) == 6
-    assert all("EACCES, not allowed" in one.remark for one in found)
+    assert all("EACCES, access is denied" in one.remark for one in found)
 
 
 def changed(replay: Replay, monkeypatch: pytest.MonkeyPatch, **fields: int) -> None:

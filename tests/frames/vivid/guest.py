@@ -301,7 +301,7 @@ async def what_a_device_has_not_is_listed() -> None:
     await refused("v4l2:///dev/video5", "several planes")
     os.seteuid(65534)
     try:
-        await refused("v4l2:///dev/video0", "EACCES", "not allowed")
+        await refused("v4l2:///dev/video0", "EACCES", "access is denied")
     finally:
         os.seteuid(0)
 

@@ -141,14 +141,14 @@ class UnitDecoding:
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DRAIN_TIMEOUT):
-                while self._units and not self._ended:  # noqa: ASYNC110 - no event says so
+                while self._units and not self._ended:  # noqa: ASYNC110 - there is no event
                     await asyncio.sleep(DRAIN_LOOK_INTERVAL)
         self.over(error)
 
     def take(self, units: list[AccessUnit]) -> None:
         """Queue encoded frames for the decoder: all, or none if there are too many."""
         source = self._source
-        assert source is not None  # noqa: S101 - nothing comes before it begins
+        assert source is not None  # noqa: S101 - set by begin
         self._units += [(one, source.utc(one.timestamp)) for one in units]
         if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
@@ -160,7 +160,7 @@ class UnitDecoding:
         if self._idle and self._units and self._run.short and not self._ended:
             try:
                 at_once(self._decode_next())
-            except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            except Exception as exc:  # noqa: BLE001 - passed on to readers
                 self._fail(exc)
         if self._units:
             self._came.set()
@@ -185,16 +185,16 @@ class UnitDecoding:
                 if self._units:
                     await self._decode_next()
                     await asyncio.sleep(0)  # several pictures must not block the loop
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - passed on to readers
             self._fail(exc)
 
     async def _decode_next(self) -> None:
         unit, device_time = self._units.popleft()
         begins = unit.begins or self._anew
-        behind = not begins and self._pace.goes_back(unit)
+        goes_back = not begins and self._pace.goes_back(unit)
         missing = self._pace.lost(unit) + self._skipped
         self._missed += missing
-        if behind and not self._reorders:
+        if goes_back and not self._reorders:
             self._reorders = begins = True
         if begins or self._decoder is None:
             self._decoder = self._made_decoder()
@@ -234,7 +234,7 @@ class UnitDecoding:
             return None
         if self._plan.size not in (None, size):
             raise FrameFormatError(
-                f"{self._name}: expected pictures of {_shown(self._plan.size)}, as it was opened, "
+                f"{self._name}: expected {_shown(self._plan.size)}, the size at the opening, "
                 f"got {_shown(size)}: open it anew",
                 available=(_shown(size),),
             )

@@ -223,7 +223,7 @@ class _RtpStream:
     async def _watch(self) -> None:
         receiver, longest = self._receiver, self._plan.timeout
         loop = asyncio.get_running_loop()
-        while (left := receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+        while (left := receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(left)
         text = f"{self._plan.name}: no packet came for {self._plan.timeout:g} s"
         self._decoding.over(FrameSourceError(text))

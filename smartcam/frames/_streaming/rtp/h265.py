@@ -73,9 +73,9 @@ def _size(bits: FieldBits) -> tuple[int, int]:
     bits.fixed(4)
     layers = bits.fixed(3)
     bits.fixed(1 + 96)
-    said = [(bits.fixed(1), bits.fixed(1)) for _ in range(layers)]
+    flags = [(bits.fixed(1), bits.fixed(1)) for _ in range(layers)]
     bits.fixed(2 * (8 - layers) if layers else 0)
-    for profile, level in said:
+    for profile, level in flags:
         bits.fixed(88 * profile + 8 * level)
     bits.unsigned()
     colours = bits.unsigned()

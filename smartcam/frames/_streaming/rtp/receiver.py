@@ -159,7 +159,7 @@ class StreamReceiver:
         self._next_report: asyncio.TimerHandle | None = None
         self._picture_asked = float("-inf")
         self._began = self._shown_at = float("-inf")
-        self.heard = self._loop.time()
+        self.last_packet_at = self._loop.time()
         pair.read(self._packet, self._report_came, self._read)
 
     def close(self) -> None:
@@ -168,7 +168,7 @@ class StreamReceiver:
             if timer is not None:
                 timer.cancel()
         if self._reception is not None:
-            self._say(wire.Goodbye((self._ssrc,)))
+            self._send_report(wire.Goodbye((self._ssrc,)))
             self._reception = None
         self._pair.close()
 
@@ -200,7 +200,7 @@ class StreamReceiver:
         now = self._loop.time()
         if self._reception is not None and now - self._picture_asked >= KEY_FRAME_REQUEST_INTERVAL:
             self._picture_asked = now
-            self._say(wire.PictureLost(self._ssrc, self._reception.ssrc))
+            self._send_report(wire.PictureLost(self._ssrc, self._reception.ssrc))
 
     def shown(self) -> None:
         """Note that a picture of the stream was decoded."""
@@ -218,7 +218,7 @@ class StreamReceiver:
         if ours is None:
             self._strange += 1
             return
-        self.heard = now = self._loop.time()
+        self.last_packet_at = now = self._loop.time()
         self._packets += 1
         ours.packet(packet, now)
         if self._asked.pop(packet.sequence, None) is not None:
@@ -258,11 +258,11 @@ class StreamReceiver:
         if self._agreed:
             return (
                 now - self._began < NEW_STREAM_DELAY
-                and now - self.heard < KEY_FRAME_REQUEST_INTERVAL
+                and now - self.last_packet_at < KEY_FRAME_REQUEST_INTERVAL
             )
         if now - self._shown_at >= NEW_HOST_DELAY:
             return now - self._began < NEW_STREAM_DELAY
-        return now - self.heard < (
+        return now - self.last_packet_at < (
             NEW_STREAM_DELAY if sender[0] == self._sender[0] else NEW_HOST_DELAY
         )
 
@@ -292,7 +292,11 @@ class StreamReceiver:
             self.want_picture()
         elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
             tail = self._depacketizer.tail()
-            if tail is not None and self._tail_due() and now - self.heard >= MAX_PACKET_INTERVAL:
+            if (
+                tail is not None
+                and self._tail_due()
+                and now - self.last_packet_at >= MAX_PACKET_INTERVAL
+            ):
                 missing = [tail]
             self._ask(missing, now)
         self._read()
@@ -305,7 +309,7 @@ class StreamReceiver:
 
     def _tail_due(self) -> bool:
         """Return True if the rest of a frame is missing and the sender repairs such losses."""
-        if not self._repaired or self._loop.time() - self.heard > self._repair:
+        if not self._repaired or self._loop.time() - self.last_packet_at > self._repair:
             return False
         return self._depacketizer.tail() is not None
 
@@ -314,7 +318,7 @@ class StreamReceiver:
         due = [one for one in missing if now - asked.get(one, float("-inf")) >= RESEND_INTERVAL]
         if due and self._reception is not None:
             self._asked = {one: asked.get(one, now) for one in missing} | dict.fromkeys(due, now)
-            self._say(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
+            self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
     def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
         if not self._may_speak(sender):
@@ -339,12 +343,12 @@ class StreamReceiver:
             self._gone(report.reason)
 
     def _report(self) -> None:
-        self._say()
+        self._send_report()
         if self._next_report is not None:
             self._next_report.cancel()
         self._next_report = self._loop.call_later(REPORT_INTERVAL, self._report)
 
-    def _say(self, *more: wire.Report) -> None:
+    def _send_report(self, *more: wire.Report) -> None:
         """Send a compound report: reception, name, and further requests."""
         if self._reception is None:
             return

@@ -44,7 +44,7 @@ REPORT_INTERVAL: Final = 2.0
 MIN_KEY_FRAME_INTERVAL: Final = 0.2
 """Least time between two requested key frames, seconds, since they are large."""
 
-BEGINS_SPS: Final = b"\0\0\1\x67"
+SPS_START: Final = b"\0\0\1\x67"
 """Start code and header of a sequence parameter set, as x264 writes them."""
 
 FULL_SOCKET_TIMEOUT: Final = 1.0
@@ -277,7 +277,7 @@ class RtpSender:
             _log.exception("! RTP to %s", link.to)
             raise
         finally:
-            self._say(link, wire.Goodbye((self._packetizer.ssrc,)))
+            self._send_report(link, wire.Goodbye((self._packetizer.ssrc,)))
 
     def _begin_anew(self) -> None:
         self._wanted, self._made_anew = False, time.monotonic()
@@ -287,7 +287,7 @@ class RtpSender:
     def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
         """Send a frame's packets; return whether the socket accepted all."""
         data = bytes(encoded.data)
-        if BEGINS_SPS in data:
+        if SPS_START in data:
             self._sets = parameter_sets(data) or self._sets
         self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
         sequence = self._packetizer.sequence
@@ -307,10 +307,10 @@ class RtpSender:
 
     async def _report(self, link: _RtpOutlet) -> None:
         while True:
-            self._say(link)
+            self._send_report(link)
             await asyncio.sleep(REPORT_INTERVAL)
 
-    def _say(self, link: _RtpOutlet, *more: wire.Report) -> None:
+    def _send_report(self, link: _RtpOutlet, *more: wire.Report) -> None:
         now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
         report = wire.SenderReport(
             self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
@@ -338,7 +338,7 @@ class RtpSender:
                 self._audience.left(ssrc)
         elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
             self._wanted = True
-            self._say(link)  # the receiver needs the sender's clock
+            self._send_report(link)  # the receiver needs the sender's clock
 
     def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:

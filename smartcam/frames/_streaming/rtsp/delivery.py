@@ -113,7 +113,7 @@ class DatagramDelivery:
         sockets: tuple[socket.socket, socket.socket],
         client: tuple[str | int, ...],
         ports: tuple[int, int],
-        heard: Callable[[bytes], None],
+        on_rtcp: Callable[[bytes], None],
     ) -> None:
         self._socket, control = sockets
         ours = f"{self._socket.getsockname()[1]}-{control.getsockname()[1]}"
@@ -121,7 +121,7 @@ class DatagramDelivery:
         self._to, self._control_to = ((client[0], port, *client[2:]) for port in ports)
         self._control_socket = control
         self._control: asyncio.DatagramTransport | None = None
-        self._heard = heard
+        self._on_rtcp = on_rtcp
 
     async def open(self) -> None:
         """Start receiving the client's reports.
@@ -131,7 +131,7 @@ class DatagramDelivery:
         loop = asyncio.get_running_loop()
         try:
             self._control, _ = await loop.create_datagram_endpoint(
-                lambda: _ControlPort(str(self._to[0]), self._heard), sock=self._control_socket
+                lambda: _ControlPort(str(self._to[0]), self._on_rtcp), sock=self._control_socket
             )
         except BaseException:
             self.close()
@@ -166,12 +166,12 @@ class DatagramDelivery:
 class _ControlPort(asyncio.DatagramProtocol):
     """Pass on the datagrams of one host."""
 
-    def __init__(self, host: str, heard: Callable[[bytes], None]) -> None:
-        self._host, self._heard = host, heard
+    def __init__(self, host: str, on_rtcp: Callable[[bytes], None]) -> None:
+        self._host, self._on_rtcp = host, on_rtcp
 
     def datagram_received(self, data: bytes, addr: tuple[str | int, ...]) -> None:
         if addr[0] == self._host:
-            self._heard(data)
+            self._on_rtcp(data)
 
     def error_received(self, exc: Exception) -> None:
         """Ignore ICMP errors, which any host can send."""

@@ -60,7 +60,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
         return await _options(connection, request)
     connection.gate.check(request)
     for session in connection.sessions.values():
-        session.heard()
+        session.keep_alive()
     with connection.serving():
         return await METHODS[method](connection, request)
 

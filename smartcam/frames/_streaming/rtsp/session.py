@@ -106,7 +106,7 @@ class RtspSession:
                 delivery.report(compound(*self._report(), Goodbye((self.ssrc,), why)))
             delivery.close()
 
-    def heard(self) -> None:
+    def keep_alive(self) -> None:
         """Note that the client is alive."""
         self._heard_at = self._loop.time()
 
@@ -117,7 +117,7 @@ class RtspSession:
         except MessageError:
             return
         if any(isinstance(one, ReceiverReport | SenderReport) for one in reports):
-            self.heard()
+            self.keep_alive()
         if any(isinstance(one, PictureLost) and one.media == self.ssrc for one in reports):
             self.stream.shared.key_frame()
 
@@ -182,7 +182,7 @@ class RtspSession:
         self._timer = self._loop.call_later(CHECK_INTERVAL, self._check)
         alive = self.delivery.alive(now) if self.playing else None
         if alive:
-            self.heard()
+            self.keep_alive()
         if alive is False:
             self.stream.stalled += 1
             self._end("")

@@ -64,7 +64,7 @@ class ServerRequest(NamedTuple):
 
 
 class ChannelPacket(NamedTuple):
-    """A packet of a channel, between the answers (section 10.12)."""
+    """A packet of a channel, between the answers (RFC 2326, section 10.12)."""
 
     channel: int
     data: bytes

@@ -108,8 +108,8 @@ def _track(kind: list[str], lines: list[str]) -> VideoTrack:
 
 
 def _encoding(number: int, lines: list[str]) -> str:
-    said = _of_type(lines, "rtpmap", number)
-    return said.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
+    text = _of_type(lines, "rtpmap", number)
+    return text.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
 
 
 def _attribute(lines: list[str], name: str) -> str:
@@ -120,8 +120,8 @@ def _attribute(lines: list[str], name: str) -> str:
 
 def _of_type(lines: list[str], name: str, number: int) -> str:
     """Return the texts of an attribute for a payload type, joined."""
-    said = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
-    return ";".join(one[2] for one in said if one is not None and int(one[1]) == number)
+    matches = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
+    return ";".join(one[2] for one in matches if one is not None and int(one[1]) == number)
 
 
 def _parameters(text: str) -> dict[str, str]:

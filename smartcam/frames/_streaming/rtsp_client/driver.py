@@ -41,11 +41,11 @@ class RtspDriver(FrameDriver):
 
     ================= =============================================================================
     ``transport``     ``tcp``, over the connection, or ``udp``; usual: over the connection, or by
-                      UDP where the camera refuses that
-    ``timeout``       seconds until it plays, for a first picture, and without a packet before it
-                      counts as gone; usual 5
-    ``format``        pixels are converted to ``RGB8``, ``BGR8`` or ``Mono8``; ``MJPEG`` or ``H264``
-                      hands the bytes on that came, where it is that; usual: as the decoder has them
+                      UDP if the camera refuses that
+    ``timeout``       seconds until PLAY, until the first picture, and without a packet until the
+                      camera counts as lost; usual 5
+    ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
+                      passes such bytes on unchanged; usual: the decoder's format
     ``delay``         longest time from exposure to arrival, seconds; usual 1
     ``verify``        of TLS (``rtsps:``): ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
@@ -273,6 +273,6 @@ class _Playing:
 
     async def _watch(self) -> None:
         loop, longest = asyncio.get_running_loop(), self._plan.timeout
-        while (left := self._receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+        while (left := self._receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(left)
         self._over(f"no packet came for {longest:g} s")

@@ -219,8 +219,8 @@ class RtspLink(asyncio.Protocol):
         """Answer a server's request, such as a check of the client."""
         known = request.method in (*_ALLOWED, *_ENDING)
         cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
-        said = "200 OK" if known else "501 Not Implemented"
-        self.write(f"RTSP/1.0 {said}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
+        status = "200 OK" if known else "501 Not Implemented"
+        self.write(f"RTSP/1.0 {status}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
         if request.method in _ENDING:
             self._end(f"the server ended the session ({request.method})")
 
@@ -231,8 +231,8 @@ class RtspLink(asyncio.Protocol):
         if self._waiting is not None and not self._waiting[1].done():
             self._waiting[1].set_exception(self._error(why))
             self._waiting[1].exception()  # mark the error as retrieved
-        told, self.on_end = self.on_end, _ignore
-        told(why)
+        on_end, self.on_end = self.on_end, _ignore
+        on_end(why)
         if self._transport is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._transport.close()
