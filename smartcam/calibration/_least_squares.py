@@ -80,7 +80,7 @@ class Normal(NamedTuple):
         #     B_p x + C_p y_p       = b_p    (pose p)
         # the second gives y_p = C_p^-1 b_p - C_p^-1 B_p x, and with that the first
         #     (A - sum_p B_p^T C_p^-1 B_p) x = a - sum_p B_p^T C_p^-1 b_p.
-        # Damping is Marquardt's: A + damping diag(A), which the units of unknowns do not matter to.
+        # Damping is Marquardt's: A + damping diag(A), which does not depend on the unknowns' units.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963); Triggs et al., section 6.1.
         grown = self.own + damping * self.own * np.eye(self.own.shape[-1])

@@ -30,7 +30,7 @@ class OneBlasThread(ContextDecorator):
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Start anew in a fork, which may go on with one thread."""
+        """Reset the state in a fork, which may go on with one thread."""
         self._lock = threading.Lock()
         self._inside: Counter[int] = Counter()  # depth of nested uses, by thread
         self._before: Any = None

@@ -1,4 +1,4 @@
-"""Judge a calibration: whether it is good, for how many millimetres, and what to do next.
+"""Judge a calibration: its quality, its error in millimetres, and the next action.
 
 A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
 twice that error is within what the user allows; the default is :data:`MAX_ERROR_SHARE` of the
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_ERROR_SHARE: Final = 0.01
-"""Largest allowed error, as a part of the field, if the user does not say another."""
+"""Largest allowed error, as a part of the field, if the user gives none."""
 
 _RMS_OF_95_PERCENT: Final = 2.0
 """Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""
@@ -75,7 +75,7 @@ CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.POOR_FIT: (_AGAIN, "redo"),
     Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
 }
-"""Advice and matching option for each thing that may be wrong; the first that applies counts."""
+"""Advice and matching option for each possible fault; the first that applies counts."""
 
 VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),

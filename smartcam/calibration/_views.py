@@ -34,13 +34,13 @@ class TargetView(storage.Stored):
     Pixels count from the centre of the upper left pixel: u to the right, v down.
 
     Attributes:
-        target: the target that was looked for.
+        target: target of the search.
         size: width and height of the image, pixels.
         ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
         points: (N, 2), places of these points in the image, pixels.
         covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
             without noise.
-        margin: how clearly the origin differs from the other corners: the number of grey levels, of
+        margin: margin of the origin over the other corners: the number of grey levels, of
             255, by which its mark, or the rim of its larger dot, is darker; None if ids or colours
             of squares show the origin, or if the target looks the same when turned.
         name: name of the image, for messages.

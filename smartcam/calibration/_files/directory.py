@@ -25,7 +25,7 @@ MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""
 
 EXPORTS = "exports"
-"""Name of the folder, inside of the given one, in which exported files stand."""
+"""Name of the folder, inside of the given one, for exported files."""
 
 _SUFFIXES = (".json", ".yaml", ".txt", ".calib")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)

@@ -4,8 +4,7 @@ A file is JSON: ``schema``, ``schema_version``, ``kind``, ``written_at``, ``unit
 ``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with as many
 digits as it takes to read the same bits again; NaN and infinity, which JSON lacks, are refused.
 
-How a file replaces another one, and how many earlier ones are kept, is in
-:mod:`smartcam._whole_files`.
+:mod:`smartcam._whole_files` replaces files and keeps earlier ones.
 """
 
 from __future__ import annotations
@@ -130,7 +129,7 @@ def read(path: StrPath, kind: str) -> dict[str, Any]:
 
 
 def read_document(path: StrPath) -> Document:
-    """Return all that a file holds.
+    """Return the contents of a file.
 
     Raises ``BROKEN_FILE``, ``NEWER_VERSION``; and OSError if the file cannot be read.
     """

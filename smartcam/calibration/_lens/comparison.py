@@ -1,4 +1,4 @@
-"""Compare two calibrations of one lens: how much they differ, and whether noise explains it."""
+"""Compare two calibrations of one lens, and test whether noise explains the difference."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class LensComparison:
 
     Attributes:
         distance: distance of the points from the camera, metres; None: infinity.
-        pixels: (h, w, 2), where the first lens sees a point.
+        pixels: (h, w, 2), pixels of the points in the first lens.
         difference: (h, w, 2), the pixel of the same point in the second lens minus that in the
             first, after ``motion``; NaN where a lens does not show the point.
         expected: (h, w, 2, 2), covariance of ``difference`` that the noise of both calibrations
@@ -151,10 +151,10 @@ def compare(
 ) -> LensComparison:
     """Compare where two calibrations of one lens project the same points.
 
-    A small motion of the camera is removed from the difference first: the one that fits best to the
-    target's points, where both calibrations have seen it. For lenses without views it is fitted to
-    points at the distance, in the largest circle around the image's centre. The noise of the two is
-    assumed to be independent; calibrations from the same images differ less.
+    A small motion of the camera is removed from the difference first: the motion that fits best to
+    the target's points in the area that both calibrations have seen. For lenses without views it is
+    fitted to points at the distance, in the largest circle around the image's centre. The noise of
+    the two is assumed to be independent; calibrations from the same images differ less.
 
     Args:
         a: calibration that is subtracted, or a bare lens, which is compared without a prediction.
@@ -165,7 +165,7 @@ def compare(
     Raises:
         CalibrationError: ``SHAPE``: neither calibrations nor lenses, or no such rows and columns;
             ``WRONG_SIZE``: images of two sizes; ``NOT_FINITE``: no such distance; ``OUT_OF_FIELD``:
-            the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion maps one
+            the lenses share too few places of the image; ``POOR_FIT``: no motion maps one
             lens to the other.
     """
     return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
@@ -234,8 +234,8 @@ def rig_difference(
 def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     """Return the points that the motion is fitted to, and whether they are only directions.
 
-    They are the target's points in those cells of the image in which both have seen it, or in all
-    cells if those are too few. For lenses without views they are in the largest circle around the
+    They are the target's points in the cells of the image in which both have seen it, or in all
+    cells if these are too few. For lenses without views they are in the largest circle around the
     image's centre: in corners without any view, lenses may project so differently that the camera
     would seem turned.
     """

@@ -252,8 +252,7 @@ def calibrate_intrinsics(
     view of a target that looks the same after half a turn may number its points from either end.
 
     If *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
-    does, nothing can show it: the lens is then that of the flipped pictures, and right only for
-    those.
+    does, no test can notice it: the lens is then right only for flipped pictures.
 
     Args:
         views: views of one target, 3 or more, of images of one size; tilted in several directions,
@@ -263,11 +262,11 @@ def calibrate_intrinsics(
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
         sheet: whether the target's points are adjusted, too, since printers stretch and paper
             bends. ``auto``: if that lowers the held-out error by more than chance. ``exact``:
-            never. ``free``: always. Adjusted points that few views show stay near where they were
-            meant to be. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an
-            exact sheet. Targets of more than 1000 points are taken as exact, untested.
-        drop_bad: whether views that fit far worse than the others are left out (and named), at
-            most a third of them; else they are only named.
+            never. ``free``: always. Adjusted points that few views show stay near their nominal
+            places. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an exact
+            sheet. Targets of more than 1000 points are taken as exact, untested.
+        drop_bad: whether views that fit far worse than the others are left out, at most a third of
+            them; a warning names them in any case.
 
     Raises:
         CalibrationError: ``TOO_FEW`` views or points; ``COLLINEAR`` points of a view;

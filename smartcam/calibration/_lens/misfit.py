@@ -1,9 +1,9 @@
 """Explain views that fit a lens worse than noise would: flipped pictures, a zoom, or others.
 
-The likeliest explanation is not proven. So it is given as a warning, which says what else was
-tried: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each view is
-eliminated first, from the residuals and from the changes that each cause would make, so only what
-no pose can compensate is compared.
+The likeliest explanation is not proven. So it is given as a warning, which names the other
+explanations: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each
+view is eliminated first, from the residuals and from the changes that each cause would make, so
+only the parts that no pose can compensate are compared.
 """
 
 from __future__ import annotations
@@ -211,8 +211,8 @@ def misfit_remarks(
     """Yield a remark if flipped pictures, or a zoom, explain the views better than all else.
 
     In a flipped picture a board is found as well if it looks the same in a mirror; its points are
-    then those of a camera with a mirrored lens. But a misfit that large may have other causes: each
-    is fitted as well, and the one that explains most counts.
+    then those of a camera with a mirrored lens. But such a large misfit may have other causes: each
+    cause is fitted, and the best one counts.
 
     ``more``: variance in addition to the points' own, pixels^2. ``free`` (4 + K,): mask of the
     lens' values that were fitted. ``names``: names of the views.

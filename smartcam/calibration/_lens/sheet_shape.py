@@ -38,7 +38,7 @@ MAX_FREE_POINTS: Final = 1000
 
 
 class Shape(NamedTuple):
-    """The fitted points of a sheet, and the evidence that they are not as they were meant."""
+    """The fitted points of a sheet, and the evidence that the sheet is not exact."""
 
     adjusted: AdjustedBundle
     left_out: list[LeftOut]  # left-out fit of each pose
@@ -47,9 +47,9 @@ class Shape(NamedTuple):
 
 
 def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet) -> Shape:
-    """Return the fit with the target's points either as meant or adjusted.
+    """Return the fit with the target's points either nominal or adjusted.
 
-    ``adjusted`` has the points as they were meant. With ``sheet`` ``auto``, points are adjusted if
+    ``adjusted`` has the nominal points. With ``sheet`` ``auto``, points are adjusted if
     that predicts left-out views better, by more than the chance between views.
 
     Raises ``SHAPE`` if there are more points than may be adjusted.

@@ -38,7 +38,7 @@ MAX_GOOD_RMS_PX: Final = 0.5
 
 
 def parameter_names(model: DistortionModel) -> tuple[str, ...]:
-    """Return the names of what :func:`~smartcam.calibration._lens.bundle.lens_values` gives.
+    """Return the names of the :func:`~smartcam.calibration._lens.bundle.lens_values`.
 
     Raises ``SHAPE`` if there is no such model.
     """

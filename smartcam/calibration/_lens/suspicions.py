@@ -244,7 +244,7 @@ def examined(
     )
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
-        found, of_fit = again(without(views, off)), []  # check_rms says it of these views
+        found, of_fit = again(without(views, off)), []  # remarked on by check_rms
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))

@@ -46,7 +46,7 @@ class ProjectionUncertainty:
         size: width and height of the images, pixels.
         distance: distance of the points from the camera, metres; None: infinity.
         pixels: (h, w, 2), places of the map.
-        covariance: (h, w, 2, 2), of the projection of a point that truly appears at that place,
+        covariance: (h, w, 2, 2), of the projection of a point whose true pixel is that place,
             pixels^2; NaN where no direction leads to the pixel.
         by_point: (h, w, 2, 3), derivative of the pixel by the point, in pixels per metre along the
             axes of the camera's frame; at infinity per radian.

@@ -121,7 +121,7 @@ def check_side(normal: Array, tool_z: Array) -> float:
 
 
 def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: bool) -> str | None:
-    """Return the remark on a scale that is not the nominal one; None if it is.
+    """Return the remark on a scale that is not the nominal one; None for the nominal one.
 
     Scales are in metres per unit of the camera; ``uncertainty`` is the standard deviation of
     ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
@@ -162,7 +162,7 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _fit(evidence: Evidence) -> Iterator[Remark]:
-    """Look for one point that is far worse than the others, then test all of them together."""
+    """Test for one point that is far worse than the others, then test all of them together."""
     fitted, weights = evidence.fitted, evidence.pairs.weights
     total = squares(fitted.residuals, weights)
     chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]

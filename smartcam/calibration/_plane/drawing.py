@@ -1,7 +1,7 @@
 """Draw a plane calibration as SVG: the touched points, their residuals, the predicted error.
 
-It shows the camera's plane as the camera sees it, x to the right and y up. Errors are far too small
-to be seen, so residuals and ellipses are drawn larger, by a factor that the picture names.
+It shows the camera's plane as the camera sees it, x to the right and y up. Errors are too small to
+see, so residuals and ellipses are enlarged by a factor that the picture names.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Find touches that belong to other marks than they were given for: exchanged or shifted ones.
+"""Find touches that were given for the wrong marks: exchanged or shifted ones.
 
 If the touches of two marks are exchanged, or all of them are shifted by one, least squares spread
 the mistake over all points. This module searches for the right order. It starts from the order as

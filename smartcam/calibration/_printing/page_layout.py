@@ -65,11 +65,11 @@ AREA_REACH_SQUARES: Final = AREA_DISTANCE_SQUARES + AREA_DIAMETER_SQUARES / 2
 """Distance that the areas outside of a checkerboard's outer corners reach, in sides of a square."""
 
 AREA_GAP_MM: Final = 1.0
-"""Distance between a white area outside of a checkerboard and the things beyond it, mm."""
+"""Distance between a white area outside of a checkerboard and the parts beyond it, mm."""
 
 
 class PageLayout:
-    """The places of all things on a page.
+    """The places of all parts on a page.
 
     Args:
         box: rectangle around the target's pattern.
@@ -124,7 +124,7 @@ class PageLayout:
     def _clear(self, end: float, edge: float) -> float:
         """Return the distance from the target of a part that reaches from the origin to ``end``.
 
-        The thing is placed between the areas at the corners, or beyond them if it does not fit.
+        The part is placed between the areas at the corners, or beyond them if it does not fit.
         """
         return self._quiet if end <= edge else max(self._quiet, self._areas + AREA_GAP_MM)
 

@@ -328,9 +328,9 @@ def calibrate_stereo(
             the same.
         sheet: ``auto``, ``exact`` or ``free``: whether the target's points are adjusted, too, as in
             :func:`~smartcam.calibration.calibrate_intrinsics`.
-        drop_bad: whether views that fit far worse than the others are left out (and named), at most
-            a third of them; else they are only named. In a pair whose views do not belong together
-            the right view is left out.
+        drop_bad: whether views that fit far worse than the others are left out, at most a third of
+            them; a warning names them in any case. In a pair whose views do not belong together the
+            right view is left out.
 
     Raises:
         CalibrationError: ``TOO_FEW``: fewer than 3 pairs, or than 2 if both lenses are known;

@@ -139,7 +139,7 @@ def examined(
     if off and drop:
         for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
             sides[one.side][one.pair] = view
-        found, of_fit = again(*sides), []  # check_fit says it of these views
+        found, of_fit = again(*sides), []  # remarked on by check_fit
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))

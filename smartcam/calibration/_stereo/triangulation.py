@@ -59,13 +59,13 @@ def triangulate(
             moved = np.linalg.norm(step, axis=1) > SETTLED_DEPTH_RATIO * np.abs(points[:, 2])
         if not moved.any():
             break
-    behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
-    points[behind] = np.nan
+    hidden = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
+    points[hidden] = np.nan
     points[~np.isfinite(points).all(axis=1)] = np.nan  # all weights are finite
     # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
     inverse = np.full_like(normal, np.nan)
-    inverse[~behind] = np.linalg.pinv(normal[~behind], hermitian=True)
+    inverse[~hidden] = np.linalg.pinv(normal[~hidden], hermitian=True)
     return Triangulated(points, inverse)
 
 

@@ -168,7 +168,7 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         most=MAX_FILE_BYTES,
     ),
 }
-"""Formats of poses over time; both are read alike, since the file's header decides."""
+"""Formats of poses over time; both are read in the same way, since the file's header decides."""
 
 _MATRIX: Format[PlaneMatrix] = Format(
     "matrix of a plane calibration",
@@ -304,7 +304,7 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         )
     transform, scale = plane_frame(calibration)
     for name in (transform.target, transform.source):
-        frame_name(name, "frame")  # in the comment, whatever the format can hold
+        frame_name(name, "frame")  # the comment must be able to hold it
     comment = (
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"

@@ -46,7 +46,7 @@ class Format(Generic[T]):
 
     title: str  # description for people
     suffix: str  # suffix of the files' names
-    # function that makes a value of a text and of further arguments: the size for cameras, else the
+    # function that parses a text to a value; further arguments: the size for cameras, else the
     # names of target and source if the format has none. It returns Measured if lengths may be in
     # any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`

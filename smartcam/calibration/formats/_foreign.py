@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class ForeignLens(NamedTuple):
-    """A lens as it is in a file."""
+    """A lens in a file's own terms."""
 
     name: str
     size: Sequence[Plain] | None  # width and height, pixels; None if the file does not say it

@@ -1,6 +1,6 @@
 """Read and write poses over time as CSV, with the columns of ASL's tools or of EuRoC's data sets.
 
-The header decides which: it names the columns, and with them the order of the quaternion and the
+The header decides: it names the columns, and with them the order of the quaternion and the
 unit of time. EuRoC has nanoseconds and the real part first, the others seconds and the real part
 last. A file without a header is refused: the rows of both are eight numbers.
 

@@ -1,9 +1,8 @@
 """Draw images of targets as a camera would take them, for tests with known truth.
 
 Each pixel is the mean, over its own square, of the image of a lens with a Gaussian blur. Edges are
-drawn by the part of each sample that they cover, so that nothing is rounded to a raster: a corner
-lies in the image where :meth:`~smartcam.calibration.CameraModel.project` puts it, to a few
-thousandths of a pixel.
+drawn by the part of each sample that they cover, without rounding to a raster: a corner is at its
+place by :meth:`~smartcam.calibration.CameraModel.project`, to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def render(
         black: grey level of the print.
         white: grey level of the paper.
         background: grey level around the paper.
-        random: source of the noise; None for one that is the same each time.
+        random: source of the noise; None for reproducible noise.
 
     Returns:
         (H, W).

@@ -31,7 +31,7 @@ class Mark:
     x: float  # x in the camera's unit; for a point of a sheet, metres on the sheet
     y: float  # y in the same unit
     theta: float  # angle, radians
-    number: int | None = None  # number of the point on its target; None for a mark of no target
+    number: int | None = None  # number of the point on its target; None for a mark without a target
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Mark:

@@ -1,7 +1,7 @@
 """Define the steps of a sequence: the texts to show, and the answers to ask for.
 
 A step is data. Its inputs have a JSON Schema, and check answers by the same rules, so a front-end
-needs to know nothing about any wizard.
+does not depend on any wizard.
 
 Source: thesis 2.2.1 and Figure 2.9 (published) for a step's parts and for the three lists of
 numbers, texts and options, which :func:`as_lists` and :func:`from_lists` derive.
@@ -152,7 +152,7 @@ class Text(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Input):
-    """Input for one of some options; without a default the first one is preselected.
+    """Input for one of several options; without a default the first one is preselected.
 
     Attributes:
         options: texts for people, by the answer that each stands for.

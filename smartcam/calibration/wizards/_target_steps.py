@@ -1,4 +1,4 @@
-"""Ask which target is on a sheet, and how long its printed rulers are."""
+"""Ask for the target on a sheet, and for the lengths of its printed rulers."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Offer a camera's calibrations as the thesis' five services: one wizard, without tokens.
 
-The steps are those of the page and of the terminal, after a first step that asks for things without
+The steps are those of the page and of the terminal, after a first step that asks for facts without
 a field in the request: the name, the camera's place, the source of pictures. A request does not
 name its step, so only one call is answered at a time, and a sequence belongs to the client that
 started it until it ends, is aborted or is abandoned.
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 SMARTCAMERA: Final = "SMARTCAMERA"
-"""Text that stands in place of a topic for the smart camera itself."""
+"""Text, instead of a topic, for the smart camera itself."""
 
 ABANDONED_AFTER: Final = 1800.0
 """Seconds without a call after which a running calibration is given up; its journal stays."""

@@ -68,7 +68,7 @@ SIDES: Mapping[str, Vector | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-"""Directions of a tool's axis in the robot's base, by the words that people choose."""
+"""Directions of a tool's axis in the robot's base, by their names for people."""
 
 SIDE = Option(
     name="side",
@@ -98,7 +98,7 @@ class Touches:
             ``unit`` and ``side``.
         marks: marks of the last picture.
         camera_unit: unit of the camera's positions.
-        side: one of :data:`SIDES`, where the tool points, of robots whose pose is typed.
+        side: one of :data:`SIDES`, the direction of the tool, for robots whose pose is typed.
     """
 
     about: StepAnswer

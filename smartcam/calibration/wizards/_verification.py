@@ -1,6 +1,6 @@
 """Check whether a calibration still holds: touch some marks again, and compare.
 
-A camera that was knocked sees everything shifted, which a few touches show. Their offsets are
+A knocked camera sees all points shifted, which a few touches show. Their offsets are
 compared with the noise of the touches, both of the new ones and of those in the calibration.
 """
 
@@ -71,8 +71,8 @@ def drift_wizard(
     Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm,
     z, chance, needed, needed_at`` (at the best mark, see :func:`touches_needed`)``, file``.
 
-    Each finished check is a line of a file, whose first line names its format: so a drift can be
-    seen that is too slow for any single check. The calibration's own file is not changed. The file
+    Each finished check is a line of a file, whose first line names its format: so the file shows a
+    drift that is too slow for a single check. The calibration's own file is not changed. The file
     takes as many checks as a journal takes entries.
 
     Args:
