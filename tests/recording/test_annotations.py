@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 from smartcam.frames import Frame
 from smartcam.inspection import Drawing
 from smartcam.recording import Recorder, load_recording
-from smartcam.recording._pictures.annotations import annotations_message, drawings_of
 from tests.recording.picturekit import shot
 
 MARKS = (
@@ -150,15 +149,22 @@ def test_marks_that_nobody_could_draw_are_left_out(tmp_path: Path) -> None:
 
 
 @given(st.data())
-def test_damaged_marks_are_an_error_or_others(data: st.DataObject) -> None:
-    whole = bytearray(annotations_message(shot(1, drawings=MARKS)))
+def test_damaged_marks_end_a_recording_or_are_others(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.mcap"
+    whole = bytearray(recorded(path, shot(1, drawings=MARKS)).read_bytes())
+    begin, end = whole.index(b"region"), whole.index(b"hint")
     for _ in range(data.draw(st.integers(1, 4))):
-        place = data.draw(st.integers(0, len(whole) - 1))
-        whole[place] = data.draw(st.integers(0, 255))
-    cut = data.draw(st.integers(0, len(whole)))
-    with contextlib.suppress(ValueError):
-        for one in drawings_of(memoryview(whole)[:cut]):
-            assert isinstance(one, Drawing)
+        whole[data.draw(st.integers(begin - 120, end + 40))] = data.draw(st.integers(0, 255))
+    place = 8
+    while whole[place] != 6:  # records before the chunk
+        place += 9 + struct.unpack_from("<Q", whole, place + 1)[0]
+    whole[place + 33 : place + 37] = bytes(4)  # the chunk's checksum: there is none
+    path.write_bytes(whole)
+    recording = load_recording(path)
+    assert recording.remark or recording.counts.pictures == 1
+    assert all(isinstance(one, Drawing) for frame in recording.pictures() for one in frame.drawings)
 
 
 def test_picture_whose_marks_were_taken_out_of_the_file_has_none(tmp_path: Path) -> None:
