@@ -33,9 +33,10 @@ LINGER: Final = 3.0
     "choose tools, see what they find, set tolerances, save. CELL is a cell file, or a fleet file "
     "with software cameras; APPLICATION is its number or name, a new number is added. The page "
     "tries the tools at once on all PICTURES (files, or folders of them; without any, the camera's "
-    "own), and sets tolerances from those that show good parts. Save writes the file; its comments stay. The "
-    "page's address goes to stdout. With --set, --learn or --save there is no page: the tools are "
-    'changed, tried on the PICTURES, and printed. The page needs the extra "web".'
+    "own), and sets tolerances from those that show good parts. Save writes the file; its comments "
+    "stay. The page's address goes to stdout. With --set, --learn or --save there is no page: the "
+    "tools are changed, tried on the PICTURES, and printed. The page needs the extra "
+    '"web".'
 )
 @click.argument("cell")
 @click.argument("camera")
