@@ -14,6 +14,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import shown_time
 from smartcam.exceptions import SmartCamError
 from smartcam.protocols import messages as m
 
@@ -97,7 +98,7 @@ class _Watch:
         else:
             end = self._asked_at + self._timeout
             if now >= end:
-                silence = f"no sign of life for {now - heard_at:.1f} s"
+                silence = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
                 self._link.give_up(TimeoutError(silence))
                 return
             # the camera may answer meanwhile, so look again when the next question is due
