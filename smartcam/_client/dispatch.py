@@ -206,8 +206,9 @@ class Dispatch:
         """
         if self._waits.fail(error):
             self._remarks.end()
-            self._listeners.fail(told(error))
-            self._results.fail(told(error))
+            if self._listeners.may_await:
+                self._listeners.fail(told(error))
+            self._results.fail(error)
 
     def finish(self, error: SmartCamError) -> None:
         """End the streams for good because of ``error``, quietly if we closed."""

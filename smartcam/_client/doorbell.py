@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar, cast
 
 from smartcam._user_code import ENDS_PROGRAM
 
@@ -227,6 +227,34 @@ class DirectFuture(Generic[T]):
         if error is not None:
             raise error
         return cast("T", self._value)
+
+
+Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"
+
+
+def wake(waiter: Waiter) -> None:
+    """Have the task go on that waits, unless it does already."""
+    if not waiter.done():
+        waiter.set_result(None)
+
+
+async def outlast(task: asyncio.Task[Any]) -> None:
+    """Wait until a task has ended, however it does; as ``asyncio.wait`` for one, in fewer steps.
+
+    Cancellation: the task is left alone.
+    """
+    if task.done():
+        return
+    waiter: asyncio.Future[None] = task.get_loop().create_future()
+
+    def on_end(_: asyncio.Task[Any]) -> None:
+        wake(waiter)
+
+    task.add_done_callback(on_end)
+    try:
+        await waiter
+    finally:
+        task.remove_done_callback(on_end)
 
 
 def _raise(error: BaseException) -> NoReturn:
