@@ -217,12 +217,13 @@ class Receiver:
             return
         program = self._caller.program
         key = program.keys.results(self._camera)
-        self._since = since
+        self._since, self._caller.streamed = since, True
         self._handles["results"] = program.bus.subscribe(key, self._hear_results)
         self._begin("find", self._find())
 
     def _leave_results(self) -> None:
         self._handles.pop("results").close()
+        self._caller.streamed = False
         self._results.stop()
         self._wake(everyone=True)
 
