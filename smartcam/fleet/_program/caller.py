@@ -146,6 +146,7 @@ class Caller:
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
         self.streamed: bool = False
+        self._commands_to = "", ""  # the agent called last, and the key of commands to it
         self._epochs: dict[str, int] = {}  # epochs of agents that have answered
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
@@ -654,7 +655,9 @@ class Caller:
     def _key(self, agent: str, do: str) -> str:
         program, camera = self.program, self.camera
         if do in COMMANDS:
-            return program.keys.command(agent, camera)
+            if self._commands_to[0] != agent:
+                self._commands_to = agent, program.keys.command(agent, camera)
+            return self._commands_to[1]
         return program.keys.ask(program.role, agent, camera)
 
     def _silence(self, do: str, waited: float) -> SmartCamError:

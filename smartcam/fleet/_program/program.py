@@ -95,7 +95,7 @@ class Program:
         self._guest = guest
         self._fleet, self._camera = fleet, camera
         self._called = called
-        self._name = ProgramName.new(ANYONE, called)
+        self._set_name(ProgramName.new(ANYONE, called))
         self._calls = 0
         self._pending: dict[int, Pending] = {}
         self._expiry = DeadlineTimer(self._expire)
@@ -118,12 +118,15 @@ class Program:
         self.keys = Keys(self._fleet or await self._find(deadline, timeout))
         if self.bus.identity is not None:
             called = self._called or self.bus.identity.name or None
-            self._name = ProgramName.new(self.bus.identity.role, called)
+            self._set_name(ProgramName.new(self.bus.identity.role, called))
         self._declared = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
             self.bus.be_present(self.keys.program(self.token)),
         ]
         return self
+
+    def _set_name(self, name: ProgramName) -> None:
+        self._name, self._token = name, name.token
 
     @property
     def name(self) -> str:
@@ -133,7 +136,7 @@ class Program:
     @property
     def token(self) -> str:
         """Its name and its secret, as it says them to agents."""
-        return self._name.token
+        return self._token
 
     @property
     def role(self) -> str:
