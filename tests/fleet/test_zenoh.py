@@ -27,6 +27,7 @@ from smartcam.fleet._inside import ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, until
+from tests.fleet.inside import zenoh
 from tests.fleet.partner import partner
 from tests.handmade import refusing
 from tests.processes import free_place, printed_by
@@ -535,6 +536,25 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
                 await asyncio.sleep(0.05)
         await until(lambda: not waiting())  # of another last one
         assert heard.payloads.count(bytes(size)) < count
+
+
+@pytest.mark.parametrize("idle", [0.0, 60.0])
+async def test_keys_that_are_used_again_have_publishers_within_a_bound(
+    idle: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh, "MAX_FREQUENT_KEYS", 2)
+    monkeypatch.setattr(zenoh, "IDLE_KEY_TIME", idle)
+    async with two_ends() as (hears, says):
+        heard = await heard_by(says, hears)
+        before, sent = len(says._declared), list[bytes]()
+        for number in range(40):
+            sent.append(b"%d" % number)
+            says.put(f"test/{number // 4 % 5}", sent[-1])
+            await asyncio.sleep(0.011)  # each by itself
+        await heard.come_all(sent)
+        assert set(says._frequent) == ({"test/3", "test/4"} if idle == 0 else {"test/0", "test/1"})
+        assert len(says._declared) == before + 2
+        assert all(one.used(0.0) is not None for one in says._frequent.values())
 
 
 async def test_end_that_is_closed_says_and_hears_nothing_and_can_be_closed_again() -> None:
