@@ -161,6 +161,8 @@ def check_seconds_or_none(
 
 def check_moment(value: object, what: str, who: str = "") -> float:
     """Return a moment of a clock: any finite number of seconds."""
+    if type(value) is float and math.isfinite(value):
+        return value
     number = _as_float(value)
     if number is None or not math.isfinite(number):
         raise wrong_argument(what, "a finite number of seconds", value, who)

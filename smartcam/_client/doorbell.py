@@ -96,6 +96,22 @@ class Doorbell:
         """Return an outcome that one task may wait for."""
         return DirectFuture(self)
 
+    def give(self, outcome: Outcome, value: object) -> None:
+        """Give an outcome its result: its task goes on at once, unless another task runs.
+
+        What ends the program is raised by the loop, as :meth:`deliver` does.
+        """
+        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
+            outcome.set_result(value)
+            return
+        due, self.due = self.due, []
+        outcome.set_result(value)
+        self.due = due
+        try:
+            outcome.wake()
+        except ENDS_PROGRAM as exc:
+            self._loop.call_soon(_raise, exc)
+
     # ------------------------------------------------------------------ for the task's machinery
 
     def __await__(self) -> Generator[Doorbell, None, None]:
@@ -293,12 +309,20 @@ class PlainDoorbell:
         """Return an outcome that one task may wait for."""
         return self._loop.create_future()
 
+    def give(self, outcome: Outcome, value: object) -> None:
+        """Give an outcome its result: its task goes on by way of the loop."""
+        outcome.set_result(value)
+
     def __await__(self) -> Generator[Any, None, None]:
         self._ringing = self._loop.create_future()
         try:
             yield from self._ringing
         finally:
             self._ringing = None
+
+
+Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
+"""What :meth:`Doorbell.outcome` or :meth:`PlainDoorbell.outcome` returns."""
 
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:
