@@ -222,6 +222,24 @@ def test_scale_is_found() -> None:
     assert 0 < found.sigmas[3] < 1e-3
 
 
+@pytest.mark.parametrize(
+    "scale", [1.02, *(pytest.param(one, marks=pytest.mark.long) for one in (0.98, 0.999))]
+)
+def test_part_of_another_size_is_right_by_its_own_sigma(scale: float) -> None:
+    part = PlacedPart(PARTS["bolt"], 100.0, 104.4, -0.7, scale)
+    found = one_of(drawn(part), "bolt")
+    assert_right(found, "bolt", part)
+    assert found.chi_square < 2
+
+
+def test_part_of_a_size_that_was_not_asked_for_is_told() -> None:
+    part = PlacedPart(PARTS["bolt"], 100.0, 104.4, -0.7, 1.045)
+    found = locate(Picture(drawn(part)), [model_of("bolt")], PartSearch())
+    assert not found.parts
+    assert found.nearest is not None
+    assert found.nearest.refusal == "its size is 1.045 of the taught one, expected 1"
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "look",

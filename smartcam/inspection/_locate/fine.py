@@ -61,6 +61,13 @@ MIN_SEEN: Final = 6
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
 """Standard deviation of an angle of which nothing is known, in radians."""
 
+SIZE_SIGMA: Final = 0.02
+"""Standard deviation, in parts of its size, of a part that is looked for in one size only: another
+height or another camera makes it larger or smaller, and a pose of the wrong size is off."""
+
+FIRST_SIZED_STEP: Final = 2
+"""Number of the first step that fits the size, too."""
+
 MAX_INVERSE: Final = 1e8
 """Largest element of the inverse of the scaled equations; above it the edges leave a pose open."""
 
@@ -71,9 +78,20 @@ class FineSettings(NamedTuple):
     contrast: Array  # (N,), grey levels from the darker to the brighter side at least
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
-    scaled: bool = False  # whether the scale is fitted
+    scaled: bool = False  # whether the scale is anything; else it is near that of the start
     least_score: float = 0.0  # of a pose whose ground matters
     turned: bool = True  # whether the angle is fitted; that of a round part is not
+
+
+class SizePrior(NamedTuple):
+    """What is known of a part's size before it is seen."""
+
+    scale: float  # that is expected
+    sigma: float  # standard deviation of the scale, in parts of it; infinite: nothing is known
+
+    def off(self, pose: PixelPose) -> float:
+        """Return how much larger a pose is than what is expected, in parts of the scale."""
+        return pose.scale / self.scale - 1
 
 
 class FinePose(NamedTuple):
@@ -98,6 +116,7 @@ def fit_pose(
     ``levels`` (H, W) is the picture.
     """
     pose, free = start, np.array([True, True, use.turned, use.scaled])
+    size = SizePrior(start.scale, math.inf if use.scaled else SIZE_SIGMA)
     widened, pixels = 0.0, pixels_in(bands, _matrix(start), levels)
     for number in range(MAX_STEPS):
         if 0 < number < 4:
@@ -105,7 +124,8 @@ def fit_pose(
         first = FIRST_BLURS_PX[number] if number < len(FIRST_BLURS_PX) else None
         fit, blurs = _steps(pixels, segments, pose, widened, first)
         rows, weights, _, _ = _equations((fit, blurs), segments, pose, use, number)
-        solved = _solve(rows, fit.shifts, weights, free)
+        free[3] = use.scaled or number >= FIRST_SIZED_STEP
+        solved = _solve(rows, fit.shifts, weights, free, (size.off(pose), size.sigma))
         if solved is None:
             return None
         move, _ = solved
@@ -114,7 +134,7 @@ def fit_pose(
             widened = _widened(widened, fit.widening, float(np.median(blurs)))
         if number >= 4 and float(np.abs(rows @ move).max()) < STILL_PX:
             break
-    return _result(pixels, segments, pose, widened, use, free)
+    return _result(pixels, segments, pose, widened, use, size)
 
 
 def _moved(pose: PixelPose, move: Array) -> PixelPose:
@@ -227,29 +247,45 @@ def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blu
 
 
 def _solve(
-    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+    rows: Array,
+    shifts: Array,
+    weights: Array,
+    free: NDArray[np.bool_],
+    size: tuple[float, float],
 ) -> tuple[Array, Array] | None:
-    """Return the robust solution (4,) and its covariance (4, 4); None: too little is seen."""
+    """Return the robust solution (4,) and its covariance (4, 4); None: too little is seen.
+
+    ``size``: how much larger the pose is than expected, and the standard deviation of that.
+    """
     used = weights > 0
     if np.count_nonzero(used) < MIN_SEEN:
         return None
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
     for _ in range(4):
-        solved = _least_squares(a, y, w * robust, free)
+        solved = _least_squares(a, y, w * robust, free, size)
         if solved is None:
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
         robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
-    return _least_squares(a, y, w * robust, free)
+    return _least_squares(a, y, w * robust, free, size)
 
 
 def _least_squares(
-    rows: Array, values: Array, weights: Array, free: NDArray[np.bool_]
+    rows: Array,
+    values: Array,
+    weights: Array,
+    free: NDArray[np.bool_],
+    size: tuple[float, float],
 ) -> tuple[Array, Array] | None:
-    a = rows[:, free] * np.sqrt(weights)[:, None]
-    square = a.T @ a
+    root = np.sqrt(weights)
+    a, right = rows * root[:, None], values * root
+    square, right = a.T @ a, a.T @ right
+    off, sigma = size
+    square[3, 3] += 1 / sigma**2
+    right[3] -= off / sigma**2
+    square, right = square[np.ix_(free, free)], right[free]
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
     try:
@@ -260,7 +296,7 @@ def _least_squares(
         return None
     inverse = inverse / np.outer(scale, scale)
     found, covariance = np.zeros(4), np.zeros((4, 4))
-    found[free] = inverse @ (a.T @ (values * np.sqrt(weights)))
+    found[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
     return found, covariance
 
@@ -271,9 +307,10 @@ def _result(
     pose: PixelPose,
     widened: float,
     use: FineSettings,
-    free: NDArray[np.bool_],
+    size: SizePrior,
 ) -> FinePose | None:
     """Return the pose with what the steps at it say."""
+    free = np.array([True, True, use.turned, True])
     fit, blurs = steps = _steps(pixels, segments, pose, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, pose, use, MAX_STEPS)
     # as much of each edge counts as it is where it should be, and a step
@@ -290,18 +327,22 @@ def _result(
             fit, _ = _steps(pixels, segments, pose, widened, None, ground, noise)
             again = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
             rows, weights, noise = again[0], np.where(seen, again[1], 0.0), again[2]
-            solved = _solve(rows, fit.shifts, weights, free)
+            solved = _solve(rows, fit.shifts, weights, free, (size.off(pose), size.sigma))
             if solved is None:
                 return None
             pose = _moved(pose, solved[0])
-    settled = _settled(rows, fit.shifts, np.where(seen, weights, 0.0), free)
+    settled = _settled(
+        (rows, fit.shifts, np.where(seen, weights, 0.0)), free, size.off(pose), size.sigma
+    )
     if settled is None:
         return None
     move, covariance, kept, chi_square = settled
-    if ground is not None:
+    if ground is not None or _is_misfit(chi_square, kept):
         left = (fit.shifts - rows @ move) * np.sqrt(weights)
         covariance = covariance * common_error(segments, left, kept)
     pose = _moved(pose, move)
+    if not use.scaled and covariance[3, 3] == 0:
+        pose = pose._replace(scale=size.scale)
     covariance[3] *= pose.scale
     covariance[:, 3] *= pose.scale
     if not use.turned:
@@ -320,30 +361,64 @@ def _result(
 
 
 def _settled(
-    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+    equations: tuple[Array, Array, Array], free: NDArray[np.bool_], off: float, sigma: float
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
     """Return the last move of a pose (4,), its covariance, and the segments that it follows from.
 
-    Besides, the squares of their shifts in parts of what they may have; None: too few agree.
+    ``equations`` are rows, shifts and weights; ``off`` is how much larger the pose is than
+    expected, by a standard deviation. Besides, the squares of the shifts in parts of what they may
+    have; None: too few agree.
     """
-    off = np.abs(shifts) * np.sqrt(weights)
+    rows, shifts, weights = equations
+    away = np.abs(shifts) * np.sqrt(weights)
     kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
     if kept.any():  # where the whole part is not quite the taught one, as in too much light
-        spread = max(1.4826 * float(np.median(off[kept])), 1.0)
+        spread = max(1.4826 * float(np.median(away[kept])), 1.0)
     for _ in range(3):
-        kept = (weights > 0) & (off <= CUT * spread)
+        kept = (weights > 0) & (away <= CUT * spread)
         if np.count_nonzero(kept) < MIN_SEEN:
             return None
         freedom = max(int(kept.sum()) - int(free.sum()), 1)
-        chi_square = float((off[kept] ** 2).sum()) / freedom
+        chi_square = float((away[kept] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
-    solved = _least_squares(rows[kept], shifts[kept], weights[kept], free)
+    misfit = _is_misfit(chi_square, kept)
+    solved = _sized((rows[kept], shifts[kept], weights[kept]), free, off, sigma, chi_square)
     if solved is None:
         return None
     move, covariance = solved
-    if chi_square > 1 + 4 * math.sqrt(2 / freedom):  # the part is not quite the taught one
-        covariance = covariance * chi_square
-    return move, covariance, kept, chi_square
+    return move, covariance * (chi_square if misfit else 1.0), kept, chi_square
+
+
+def _is_misfit(chi_square: float, kept: NDArray[np.bool_]) -> bool:
+    """Return True if segments lie beside a pose by more than chance, as of another part."""
+    return chi_square > 1 + 4 * math.sqrt(2 / max(int(kept.sum()) - 4, 1))
+
+
+def _sized(
+    told: tuple[Array, Array, Array],
+    free: NDArray[np.bool_],
+    off: float,
+    sigma: float,
+    chi_square: float,
+) -> tuple[Array, Array] | None:
+    """Return the solution of rows, shifts and weights, with the size that is expected if it may be.
+
+    What the edges say of the size beyond their own error says how far off the expected one may be.
+    """
+    rows, shifts, weights = told
+    solved = _least_squares(rows, shifts, weights, free, (off, sigma))
+    if solved is None or math.isinf(sigma):
+        return solved
+    move, covariance = solved
+    by_edges = 1 / max(1 / float(covariance[3, 3]) - 1 / sigma**2, 1e-12)
+    beyond = (off + float(move[3])) ** 2 - max(chi_square, 1.0) * by_edges
+    if beyond > 0:
+        return _least_squares(rows, shifts, weights, free, (off, min(math.sqrt(beyond), sigma)))
+    expected = np.where([True, True, True, False], free, False)
+    solved = _least_squares(rows, shifts + off * rows[:, 3], weights, expected, (0.0, math.inf))
+    if solved is not None:
+        solved[0][3] = -off
+    return solved
 
 
 def _of_weights(weights: Array) -> Array:
