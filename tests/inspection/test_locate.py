@@ -215,9 +215,12 @@ def test_pose_is_right_by_its_own_sigma(name: str, angle: float) -> None:
 
 
 @pytest.mark.long
-def test_scale_is_found() -> None:
-    part = PlacedPart(PARTS["tee"], 100.0, 104.4, -0.7, 1.17)
-    found = one_of(drawn(part, side=220), "tee", scales=(0.8, 1.25))
+@pytest.mark.parametrize(
+    ("scale", "scales"), [(1.17, (0.8, 1.25)), (0.5, (0.45, 0.55)), (1.9, (1.8, 2.2))]
+)
+def test_scale_is_found(scale: float, scales: tuple[float, float]) -> None:
+    part = PlacedPart(PARTS["tee"], 120.0, 124.4, -0.7, scale)
+    found = one_of(drawn(part, side=260), "tee", scales=scales)
     assert_right(found, "tee", part)
     assert 0 < found.sigmas[3] < 1e-3
 

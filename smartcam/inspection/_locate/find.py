@@ -231,7 +231,7 @@ class _SearchedPicture:
             search.least_score,
             model.symmetry.fold != 0,
         )
-        return fit_pose(self._levels, model.segments, model.bands, start, use)
+        return fit_pose(self._levels, model.segments, model.bands_at(start.scale), start, use)
 
     def _fitted(
         self,
