@@ -255,9 +255,8 @@ def compare(count: int, seed: int) -> list[str]:
     }
     if hasattr(cv2, "linemod"):
         ways["OpenCV linemod, then findTransformECC"] = linemod
-    for name, way in (("geofit", geofit), ("corrmatch", corrmatch)):
-        if importlib.util.find_spec(name) is not None:
-            ways[name] = way
+    packages: dict[str, Way] = {"geofit": geofit, "corrmatch": corrmatch}
+    ways |= {name: way for name, way in packages.items() if importlib.util.find_spec(name)}
     drawn = list(scenes(count, seed))
     return [_row(name, way, drawn) for name, way in ways.items()]
 
