@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from smartcam.protocols._framed.machine import Machine
+from tests.protocols.inside import Machine
 
 
 class JudgingMachine(Machine):

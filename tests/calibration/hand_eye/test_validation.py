@@ -17,7 +17,6 @@ from smartcam.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration._hand_eye.equations import PoseObservations, RobotPoses
 from smartcam.calibration._hand_eye.model_selection import Problem
 from smartcam.calibration._hand_eye.validation import (
     agreement,
@@ -26,7 +25,7 @@ from smartcam.calibration._hand_eye.validation import (
     most_error,
 )
 from smartcam.geometry._inside import Rigid
-from tests.calibration.inside import Setup
+from tests.calibration.inside import PoseObservations, RobotPoses, Setup
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]

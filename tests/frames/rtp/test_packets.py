@@ -9,19 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._streaming.rtp.packets import (
+from tests.frames.inside import (
     Goodbye,
     PacketsMissing,
     PictureLost,
     ReceiverReport,
     Report,
     ReportBlock,
+    RtpPacket,
     SenderReport,
     SourceDescription,
     compound,
+    is_rtcp,
     parse_rtcp,
 )
-from tests.frames.inside import RtpPacket, is_rtcp
 
 PLAIN = bytes.fromhex("80 e0 fffe 00015f90 deadbeef 0102")
 PACKET = RtpPacket(True, 96, 0xFFFE, 90000, 0xDEADBEEF, b"\1\2")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.frames._streaming.rtsp.messages import (
+from tests.frames.inside import (
     MAX_BODY_BYTES,
     MAX_HEADERS,
     MAX_LINE_BYTES,
