@@ -2,4 +2,5 @@
 
 from __future__ import annotations
 
+from smartcam.conformance.camera._report import CameraReport
 from smartcam.conformance.client._tasks import Client, read_results

@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from smartcam.emulator import Cue, DeviceState, EmulatedCamera, ManualClock
+from smartcam.emulator import Cue, EmulatedCamera, ManualClock
 from smartcam.emulator._inside import RealClock
+from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator.faults import Fault
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status

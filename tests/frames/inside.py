@@ -46,6 +46,7 @@ from smartcam.frames._streaming.rtp.packets import (
 from smartcam.frames._streaming.rtp.parameters import description as parameters_description
 from smartcam.frames._streaming.rtp.parameters import picture_size
 from smartcam.frames._streaming.rtp.parameters import size_in as parameters_size_in
+from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY, RtpStatistics
 from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970, ntp_time
 from smartcam.frames._streaming.rtsp import delivery
 from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of

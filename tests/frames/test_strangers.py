@@ -12,10 +12,10 @@ import pytest
 from smartcam import frames
 from smartcam.frames import RtpSender
 from smartcam.frames._gige.stream import StreamSocket
-from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY
 from tests.frames.gige.camera import camera as gige_camera
 from tests.frames.inside import (
     MAX_ANSWERS_OF_ONE_ADDRESS,
+    NEW_HOST_DELAY,
     Network,
     RtpPacket,
     _Asking,

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from smartcam.frames import Frame, FrameReader, FrameSource, RtpStatistics
+    from smartcam.frames import Frame, FrameReader, FrameSource
+    from tests.frames.inside import RtpStatistics
 
 pytestmark = pytest.mark.real_time
 
