@@ -23,6 +23,7 @@ from smartcam.frames._gige.gvcp import DeviceInfo
 from smartcam.frames._gige.messages import MAX_CHUNKS, MessageFeatures, cut_chunks
 from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
+from smartcam.frames._streaming.rtp import packets
 from smartcam.frames._streaming.rtp.assembling import MAX_ACCESS_UNIT_BYTES, AccessUnit
 from smartcam.frames._streaming.rtp.depacketizer import MAX_PACKETS_AHEAD, Depacketizer
 from smartcam.frames._streaming.rtp.driver import RtpDriver
@@ -34,8 +35,6 @@ from smartcam.frames._streaming.rtp.packets import (
     PacketsMissing,
     PictureLost,
     ReceiverReport,
-    Report,
-    ReportBlock,
     RtpPacket,
     SenderReport,
     SourceDescription,
@@ -48,7 +47,7 @@ from smartcam.frames._streaming.rtp.parameters import picture_size
 from smartcam.frames._streaming.rtp.parameters import size_in as parameters_size_in
 from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY, RtpStatistics
 from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970, ntp_time
-from smartcam.frames._streaming.rtsp import delivery
+from smartcam.frames._streaming.rtsp import delivery, messages
 from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
 from smartcam.frames._streaming.rtsp.authentication import (
     MAX_WRONG_ANSWERS,
@@ -57,18 +56,7 @@ from smartcam.frames._streaming.rtsp.authentication import (
     _parts,
 )
 from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, _ControlPort, port_pair
-from smartcam.frames._streaming.rtsp.messages import (
-    MAX_BODY_BYTES,
-    MAX_HEADERS,
-    MAX_LINE_BYTES,
-    ROOM,
-    ChannelData,
-    RequestParser,
-    RtspError,
-    RtspRequest,
-    answer,
-    cseq_of,
-)
+from smartcam.frames._streaming.rtsp.messages import ROOM, RequestParser, RtspError, RtspRequest
 from smartcam.frames._streaming.rtsp_client import answers
 from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
 from smartcam.frames._streaming.rtsp_client.description import described, url_of

@@ -431,11 +431,6 @@ class LastPicture:
         return self.file
 
 
-def images_of(node: Node) -> list[str]:
-    ends = [one.name for one in node.graph if one.kind == "MP"]
-    return [name for name in ends if name.endswith("/image_raw")]
-
-
 async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: Path) -> None:
     camera: Any = LastPicture()
     async with two_nodes() as (here, there):

@@ -49,7 +49,6 @@ PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
 FLEET_PAGE = (ROOT / "docs" / "fleet-page.md").read_text(encoding="utf-8")
 LIVE_PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
 FRAMES_PAGE = (ROOT / "docs" / "frames.md").read_text(encoding="utf-8")
-WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
 CURL = [
     line
     for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
