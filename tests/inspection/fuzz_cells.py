@@ -19,14 +19,16 @@ import numpy as np
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection import Picture, Program, Teaching, load_cell
-from smartcam.inspection._camera import frame_inspector
-from smartcam.inspection._camera.frame_inspector import failed_values
-from smartcam.inspection._program import MAX_REASON_BYTES
-from smartcam.inspection._read import gs1
-from smartcam.inspection._read.gs1 import GS
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
-from tests.inspection.inside import elements
+from tests.inspection.inside import (
+    GS,
+    MAX_REASON_BYTES,
+    elements,
+    failed_values,
+    frame_inspector,
+    gs1,
+)
 
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection
