@@ -191,7 +191,7 @@ LIMITS = (
     "_suggestions.MAX_WORD_CHARACTERS",
     "_suggestions.MAX_KNOWN_WORDS",
     "depth._tables.MAX_LINE_BYTES",
-    "depth._tables.WORDS",
+    "depth._tables.NUMBERS_AT_A_TIME",
     "depth._pcd.MAX_UNPACKED_BYTES",
     "frames._gige.assembler.MAX_GAPS_PER_BLOCK",
     "frames._gige.description.MAX_PLAIN_BYTES",

@@ -1,4 +1,4 @@
-"""From what a camera sees to where a robot goes.
+"""Calibrate cameras, and map what they see to poses for a robot.
 
 ::
 

@@ -2,7 +2,7 @@
 
 An error that all residuals of a view share (a sheet that bends anew, a rolling shutter, a lens that
 does not quite follow its model) is no noise of its hundreds of points: it is one error per view. So
-the number of views counts, and how far each of them pulls the estimate.
+the number of views counts, and the pull of each view on the estimate.
 """
 
 from __future__ import annotations

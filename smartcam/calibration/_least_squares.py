@@ -69,7 +69,7 @@ class Normal(NamedTuple):
         )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-        """Eliminate the poses; return the shared equations, and what the poses follow from.
+        """Eliminate the poses; return the shared equations, and the factors that give the poses.
 
         The result is a matrix (S, S) and a right side (S,), then (P, K, S) and (P, K): the change
         of a pose is the last minus the third times the shared change. ``damping``: part of the
@@ -80,7 +80,7 @@ class Normal(NamedTuple):
         #     B_p x + C_p y_p       = b_p    (pose p)
         # the second gives y_p = C_p^-1 b_p - C_p^-1 B_p x, and with that the first
         #     (A - sum_p B_p^T C_p^-1 B_p) x = a - sum_p B_p^T C_p^-1 b_p.
-        # Damping is Marquardt's: A + damping diag(A), which the units of unknowns do not matter to.
+        # Damping is Marquardt's: A + damping diag(A), which does not depend on the unknowns' units.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963); Triggs et al., section 6.1.
         grown = self.own + damping * self.own * np.eye(self.own.shape[-1])
@@ -105,7 +105,7 @@ class Normal(NamedTuple):
             return np.full_like(self.shared, np.nan), np.full_like(self.own, np.nan)
         # With residuals of variance 1 the covariance is the inverse of J^T J. Its upper left block
         # is that of Schur's complement, S^-1; those of the poses are C_p^-1 + D_p S^-1 D_p^T, with
-        # D_p = C_p^-1 B_p: their own, and what the shared unknowns' errors do to them.
+        # D_p = C_p^-1 B_p: their own part, and that of the shared unknowns' errors.
         # Source: Hartley and Zisserman, section 5.2 and appendix 6.
         matrix, _, by_shared, _ = self.reduced()
         shared = inverse_scaled(matrix)

@@ -1,4 +1,4 @@
-"""Hold the linear algebra to one thread while something is calibrated.
+"""Limit linear algebra to one thread during a calibration.
 
 The matrices have up to some hundred rows. OpenBLAS divides the work on such a matrix among threads
 that wait for each other without sleeping. That takes several times the CPU time, and a hundred
@@ -30,7 +30,7 @@ class OneBlasThread(ContextDecorator):
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Start anew in a fork, which may go on with one thread."""
+        """Reset the state in a fork, which may go on with one thread."""
         self._lock = threading.Lock()
         self._inside: Counter[int] = Counter()  # depth of nested uses, by thread
         self._before: Any = None

@@ -1,6 +1,6 @@
 """Solvers: the parts of a transformation from the camera's coordinates to the robot's.
 
-Each does one part of the transformation and knows nothing of the others; a :class:`Chain` applies
+Each does one part of the transformation and does not depend on the others; a :class:`Chain` applies
 them in order. All of them map :class:`Poses` to :class:`Poses`: arrays of points and orientations.
 A localization of the camera is a pose on its own plane: ``z`` is 0 and the orientation a turn about
 ``z``.
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class Poses(NamedTuple):
-    """Positions and orientations of many things.
+    """Positions and orientations of several objects.
 
     Attributes:
         points: (N, 3) float64.
@@ -126,8 +126,8 @@ class CameraPosition2D:
     Raises:
         CalibrationError: ``SHAPE``, or ``NOT_FINITE``, also for a scale that is not positive.
 
-    Source: the thesis' ``solver_camera_2D_position``, 3.2.5.1; that the origin is subtracted, and
-    first, is derived: the origin itself must come to zero.
+    Source: the thesis' ``solver_camera_2D_position``, 3.2.5.1; the subtraction of the origin before
+    the turn is derived: the origin must become zero.
     """
 
     def __init__(self, origin: ArrayLike, theta: float = 0.0, scale: float = 1.0) -> None:
@@ -140,7 +140,7 @@ class CameraPosition2D:
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses relative to the origin mark, metres."""
-        # the origin first: turned first, it would not come to zero
+        # subtract before turning, so that the origin becomes zero
         centred = poses.points - np.array([*self.origin, 0.0])
         return Poses(self.scale * centred, poses.quaternions).moved(self._back, np.zeros(3))
 
@@ -235,10 +235,10 @@ class PlaneProjection:
 
 
 class Height:
-    """Solver for parts that are higher than the plane: from where they are seen to where they are.
+    """Solver for parts higher than the plane: from their apparent place to their true place.
 
-    A point at ``height`` above the plane is seen where the ray through it meets the plane, farther
-    from the point below the camera than it is. Without ``viewpoint`` the rays are taken as parallel
+    A point at ``height`` above the plane appears at the place where its ray meets the plane, which
+    is farther from the point below the camera. Without ``viewpoint`` the rays are taken as parallel
     to the normal, as with a telecentric lens: then only the height is added.
 
     Args:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Noise(NamedTuple):
-    """The variance of the touches' noise, and how well it is known."""
+    """The variance of the touches' noise, and its degrees of freedom."""
 
     variance: float  # variance of one coordinate, m^2
     # degrees of freedom of the estimate that the variance comes from; None if it was given

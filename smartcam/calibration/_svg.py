@@ -61,10 +61,10 @@ def line(start: Place, end: Place, kind: str, more: str = "") -> str:
     )
 
 
-def text(place: Place, said: str, kind: str = "", more: str = "") -> str:
+def text(place: Place, content: str, kind: str = "", more: str = "") -> str:
     """Return a text that begins at a place; ``more``: further attributes, after a space."""
     of_kind = f' class="{kind}"' if kind else ""
-    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(said)}</text>'
+    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(content)}</text>'
 
 
 def circle(place: Place, radius: float, kind: str) -> str:

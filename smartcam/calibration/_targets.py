@@ -30,8 +30,8 @@ MAX_POINTS = 10_000
 """A target has at most this many points."""
 
 MAX_LENGTH_M = 1.0
-"""Largest side of a square or marker, and largest distance of dots, metres: those of a printed
-sheet are some millimetres to a few hundred, so a larger number was meant in millimetres."""
+"""Largest side of a square or marker, and largest distance of dots, metres: a printed sheet has
+some to a few hundred millimetres, so a larger number is one in millimetres."""
 
 AREA_DISTANCE_SQUARES = 0.3
 """Distance along x and along y from an outer corner of a checkerboard to the centre of the round
@@ -77,8 +77,8 @@ class Checkerboard:
     def corner_areas(self) -> Array:
         """Centres of the round areas outside of the outer corners, (4, 2), metres.
 
-        The first is at the origin, the others follow counter-clockwise on the sheet as it is read:
-        at the end of the ray A, opposite, at the end of the ray B.
+        The first is at the origin, the others follow counter-clockwise on the sheet: at the end of
+        the ray A, opposite, at the end of the ray B.
         """
         low = -self.square * (1 + AREA_DISTANCE_SQUARES)
         right = self.square * (self.columns + AREA_DISTANCE_SQUARES)

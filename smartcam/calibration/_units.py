@@ -1,7 +1,7 @@
-"""Handle units of length, which a file, its format or the user says, and are never guessed.
+"""Convert units of length, which a file, its format or the user names; they are never guessed.
 
-Programs write the same files in metres and in millimetres. If neither the file nor its format says
-which, the user has to. Even if one does, values that do not occur in a robot's cell are refused,
+Programs write the same files in metres and in millimetres. If neither the file nor its format names
+the unit, the user has to. Even with a unit, values that do not occur in a robot's cell are refused,
 with the question whether they are in another unit.
 """
 

@@ -1,4 +1,4 @@
-"""Judge a calibration: whether it is good, for how many millimetres, and what to do next.
+"""Judge a calibration: its quality, its error in millimetres, and the next action.
 
 A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
 twice that error is within what the user allows; the default is :data:`MAX_ERROR_SHARE` of the
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_ERROR_SHARE: Final = 0.01
-"""Largest allowed error, as a part of the field, if the user does not say another."""
+"""Largest allowed error, as a part of the field, if the user gives none."""
 
 _RMS_OF_95_PERCENT: Final = 2.0
 """Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""
@@ -44,7 +44,7 @@ class Allowed(NamedTuple):
     """The largest error that is allowed."""
 
     error: float  # error that 95 of 100 new points may have, mm
-    said: bool  # whether the user gave it
+    given: bool  # whether the user gave the error
 
     @classmethod
     def of(cls, error: float | None, field: float) -> Allowed:
@@ -53,11 +53,11 @@ class Allowed(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The error that is allowed, and who said so, in words."""
-        if self.said:
+        """The error that is allowed, in words."""
+        if self.given:
             return f"{self.error:.3g} mm are allowed"
         share = f"{100 * MAX_ERROR_SHARE:g} % of the field"
-        return f"{self.error:.3g} mm are allowed, {share}, as nobody said"
+        return f"{self.error:.3g} mm are allowed, {share}, the default"
 
 
 _LOOK: Final = ("see the warning", "more")
@@ -75,7 +75,7 @@ CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.POOR_FIT: (_AGAIN, "redo"),
     Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
 }
-"""Advice and matching option for each thing that may be wrong; the first that applies counts."""
+"""Advice and matching option for each possible fault; the first that applies counts."""
 
 VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),
@@ -125,8 +125,8 @@ def judge(
     ``held_out``: RMS error at points that were left out, mm. ``wrong``: warnings; those without a
     cure do not count. ``worst``: number of the point to blame if a warning names none.
     ``predicted``: RMS error that noise causes, mm; the promised error is never less. ``allowed``:
-    largest error that may be promised. ``more``: things that would show how good it is. ``where``:
-    place that the promise is about, for people.
+    largest error that may be promised. ``more``: work that would show how good it is. ``where``:
+    text for people: the place of the promise.
     """
     wrong = list(wrong)
     texts = dict(reversed(wrong))
@@ -156,12 +156,12 @@ def refused(
     worst: int = 1,
     cures: Mapping[Code, tuple[str, str]] = CURES,
 ) -> Judgement:
-    """Return the judgement that a calibration is not good; ``text`` says what is wrong."""
+    """Return the judgement that a calibration is not good; ``text`` names the fault."""
     named = re.search(r"\bpoints? (\d+)", text)
     number = int(named[1]) if named else worst
     cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
-    said = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
-    return Judgement(said, option=option, number=number)
+    verdict = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
+    return Judgement(verdict, option=option, number=number)
 
 
 def _rounded_up(value: float) -> float:

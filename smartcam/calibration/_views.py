@@ -1,4 +1,4 @@
-"""Hold the points of a target in one image."""
+"""Store the points of a target that were found in one image."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class TargetView(storage.Stored):
     Pixels count from the centre of the upper left pixel: u to the right, v down.
 
     Attributes:
-        target: the target that was looked for.
+        target: target of the search.
         size: width and height of the image, pixels.
         ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
         points: (N, 2), places of these points in the image, pixels.
         covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
             without noise.
-        margin: how clearly the origin differs from the other corners: the number of grey levels, of
+        margin: margin of the origin over the other corners: the number of grey levels, of
             255, by which its mark, or the rim of its larger dot, is darker; None if ids or colours
             of squares show the origin, or if the target looks the same when turned.
         name: name of the image, for messages.
@@ -66,7 +66,7 @@ class TargetView(storage.Stored):
     warnings: storage.Remarks = ()
 
     def __post_init__(self) -> None:
-        """Take read-only copies, and check them."""
+        """Copy the arrays as read-only ones, and check them."""
         checked(self.name, str, "view of a target: name")
         called = f"target in {self.name}" if self.name else "view of a target"
         target = checked(self.target, get_args(Target), f"{called}: target")
@@ -138,7 +138,7 @@ def described(value: Any) -> str:
 
 
 def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
-    """Return views as a list; raise SHAPE if something else is among them, or it is no list."""
+    """Return views as a list; raise SHAPE for no list, or for another kind of element."""
     return as_list(views, TargetView, f"{what}: view")
 
 

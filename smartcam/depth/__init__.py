@@ -1,4 +1,4 @@
-"""Depth: from two cameras to metres, clouds, and what is done to them.
+"""Depth from two cameras, and point clouds: filters, files and registration.
 
 Distances are metres, in the frame of the left camera after rectification: x right, y down, z ahead.
 A depth of 0 means that there is no depth. The extra ``depth`` brings OpenCV and small-gicp.

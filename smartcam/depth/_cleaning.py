@@ -1,6 +1,6 @@
-"""Depth maps made cleaner: noise taken out and edges kept, holes filled as far as that is sound.
+"""Clean depth maps: smooth noise, keep edges, fill holes.
 
-A hole is a pixel without a depth, 0. It has no part in any average.
+A hole is a pixel without a depth: its value is 0. No average includes holes.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HoleFill: TypeAlias = Literal["left", "nearest", "farthest"]
-"""The neighbour that a hole takes its depth from."""
+"""Neighbour from which a hole gets its depth."""
 
 MILLIMETRE: Final = 1e-3
-"""Metres for one step of a depth map of 16 bits, by default."""
+"""Default step of a depth map of 16 bits, metres."""
 
 MAX_PASSES: Final = 16
-"""Iterations, and pixels that holes are filled over: 8 times as many are still a few seconds."""
+"""Largest number of iterations, and of pixels over which holes are filled."""
 
 MIN_NEW_SCENE_SHARE: Final = 0.5
-"""Share of the pixels that must change by more than an edge for a new scene."""
+"""Share of the pixels that must jump for the average to restart."""
 
 
 @takes(scale=a_number)
@@ -35,9 +35,8 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
     """Return a depth map as float32 metres, 0 where there is none.
 
     Args:
-        depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (or whatever
-            else: disparities are passed on as they are). 0, negative and not finite values stand
-                for no disparity.
+        depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (disparities in
+            pixels work, too). 0, negative and not finite values mean that there is no depth.
         scale: metres of a step of uint16.
 
     Returns:
@@ -68,18 +67,17 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
 
 
 class SpatialFilter:
-    """Smooths a depth map and keeps its edges.
+    """Smooth a depth map and keep its edges.
 
-    It is a recursive exponential average along rows, then along columns, each forth and back. A
-    pixel takes ``1 - alpha`` of its difference to the one before, which was smoothed already,
-    unless that differs by ``delta`` or more, or is a hole. There the average begins anew. Holes
-    stay holes.
+    The filter is a recursive exponential average along rows, then along columns, each forwards and
+    backwards. A pixel moves by ``1 - alpha`` of its difference towards the smoothed pixel before
+    it. The average restarts at holes and at steps of ``delta`` or more. Holes stay holes.
 
     Args:
         alpha: weight of the pixel itself, above 0; 1 changes nothing.
-        delta: the least step that is an edge: metres, or pixels where the map is one of
-            disparities. About four times the noise.
-        iterations: how often all of it is done.
+        delta: least step that counts as an edge: metres, or pixels of disparity. About four times
+            the noise is a good value.
+        iterations: number of times that the filter runs.
 
     Raises:
         ConfigurationError: a number out of its range.
@@ -97,14 +95,14 @@ class SpatialFilter:
         self.iterations: int = iterations
 
     def __call__(self, depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
-        """Return a map smoothed, (H, W) float32; of uint16 in metres. The given one stays.
+        """Return a smoothed copy of a map, (H, W) float32; maps of uint16 become metres.
 
         Raises:
-            FrameFormatError: no map of depth.
+            FrameFormatError: the array is no depth map.
         """
         smooth = as_metres(depth, scale)
         holes = smooth == 0
-        smooth[holes] = np.nan  # no comparison with it is true: nothing is taken from it
+        smooth[holes] = np.nan  # comparisons with NaN are false: holes do not enter the average
         with np.errstate(invalid="ignore"):
             for _ in range(self.iterations):
                 for _ in range(2):  # along rows, then along columns
@@ -115,7 +113,7 @@ class SpatialFilter:
 
     @property
     def shared(self) -> float:
-        """Pixels that share one noise afterwards, far from edges: see :func:`region_depth`."""
+        """Number of pixels with common noise after filtering, away from edges."""
         reach = min(1000, math.ceil(8 / self.alpha))
         once = (1 - self.alpha) ** np.abs(np.arange(-reach, reach + 1))
         kernel = once = once / once.sum()
@@ -124,7 +122,7 @@ class SpatialFilter:
         return float(1 / np.sum(kernel**2) ** 2)
 
     def _smooth(self, lines: NDArray[np.float32]) -> None:
-        """Smooth along the first axis, forth and back; all of the second one at a time."""
+        """Smooth along the first axis, forwards and backwards, in place."""
         step, size = np.empty_like(lines[0]), np.empty_like(lines[0])
         near = np.empty(lines.shape[1], bool)
         rest, delta = np.float32(1 - self.alpha), np.float32(self.delta)
@@ -136,23 +134,23 @@ class SpatialFilter:
 
 
 def _forth_and_back(count: int) -> list[tuple[int, int]]:
-    """Return each line but the first with the one before it, then the same from the end."""
+    """Return pairs of a line and the line before it, forwards, then backwards."""
     forth = [(line, line - 1) for line in range(1, count)]
     return forth + [(before, line) for line, before in reversed(forth)]
 
 
 class TemporalFilter:
-    """Averages the depth maps of a camera that stands still, each pixel for itself.
+    """Average the depth maps of a camera that does not move, each pixel separately.
 
-    A pixel that differs from its average by ``delta`` or more begins anew: something moved, or an
-    edge went over it. Where half of the picture jumps, or maps of another size come, all of it
-    begins anew. A hole takes no part, and for ``persistence`` maps it shows the average that was
-    there before, unless a pixel beside it begins anew.
+    The average of a pixel restarts at a difference of ``delta`` or more: something moved. If half
+    of the picture jumps, or the size of the maps changes, all pixels restart. A hole is not
+    averaged. It keeps the earlier average for ``persistence`` maps, unless a pixel beside it
+    restarts.
 
     Args:
         alpha: weight of the newest map, above 0; 1 averages nothing.
-        delta: the least step that is a change: metres, or pixels of disparity.
-        persistence: maps for which a hole shows what was there; 0: none.
+        delta: least difference that restarts the average: metres, or pixels of disparity.
+        persistence: number of maps for which a hole keeps the earlier average.
 
     Raises:
         ConfigurationError: a number out of its range.
@@ -169,17 +167,17 @@ class TemporalFilter:
         self.delta: float = delta
         self.persistence: int = persistence
         self._average: NDArray[np.float32] | None = None
-        self._holes: NDArray[np.uint8] | None = None  # maps since a pixel had a depth
+        self._holes: NDArray[np.uint8] | None = None  # number of maps since each pixel had a depth
 
     def reset(self) -> None:
-        """Begin anew: the camera has moved, or has not been looked at for long."""
+        """Restart the average, as after a move of the camera or a long pause."""
         self._average = self._holes = None
 
     def __call__(self, depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
-        """Take the next map; return the average, (H, W) float32, of uint16 in metres.
+        """Add a map, and return the average, (H, W) float32; maps of uint16 become metres.
 
         Raises:
-            FrameFormatError: no map of depth; nothing has changed then.
+            FrameFormatError: the array is no depth map; the average is unchanged.
         """
         new = as_metres(depth, scale)
         average, holes = self._average, self._holes
@@ -216,19 +214,19 @@ def fill_holes(
 ) -> NDArray[np.float32]:
     """Return a depth map whose holes are filled from their rim inwards, (H, W) float32.
 
-    What is filled in is a guess, and good to look at; measure with what was measured.
+    Filled depths are guesses for viewing; do not measure with them.
 
     Args:
-        depth: (H, W); of uint16 metres come out.
+        depth: (H, W), float, or uint16, which becomes metres.
         how: ``"left"``: the next depth to the left; ``"nearest"`` or ``"farthest"``: the least or
-            the largest of the eight neighbours, ring by ring. Behind an edge, where one of two
-            cameras sees nothing, the farthest is right.
-        reach: pixels that a depth is carried at most, 1 to 16; what is farther inside stays a hole.
+            the largest of the eight neighbours, ring by ring. Beside an edge, where one of two
+            cameras sees nothing, ``"farthest"`` is right.
+        reach: width, pixels, of the rim of a hole that is filled, 1 to 16.
         scale: metres of a step of uint16.
 
     Raises:
         ConfigurationError: another ``how``, or a reach out of its range.
-        FrameFormatError: no map of depth.
+        FrameFormatError: the array is no depth map.
     """
     if how not in get_args(HoleFill):
         raise ConfigurationError(
@@ -253,7 +251,7 @@ def _left(metres: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _extreme(metres: NDArray[np.float32], how: HoleFill) -> NDArray[np.float32]:
-    """Return the least or largest depth of each pixel and its neighbours, 0 where none has one."""
+    """Return the least or largest depth among each pixel and its neighbours, 0 if all are holes."""
     if how == "farthest":
         return _widened(metres, np.maximum)
     least = _widened(np.where(metres > 0, metres, np.float32(np.inf)), np.minimum)
@@ -265,7 +263,7 @@ def _dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _widened(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
-    """Return each pixel joined with its eight neighbours."""
+    """Return each pixel combined with its eight neighbours."""
     for _ in range(2):
         wide = values.copy()
         join(wide[1:], values[:-1], out=wide[1:])

@@ -1,4 +1,4 @@
-"""A cloud: points in metres, with colours and with what each is worth."""
+"""A point cloud: points in metres, with colours and standard deviations."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from smartcam.geometry import Transform
 
 _NUMBERS = "fiu"
-"""Kinds of numpy's numbers."""
+"""NumPy's codes for kinds of real numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
     """Points in metres.
 
-    The arrays are read-only. What is float32 (or uint8) already is not copied: who gave it must
-    not write into it any longer.
+    The arrays are read-only. Given arrays of float32 (or uint8) are not copied, so the caller must
+    not change them afterwards.
 
     Attributes:
         points: (N, 3) float32, metres, all finite.
-        colours: (N, 3) uint8, red, green, blue; None without.
+        colours: (N, 3) uint8, red, green, blue; None: no colours.
         sigma: (N,) float32, metres, standard deviations along the ray on which each point was seen;
-            None if nobody said.
+            None: unknown.
 
     Raises:
         ConfigurationError: other shapes, no numbers, a point that is not finite, a sigma below 0.
@@ -42,7 +42,7 @@ class Cloud:
     sigma: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
-        """Check, and take read-only views."""
+        """Check the arrays, and make read-only views."""
         points = _floats(self.points, "points", (None, 3))
         object.__setattr__(self, "points", points)
         count = len(points)
@@ -56,7 +56,7 @@ class Cloud:
             object.__setattr__(self, "sigma", sigma)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Be the same in another process: read-only, too."""
+        """Return the parts for pickle; the copy is read-only, too."""
         return type(self), (self.points, self.colours, self.sigma)
 
     def __len__(self) -> int:
@@ -83,12 +83,12 @@ class Cloud:
             matrix: (3, 3), of a camera without distortion, in pixels; the centre of the first
                 pixel is (0, 0).
             colours: (H, W, 3) uint8, red, green, blue; or (H, W) uint8, grey.
-            sigma: (H, W) metres, of the depth along the optical axis, where there is one.
-                A point's is that along its ray, which is longer off the axis.
+            sigma: (H, W) metres, standard deviation of the depth along the optical axis. The points
+                get the sigma along their rays, which is larger away from the axis.
 
         Raises:
-            ConfigurationError: other shapes, a depth that is below 0 or not finite, no matrix of
-                a camera, or depth, colours and sigma are not of one size.
+            ConfigurationError: other shapes, a depth that is below 0 or not finite, a matrix that
+                is no camera matrix, or sizes of depth, colours and sigma that differ.
         """
         metres = _floats(depth, "depth", (None, None))
         if metres.size and metres.min() < 0:
@@ -99,7 +99,7 @@ class Cloud:
         rows, columns = np.nonzero(metres)
         along = metres[rows, columns].astype(np.float64)
         pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
-        rays = pixels @ inverse.T  # whose z is 1
+        rays = pixels @ inverse.T  # with z = 1
         picked = spread = None
         if colours is not None:
             picture = _picture(colours, metres.shape)
@@ -107,16 +107,16 @@ class Cloud:
         if sigma is not None:
             lengths = np.linalg.norm(rays, axis=1)
             if np.shape(sigma) == metres.shape:
-                sigma = np.where(metres > 0, sigma, 0)  # of no depth it may be anything
+                sigma = np.where(metres > 0, sigma, 0)  # without depth, sigma is not used
             spread = _floats(sigma, "sigma", metres.shape)[rows, columns] * lengths
         return cls(_as(rays * along[:, None]), picked, None if spread is None else _as(spread))
 
     @classmethod
     def joined(cls, clouds: Iterable[Cloud]) -> Self:
-        """Return clouds of one frame as one, in their order.
+        """Return one cloud with the points of all, which are in one frame.
 
         Raises:
-            ConfigurationError: some have colours, or sigma, and others have none.
+            ConfigurationError: only some of the clouds have colours, or sigma.
         """
         parts = list(clouds)
         columns: dict[str, NDArray[Any] | None] = {}
@@ -134,11 +134,12 @@ class Cloud:
     def transformed(self, pose: Transform) -> Self:
         """Return the cloud in the frame that a rigid motion leads to.
 
-        ``pose`` is a :class:`~smartcam.calibration.Transform`: ``T_robot_camera`` takes a cloud of
-        the camera to the robot. Sigma stays: the points lie along other axes, as far off as before.
+        ``pose`` is a :class:`~smartcam.calibration.Transform`: ``T_robot_camera`` moves a cloud
+        from the camera's frame to the robot's. Sigma does not change.
 
         Raises:
-            ConfigurationError: no rigid motion, or it leads out of float32's range.
+            ConfigurationError: ``pose`` is no Transform, or the moved points exceed float32's
+                range.
         """
         motion = getattr(pose, "rigid", None)
         if motion is None:
@@ -149,7 +150,7 @@ class Cloud:
         return type(self)(_as(moved), self.colours, self.sigma)
 
     def taken(self, index: NDArray[Any]) -> Self:
-        """Return some of the points, by a mask (N,) or by their places, in that order."""
+        """Return the points of a mask (N,), or of indices in their order."""
         return type(self)(
             self.points[index],
             None if self.colours is None else self.colours[index],
@@ -158,7 +159,7 @@ class Cloud:
 
 
 def _as(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Return as float32; what is too large is infinite then, which a cloud refuses."""
+    """Return values as float32; too large values become infinite, which a cloud refuses."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
@@ -173,7 +174,7 @@ def _shape(values: NDArray[Any], what: str, shape: tuple[int | None, ...]) -> No
 
 
 def _floats(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Return a read-only view as float32, all finite; else ConfigurationError."""
+    """Return a read-only view as finite float32; raise ConfigurationError otherwise."""
     values = _array(given, what)
     if values.dtype.kind not in _NUMBERS:
         raise ConfigurationError(f"{what}: expected numbers, got {values.dtype}")
@@ -207,7 +208,7 @@ def _array(given: ArrayLike, what: str) -> NDArray[Any]:
 
 
 def _picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return colours (H, W, 3) of colours or grey."""
+    """Return a colour picture (H, W, 3) made of a colour or grey picture."""
     values = _array(given, "colours")
     if values.ndim == 2:
         grey = _bytes(values, "colours", size)

@@ -1,4 +1,4 @@
-"""Clouds as files: PLY and PCD, by the suffix."""
+"""Read and write clouds as PLY or PCD files, chosen by the suffix."""
 
 from __future__ import annotations
 
@@ -31,58 +31,57 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats import LengthUnit
 
 MAX_FILE_BYTES: Final = 1 << 30
-"""Largest number of bytes of a file that is read."""
+"""Largest size of a file that is read, bytes."""
 
 MAX_HEAD_BYTES: Final = 1 << 12
-"""Largest number of bytes of a file in which a comment says the unit."""
+"""Number of bytes at a file's beginning that are searched for the unit's comment."""
 
-UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
-"""The comment with which :func:`save_cloud` says the unit."""
+UNIT_COMMENT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
+"""Comment in which :func:`save_cloud` writes the unit."""
 
-COLOURS: Final = (
+COLOUR_NAMES: Final = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("r", "g", "b"),
 )
-"""Names of the colours' columns, as programs write them."""
+"""Names that programs give the columns of red, green and blue."""
 
-COARSE: Final = 1e-3
-"""Metres by which float32 may round a coordinate that was written as a double."""
+MAX_ROUNDING_METRES: Final = 1e-3
+"""Largest error, metres, of rounding a coordinate from double to float32."""
 
 
 class _CloudFormat(NamedTuple):
     read: Callable[[bytes], Mapping[str, NDArray[Any]]]  # columns by their names
-    write: Callable[[Cloud, bool], bytes]  # True: as text
+    write: Callable[[Cloud, bool], bytes]  # the flag is true for text
 
 
 FORMATS: Final = {
     ".ply": _CloudFormat(_ply.read, _ply.write),
     ".pcd": _CloudFormat(_pcd.read, _pcd.write),
 }
-"""The file formats by suffix, in lower case."""
+"""File formats by suffix, in lower case."""
 
 
 @takes(unit=or_none(check_text))
 def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) -> Cloud:
     """Return the cloud of a ``.ply`` or a ``.pcd`` file, up to 1 GiB.
 
-    Neither format has a unit of length, and programs write metres and millimetres. A file of
-    :func:`save_cloud` says in a comment that it is in metres; of any other file ``unit`` has to
-    tell it: ``m``, ``cm``, ``mm`` or ``inch``.
+    Neither format has a unit of length, and programs write metres or millimetres. Files of
+    :func:`save_cloud` name the unit in a comment. For any other file give ``unit``: ``m``, ``cm``,
+    ``mm`` or ``inch``.
 
     PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
-    with a coordinate that is not finite are no points, as in organised files, and are left out.
-    Colours are ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``,
-    or PCL's ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the
-    same unit.
-    Properties of other names are skipped, and so is a PCD's viewpoint. It takes its time: beside an
-    event loop it belongs into a thread.
+    with a coordinate that is not finite, as organised files have them, are left out. Colours are
+    ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``, or PCL's
+    ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the same unit.
+    Properties of other names are skipped, and so is a PCD's viewpoint. Large files take seconds: do
+    not read them in a coroutine, but in a thread.
 
     Raises:
-        ConfigurationError: another suffix, or no such unit.
+        ConfigurationError: the suffix or the unit is unknown.
         FrameSourceError: the file cannot be read.
-        FrameFormatError: nothing says the unit, or the file's bytes are no cloud, or have no x, y
-            and z, or its coordinates are so large that float32 would take a millimetre from them.
+        FrameFormatError: the unit is not given, the file is no cloud or has no x, y and z, or its
+            coordinates are so large that float32 would round them by a millimetre.
     """
     path = check_path(path, "path", "cloud")
     form = _format(path)
@@ -92,23 +91,23 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
         )
     try:
         with path.open("rb") as stream:
-            told = os.fstat(stream.fileno())  # what is asked for is reserved at once
-            regular = stat.S_ISREG(told.st_mode) and told.st_size <= MAX_FILE_BYTES
-            data = stream.read(told.st_size if regular else MAX_FILE_BYTES + 1)
+            status = os.fstat(stream.fileno())  # read() would allocate its whole argument
+            regular = stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE_BYTES
+            data = stream.read(status.st_size if regular else MAX_FILE_BYTES + 1)
     except OSError as exc:
         reason = exc.strerror or exc
         raise FrameSourceError(f"{path}: cannot be read: {reason}", source=str(path)) from exc
     try:
         if len(data) > MAX_FILE_BYTES:
             raise BadTableError(f"a file of {MAX_FILE_BYTES:,} bytes at most", "more")
-        return _cloud(form.read(data), METRES_PER_UNIT[unit or _said_unit(data)])
+        return _cloud(form.read(data), METRES_PER_UNIT[unit or _unit_comment(data)])
     except BadTableError as exc:
         raise FrameFormatError(f"{path}: {exc}", source=str(path)) from exc
 
 
-def _said_unit(data: bytes) -> str:
-    """Return the unit that a comment of the header says; else BadTableError."""
-    found = UNIT.search(data[:MAX_HEAD_BYTES])
+def _unit_comment(data: bytes) -> str:
+    """Return the unit from the header's comment; raise BadTableError if it is missing."""
+    found = UNIT_COMMENT.search(data[:MAX_HEAD_BYTES])
     if found is None:
         raise BadTableError(
             'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '
@@ -122,10 +121,10 @@ def _said_unit(data: bytes) -> str:
 def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False) -> None:
     """Write a cloud as ``.ply`` or ``.pcd``, in bytes (little endian) or as text.
 
-    The file is there as a whole or not at all: one that was there before stays until then.
+    An existing file is replaced only after the new one is complete.
 
     Raises:
-        ConfigurationError: another suffix, or it cannot be written.
+        ConfigurationError: the suffix is unknown, or the file cannot be written.
     """
     path = check_path(path, "path", "cloud")
     data = _format(path).write(cloud, text)
@@ -145,9 +144,9 @@ def _format(path: Path) -> _CloudFormat:
 
 
 def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
-    """Return a cloud of a file's columns; else BadTableError.
+    """Return a cloud made of a file's columns; raise BadTableError if they do not fit.
 
-    ``metre``: metres of the file's unit.
+    ``metre``: the file's unit in metres.
     """
     missing = [name for name in "xyz" if name not in columns]
     if missing:
@@ -176,13 +175,13 @@ def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
 
 def _loses(exact: NDArray[Any], kept: NDArray[Any]) -> bool:
     with np.errstate(invalid="ignore"):
-        return not float(np.abs(exact - kept.astype(np.float64)).max()) <= COARSE
+        return not float(np.abs(exact - kept.astype(np.float64)).max()) <= MAX_ROUNDING_METRES
 
 
 def _colours(
     columns: Mapping[str, NDArray[Any]], there: NDArray[np.bool_]
 ) -> NDArray[np.uint8] | None:
-    names = next((some for some in COLOURS if all(name in columns for name in some)), None)
+    names = next((some for some in COLOUR_NAMES if all(name in columns for name in some)), None)
     if names is None:
         return None
     found: NDArray[Any] = np.stack([columns[name][there] for name in names], axis=1)

@@ -1,4 +1,4 @@
-"""Things of one colour: a range of it, the mask, and the regions that look like what is wanted."""
+"""Find regions of one colour: ranges of colours, masks, and connected regions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from smartcam.frames._inside import converted
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MOST: Final = {"hue": 179, "saturation": 255, "value": 255}
-"""Largest number of each channel."""
+MAX_LEVELS: Final = {"hue": 179, "saturation": 255, "value": 255}
+"""Largest value of each channel."""
 
 HUE_UNITS: Final = 180
-"""Hues on the circle of colours in OpenCV's units, two degrees each."""
+"""Number of OpenCV's hues, each two degrees of the circle of colours."""
 
 MIN_COLOURFUL: Final = 40
-"""Saturation or value below which a hue is nothing but noise."""
+"""Saturation or value below which the hue is only noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,13 +35,14 @@ class ColourRange:
 
     Attributes:
         hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
-            green, 90 cyan, 120 blue, 150 magenta. A first hue above the second goes over 179:
-            ``(170, 10)`` is red.
+            green, 90 cyan, 120 blue, 150 magenta. If the first hue is above the second, the range
+            goes through 0: ``(170, 10)`` is red.
         saturation: from, to, each 0 (grey) to 255.
         value: from, to, each 0 (black) to 255: the largest of red, green and blue.
 
     Raises:
-        ConfigurationError: a number out of its range, or from more than to but for the hue.
+        ConfigurationError: a number out of its range, or a lower end above the upper one, except
+            for the hue.
     """
 
     hue: tuple[int, int] = (0, 179)
@@ -50,7 +51,7 @@ class ColourRange:
 
     def __post_init__(self) -> None:
         """Check the limits."""
-        for name, most in MOST.items():
+        for name, most in MAX_LEVELS.items():
             given: Any = getattr(self, name)
             try:
                 low, high = given
@@ -62,17 +63,17 @@ class ColourRange:
                     f"ColourRange: {name}: expected (from, to) of whole numbers 0 to {most}, "
                     f"got {shown(given)}"
                 )
-            object.__setattr__(self, name, (low, high))  # of JSON it is a list
+            object.__setattr__(self, name, (low, high))  # JSON gives a list
 
     def mask(self, picture: Frame | NDArray[Any]) -> NDArray[np.bool_]:
         """Return the mask of the pixels with a colour in the range, (H, W).
 
         Args:
-            picture: a frame with colours (of more than 8 bits the upper 8 count), or (H, W, 3) of
-                uint8, red first.
+            picture: a frame with colours (of more than 8 bits, the upper 8 are used), or (H, W, 3)
+                of uint8, red first.
 
         Raises:
-            FrameFormatError: there is no such picture.
+            FrameFormatError: the picture has another type or shape.
             MissingExtraError: OpenCV (extra ``depth``) is not installed.
         """
         return self.mask_hsv(hsv(picture))
@@ -83,7 +84,7 @@ class ColourRange:
         if low <= high:
             found = self._between(picture, low, high)
         else:
-            found = self._between(picture, low, MOST["hue"]) | self._between(picture, 0, high)
+            found = self._between(picture, low, MAX_LEVELS["hue"]) | self._between(picture, 0, high)
         return found > 0
 
     def _between(self, picture: NDArray[np.uint8], low: int, high: int) -> NDArray[np.uint8]:
@@ -97,17 +98,17 @@ class ColourRange:
         """Return the range of the colours around a pixel.
 
         Args:
-            picture: as :meth:`mask` takes it.
+            picture: picture, as for :meth:`mask`.
             x: column of the pixel.
             y: row of the pixel.
-            radius: pixels to each side that are looked at.
-            margin: units by which the range is made wider to each side, by half of them for the
-                hue. The tenth of the pixels that is farthest out does not count. Of greys and
-                blacks every hue is taken, since they have none, and of blacks every saturation.
+            radius: number of pixels to each side that are used.
+            margin: units by which the range is widened on each side; half as many for the hue. The
+                most extreme tenth of the pixels is ignored. Greys and blacks have no hue, so the
+                range includes every hue; for blacks it includes every saturation.
 
         Raises:
             ConfigurationError: a pixel outside of the picture, or a number out of its range.
-            FrameFormatError: there is no such picture.
+            FrameFormatError: the picture has another type or shape.
             MissingExtraError: OpenCV (extra ``depth``) is not installed.
         """
         if not (0 <= radius <= 1000 and 0 <= margin <= 255):
@@ -152,12 +153,12 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
         return ColourRange(value=(0, value[1]))
     if np.median(saturations) < MIN_COLOURFUL:
         return ColourRange(saturation=(0, saturation[1]), value=value)
-    # the hues as seen from their middle, so that red is no two colours
+    # hues relative to their middle, so that red is not split at 0
     middle = round(np.angle(np.exp(2j * np.pi * hues / HUE_UNITS).sum()) * HUE_UNITS / (2 * np.pi))
     off = (hues - middle + HUE_UNITS // 2) % HUE_UNITS - HUE_UNITS // 2
     low, high = (round(float(one)) for one in np.percentile(off, (5, 95)))
     low, high = low - (margin + 1) // 2, high + (margin + 1) // 2
-    hue = (0, MOST["hue"])
+    hue = (0, MAX_LEVELS["hue"])
     if high - low < HUE_UNITS - 1:
         hue = ((middle + low) % HUE_UNITS, (middle + high) % HUE_UNITS)
     return ColourRange(hue=hue, saturation=saturation, value=value)
@@ -178,9 +179,8 @@ class ColourRegion:
         sides: the longer and the shorter side of the smallest rectangle around it, pixels.
         corners: corners of this rectangle, (4, 2).
         orientation: angle of the region's longer axis, radians, above -pi/2 up to pi/2, from x
-            (right) towards y (down). It is the axis about which the pixels lie closest, which
-            noise at the rim changes less than the rectangle. For squares and circles it means
-            nothing.
+            (right) towards y (down). It is the axis of least inertia, which noise at the rim
+            changes less than the rectangle. For squares and circles it has no meaning.
         mask: pixels of the region, (H, W) of bool.
     """
 
@@ -193,12 +193,12 @@ class ColourRegion:
 
     @property
     def ratio(self) -> float:
-        """The longer side beside the shorter one, 1 or more."""
+        """Ratio of the longer to the shorter side, 1 or more."""
         return self.sides[0] / self.sides[1]
 
     @property
     def fullness(self) -> float:
-        """Part of the rectangle that is filled; a rectangle's own is about 1."""
+        """Share of the smallest rectangle around the region that it fills, up to about 1."""
         return self.area / (self.sides[0] * self.sides[1])
 
 
@@ -218,19 +218,19 @@ def find_regions(
     whole: bool = False,
     most: int = 1000,
 ) -> list[ColourRegion]:
-    """Return the connected regions of a mask, the largest first; pixels touch at corners, too.
+    """Return the connected regions of a mask, the largest first; corners connect pixels, too.
 
     Args:
         mask: (H, W) of bool.
-        area: least and largest area that is wanted, pixels.
+        area: least and largest area, pixels.
         ratio: least and largest ratio of the longer to the shorter side.
-        fullness: least part of its rectangle that a region fills, 0 to 1.
-        whole: whether one that touches the picture's rim is not wanted: it may be cut off.
+        fullness: least share of its rectangle that a region fills, 0 to 1.
+        whole: whether to leave out regions that touch the picture's rim, since they may be cut.
         most: number of regions at most; the largest are returned.
 
     Raises:
-        ConfigurationError: a range that holds nothing.
-        FrameFormatError: no mask.
+        ConfigurationError: a range whose lower end is above its upper end.
+        FrameFormatError: ``mask`` is no mask.
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
     for name, (low, high) in (("area", area), ("ratio", ratio), ("fullness", (fullness, 1))):

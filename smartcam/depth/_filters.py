@@ -1,4 +1,4 @@
-"""Filter clouds: by place, by number of neighbours, by one point a voxel."""
+"""Filter clouds by place, by number of neighbours, or to one point per voxel."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 AXES: Final = "xyz"
 
-ROWS: Final = 1 << 17
-"""Points whose neighbours are looked for at a time: what they need is memory."""
+POINTS_AT_A_TIME: Final = 1 << 17
+"""Number of points whose neighbours are searched at a time, which bounds the memory."""
 
 MAX_NEIGHBOURS: Final = 1000
 
@@ -40,7 +40,7 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
             f"pass_through: expected low <= high, got {shown(low)} and {shown(high)}"
         )
     along = cloud.points[:, AXES.index(axis)]
-    ends = _as_points_are((low, high))
+    ends = _as_float32((low, high))
     return cloud.taken((along >= ends[0]) & (along <= ends[1]))
 
 
@@ -54,23 +54,23 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     corners = [np.asarray(one, np.float64) for one in (low, high)]
     if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
-    ends = _as_points_are(corners)
+    ends = _as_float32(corners)
     inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)
     return cloud.taken(np.asarray(inside))
 
 
-def _as_points_are(ends: ArrayLike) -> NDArray[np.float32]:
-    """Return ends as float32, as points are: 0.1 includes a point that was made of 0.1."""
-    with np.errstate(over="ignore"):  # an end beyond its range is no limit
+def _as_float32(ends: ArrayLike) -> NDArray[np.float32]:
+    """Return bounds as float32, like points: a bound of 0.1 includes a point at 0.1."""
+    with np.errstate(over="ignore"):  # a bound beyond float32 becomes infinite
         return np.asarray(ends, np.float64).astype(np.float32)
 
 
 @takes(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
-    """Return the points that are about as near to others as most are.
+    """Return the points without those that are unusually far from their neighbours.
 
-    Each point's mean distance to its ``neighbours`` nearest is compared with the mean of all those
-    distances: it stays up to ``ratio`` standard deviations above. A cloud without points stays.
+    A point stays if its mean distance to its ``neighbours`` nearest points is at most ``ratio``
+    standard deviations above the mean of these distances. An empty cloud is returned as it is.
 
     Raises:
         ConfigurationError: ``neighbours`` is not 1 to 1000, or not below the number of points; or
@@ -91,7 +91,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
     tree = load("scipy.spatial").cKDTree(cloud.points)
     means = np.empty(len(cloud))
     for part in _parts(len(cloud)):
-        # The nearest is the point itself, or one at the same place, which is as good.
+        # The nearest point is the point itself, or another at the same place.
         distances, _ = tree.query(cloud.points[part], k=neighbours + 1)
         means[part] = distances[:, 1:].mean(axis=1)
     return cloud.taken(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
@@ -99,7 +99,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
 
 @takes(cloud=of_class("Cloud"), radius=a_number)
 def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> Cloud:
-    """Return the points with so many others, or more, within a radius in metres.
+    """Return the points with at least ``neighbours`` other points within a radius in metres.
 
     Raises:
         ConfigurationError: the radius is not above 0, or ``neighbours`` is not 1 to 1000.
@@ -112,7 +112,7 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     tree = load("scipy.spatial").cKDTree(cloud.points)
     kept = np.empty(len(cloud), bool)
     for part in _parts(len(cloud)):
-        # The farthest of them is within the radius, or not: no list of all that are.
+        # It is enough to know the distance to the last of the required neighbours.
         distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
         kept[part] = distances[:, 0] <= radius
     return cloud.taken(kept)
@@ -120,11 +120,11 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
 
 @takes(cloud=of_class("Cloud"), size=a_number)
 def voxel_grid(cloud: Cloud, size: float) -> Cloud:
-    """Return one point a voxel: the mean of the points in it, with their mean colour.
+    """Return one point per voxel: the mean of its points, with their mean colour.
 
-    Voxels are cubes of ``size`` metres, with a corner at the origin: the same place is the same
-    voxel in every cloud. They come by x, then y, then z. Their sigma is the root mean square of
-    the points': depth errs alike in neighbours, so that a mean of them is hardly better.
+    Voxels are cubes of ``size`` metres, with a corner at the origin, so the grid is the same for
+    every cloud. They are ordered by x, then y, then z. A voxel's sigma is the RMS of its points'
+    sigmas: errors of neighbouring depths are alike, so averaging hardly reduces them.
 
     Raises:
         ConfigurationError: the size is not above 0, or so small that the voxels cannot be counted.
@@ -133,7 +133,7 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     if not len(cloud):
         return cloud
     keys = _voxels(cloud, size)
-    order = np.argsort(keys)  # whatever order the points of a voxel get: their sums are of float64
+    order = np.argsort(keys)  # the order within a voxel does not matter: sums are float64
     keys = keys[order]
     first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
     counts = np.diff(np.append(first, len(keys)))
@@ -156,7 +156,7 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
 
 
 def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
-    """Return the number of each point's voxel, one number for one voxel."""
+    """Return the number of the voxel of each point."""
     low = np.floor(cloud.points.min(axis=0).astype(np.float64) / size)
     high = np.floor(cloud.points.max(axis=0).astype(np.float64) / size)
     spans = high - low + 1
@@ -175,8 +175,8 @@ def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
 
 
 def _parts(count: int) -> Iterator[slice]:
-    for start in range(0, count, ROWS):
-        yield slice(start, min(start + ROWS, count))
+    for start in range(0, count, POINTS_AT_A_TIME):
+        yield slice(start, min(start + POINTS_AT_A_TIME, count))
 
 
 def _check_count(value: int, what: str) -> None:

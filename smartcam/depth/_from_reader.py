@@ -1,4 +1,4 @@
-"""A reader of frames, such as ``camera.frames()`` gives, as a source that can be paired."""
+"""Use a reader of frames, as from ``camera.frames()``, as a source that can be paired."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 class ReaderDriver(FrameDriver):
-    """Frames of a reader that is entered when this is opened, and left when it is closed."""
+    """Driver that passes on the frames of a reader, which it enters and leaves."""
 
-    times_frames: ClassVar[bool] = True  # the reader's source did
+    times_frames: ClassVar[bool] = True  # the reader's source sets the times
 
     def __init__(self, frames: AbstractAsyncContextManager[FrameReader], name: str) -> None:
         super().__init__(FrameAddress.parse("synthetic://"))
@@ -28,15 +28,15 @@ class ReaderDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """Left or right, until a frame tells more."""
+        """``left`` or ``right``; after the first frame, the name of its source."""
         return self._name
 
     async def open(self) -> StreamFormat:
-        """Enter the reader, and see its first frame.
+        """Enter the reader, and wait for its first frame.
 
         Raises:
             FrameTimeoutError: no frame came in time.
-            FrameSourceError: the reader's source is not there.
+            FrameSourceError: the reader's source is not available.
         """
         self._reader = await self._frames.__aenter__()
         first = await self._reader.newest(max_age=math.inf)
@@ -44,7 +44,7 @@ class ReaderDriver(FrameDriver):
         return StreamFormat(first.format, first.width, first.height)
 
     async def start(self, sink: FrameSink) -> None:
-        """Hand on what the reader gives."""
+        """Start passing on the reader's frames."""
         if self._reader is None:
             raise FrameSourceError(f"{self._name}: the reader is closed", source=self._name)
         self._pump = asyncio.create_task(
@@ -52,7 +52,7 @@ class ReaderDriver(FrameDriver):
         )
 
     async def stop(self) -> None:
-        """Hand on nothing any longer."""
+        """Stop passing on frames."""
         pump, self._pump = self._pump, None
         if pump is not None:
             pump.cancel()
@@ -72,7 +72,7 @@ async def _hand_on(reader: FrameReader, sink: FrameSink) -> None:
             async for frame in reader:
                 sink.frame(frame)
         except FrameTimeoutError:
-            continue  # who iterates over the pair has a deadline of its own
+            continue  # iterating over the pair has its own deadline
         except FrameSourceError as error:
             sink.ended(error)
         else:

@@ -1,4 +1,4 @@
-"""Disparity of two rectified pictures: OpenCV's matchers, what is wrong taken out."""
+"""Compute the disparity of two rectified pictures with OpenCV's matchers, and reject errors."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ if TYPE_CHECKING:
     Value = int | str
 
 SUBPIXELS: Final = 16
-"""Steps in which OpenCV counts a disparity of one pixel."""
+"""Number of OpenCV's disparity steps per pixel."""
 
 WINDOWS: Final = (0, 5, 7, 9, 11, 13, 15)
 """Sides of the window in which disparities are refined, pixels; 0: no refinement."""
 
 MAX_DISPARITIES: Final = 4096
-"""Disparities that are searched at most, pixels."""
+"""Largest range of disparities that can be searched, pixels."""
 
 
 class Disparity(NamedTuple):
     """The disparities that a :class:`StereoMatcher` finds.
 
     Attributes:
-        pixels: (H, W), float32: a point of the left picture is so far further left in the right
-            one; NaN: none was found.
-        sigma: (H, W), float32: standard deviation of ``pixels``, pixels; NaN where that is.
+        pixels: (H, W), float32: distance by which a point of the left picture is farther left in
+            the right picture; NaN: no match.
+        sigma: (H, W), float32: standard deviation of ``pixels``, pixels; NaN where ``pixels`` is
+            NaN.
     """
 
     pixels: NDArray[np.float32]
@@ -59,7 +60,7 @@ class _WholeParameter(NamedTuple):
         return f"{self.low} to {self.high}{step.get(self.every, f', a multiple of {self.every}')}"
 
     def check(self, value: object) -> int | None:
-        """Return a value as OpenCV takes it; None: it is none of these."""
+        """Return a value for OpenCV; None if it is not allowed."""
         if not isinstance(value, int | np.integer) or isinstance(value, bool):
             return None
         number = int(value)
@@ -68,21 +69,21 @@ class _WholeParameter(NamedTuple):
 
 
 class _WordParameter(NamedTuple):
-    """A parameter that is one of some words; the first is the default."""
+    """A parameter with a list of words as values; the first word is the default."""
 
     words: tuple[str, ...]
-    prefix: str  # beginning of the names of OpenCV's constants
+    prefix: str  # prefix of OpenCV's constants
 
     @property
     def default(self) -> str:
-        """Value that is used where the user gives none."""
+        """Default value."""
         return self.words[0]
 
     def __str__(self) -> str:
         return " or ".join(self.words)
 
     def check(self, value: object) -> int | None:
-        """Return OpenCV's number of a word; None: there is no such word."""
+        """Return OpenCV's number for a word; None if the word is unknown."""
         if value not in self.words:
             return None
         return int(getattr(load("cv2"), self.prefix + str(value).upper()))
@@ -115,11 +116,11 @@ _PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
         "texture_threshold": _WholeParameter(10, 0, 1_000_000),
     },
 }
-"""By OpenCV's names, words with underscores between them; what is ours has other defaults."""
+"""Parameters by OpenCV's names in snake case; some defaults differ from OpenCV's."""
 
 
 class StereoMatcher:
-    """Finds how far apart the points of two rectified pictures are.
+    """Compute the disparity of two rectified pictures.
 
     ::
 
@@ -127,26 +128,25 @@ class StereoMatcher:
         disparity = matcher(left, right)
         disparity.pixels, disparity.sigma
 
-    OpenCV's matcher looks from left to right and from right to left; what the two do not agree on
-    does not count, nor does a speckle. It is then refined by least squares in a window, which also
-    tells its
-    sigma: see :attr:`Disparity.sigma` and ``docs/depth.md``. Points near the left border are found,
-    too, which OpenCV alone leaves out. Colours are made grey.
+    OpenCV's matcher runs from left to right and from right to left; disparities on which both do
+    not agree, and speckles, are dropped. The rest are refined by least squares in a window, which
+    also estimates their sigma: see ``docs/depth.md``. Points near the left border, which OpenCV
+    alone leaves out, are matched, too. Colours are converted to grey.
 
     Args:
         algorithm: ``sgbm``, semi-global, or ``bm``, blocks: three times faster, with more holes.
-        left_right: pixels by which both ways may differ; None: they are not compared.
-        refine: side of the window that disparities are refined in, odd, 5 to 15 pixels; 0: they
-            are OpenCV's sixteenths.
+        left_right: largest difference between the two directions, pixels; None: no comparison.
+        refine: side of the window for refinement, odd, 5 to 15 pixels; 0: keep OpenCV's steps of
+            1/16 pixel.
         wls: lambda and sigma of OpenCV's weighted least squares filter, such as (8000, 1.5), which
-            makes them smooth between edges and fills holes; None: without.
+            smooths disparities between edges and fills holes; None: no filter.
         parameters: parameters of OpenCV's matcher, by its names with underscores:
             ``num_disparities``, ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. ``P1``
             and ``P2`` of 0 are 8 and 32 times ``block_size`` squared.
 
     Raises:
-        ConfigurationError: there is no such algorithm, parameter or value; the text lists what
-            there is. ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
+        ConfigurationError: the algorithm, parameter or value is unknown, or ``wls`` is given but
+            ``cv2.ximgproc`` is missing, which is in OpenCV's contrib packages only.
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
 
@@ -176,13 +176,13 @@ class StereoMatcher:
             name: _PARAMETERS[algorithm][name].check(value)
             for name, value in self.parameters.items()
         }
-        # OpenCV's own check is between its guesses only; it is in whole pixels, and -1 does not
-        # turn that of SGBM off
+        # OpenCV's own check compares only its first guesses, in whole pixels; -1 does not turn it
+        # off for SGBM
         numbers["disp12_max_diff"] = (
             MAX_DISPARITIES if left_right is None else math.ceil(left_right)
         )
         self._compute = _ALGORITHMS[algorithm](numbers)
-        self._lock = threading.Lock()  # OpenCV's matchers keep their buffers
+        self._lock = threading.Lock()  # OpenCV's matchers reuse their buffers
 
     @property
     def nearest(self) -> int:
@@ -192,14 +192,15 @@ class StereoMatcher:
     def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Disparity:
         """Return the disparity of two rectified pictures.
 
-        Blocks for as long as that takes: in a coroutine have a thread do it. Threads take turns.
+        Blocks until it is done: call it in a thread, not in a coroutine. Calls of several threads
+        run one after the other.
 
         Args:
             left: (H, W) or, red first, (H, W, 3); uint8.
             right: picture of the same shape and type as ``left``.
 
         Raises:
-            FrameFormatError: other shapes or types, or the pictures are too small.
+            FrameFormatError: the pictures have other shapes or types, or are too small.
         """
         first, second = _grey(left, "left"), _grey(right, "right")
         window = int(self.parameters["block_size"])
@@ -218,9 +219,9 @@ class StereoMatcher:
         none = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
         sixteenths = self._padded(left, right)
         if self._smooth is not None:
-            sixteenths = self._smooth(sixteenths, left, np.negative(self._back(left, right)))
+            sixteenths = self._smooth(sixteenths, left, np.negative(self._reverse(left, right)))
         elif self._left_right is not None:
-            apart = _disagreement(sixteenths, self._back(left, right), none)
+            apart = _disagreement(sixteenths, self._reverse(left, right), none)
             sixteenths[~(apart <= self._left_right * SUBPIXELS)] = none
         column = np.arange(left.shape[1])
         there = column - np.round(sixteenths / SUBPIXELS)
@@ -231,13 +232,13 @@ class StereoMatcher:
             cv2.filterSpeckles(sixteenths, none, size, reach)
         return np.where(sixteenths > none, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan))
 
-    def _back(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
-        """Return sixteenths from right to left, above 0 where those from left to right are."""
-        # seen in a mirror, the right picture is the left one of a pair
+    def _reverse(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        """Return disparities from right to left in 1/16 pixel, with the sign of left to right."""
+        # the mirrored right picture is the left picture of a mirrored pair
         return np.ascontiguousarray(self._padded(right[:, ::-1], left[:, ::-1])[:, ::-1])
 
     def _padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
-        """Return sixteenths, also where OpenCV would have no room for all disparities."""
+        """Return disparities in 1/16 pixel, also near borders, where OpenCV leaves them out."""
         cv2 = load("cv2")
         before = max(0, self.nearest + 1)
         after = max(0, -int(self.parameters["min_disparity"]))
@@ -250,10 +251,10 @@ class StereoMatcher:
         return np.ascontiguousarray(found)
 
 
-def _merged(algorithm: str, said: Mapping[str, Value]) -> dict[str, Value]:
+def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
     """Return all parameters of an algorithm."""
     known = _PARAMETERS[algorithm]
-    for name, value in said.items():
+    for name, value in given.items():
         if name not in known:
             raise ConfigurationError(
                 f"StereoMatcher {algorithm}: no parameter {shown(name)}; there are "
@@ -261,7 +262,7 @@ def _merged(algorithm: str, said: Mapping[str, Value]) -> dict[str, Value]:
             )
         if known[name].check(value) is None:
             raise _wrong(f"{algorithm}: {name}", str(known[name]), value)
-    merged: dict[str, Value] = {name: one.default for name, one in known.items()} | dict(said)
+    merged: dict[str, Value] = {name: one.default for name, one in known.items()} | dict(given)
     if algorithm == "sgbm":
         area = int(merged["block_size"]) ** 2
         merged["P1"] = merged["P1"] or 8 * area
@@ -290,10 +291,10 @@ def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
 def _disagreement(
     there: NDArray[np.int16], back: NDArray[np.int16], none: int
 ) -> NDArray[np.float32]:
-    """Return by how much a disparity differs from that of its point in the right picture.
+    """Return the differences between disparities of both directions at the same point.
 
-    Sixteenths; infinite where either has no disparity, or the point is outside of the right
-    picture.
+    They are in 1/16 pixel, and infinite if a disparity is missing or the point is outside of the
+    right picture.
     """
     width = there.shape[1]
     column = np.arange(width, dtype=np.int32)[None] - ((there.astype(np.int32) + 8) >> 4)
@@ -304,7 +305,7 @@ def _disagreement(
 
 
 def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
-    """Return OpenCV's filter of sixteenths, the left picture, and sixteenths from right to left."""
+    """Return OpenCV's weighted least squares filter for disparities in 1/16 pixel."""
     cv2 = load("cv2")
     if not hasattr(cv2, "ximgproc"):
         raise ConfigurationError(
@@ -318,7 +319,7 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
         raise _wrong("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
-    made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # what both ways say, counts more
+    made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: weights by agreement
     made.setLambda(smoothness)
     made.setSigmaColor(edges)
 
@@ -343,7 +344,7 @@ def _sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
         "disp12_max_diff": "disp12MaxDiff",
     }
     given = {names[name]: value for name, value in numbers.items() if name in names}
-    # speckles come later, when both ways were compared
+    # speckles are removed after both directions were compared
     compute: Callable[..., Any] = (
         load("cv2").StereoSGBM_create(**given, speckleWindowSize=0).compute
     )

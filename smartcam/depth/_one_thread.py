@@ -1,4 +1,4 @@
-"""A thread that does one thing after the other for an object of the event loop."""
+"""Run blocking calls one after the other in a thread of its own."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ T = TypeVar("T")
 
 
 class OneThread:
-    """One thread; its owner closes it.
+    """A thread that runs one call at a time; its owner closes it.
 
-    Cancellation: what the thread is at is finished and thrown away.
+    Cancellation: the running call finishes, and its result is dropped.
     """
 
     def __init__(self, name: str) -> None:
@@ -26,14 +26,14 @@ class OneThread:
         self._running: asyncio.Future[Any] | None = None
 
     async def idle(self) -> None:
-        """Return when the thread has nothing to do."""
+        """Wait until no call is running."""
         while self._running is not None and not self._running.done():
             await asyncio.wait([self._running])
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Have the thread do something, in the order of the calls.
+        """Run a function in the thread, in the order of the calls.
 
-        Raises LocalProtocolError: it is closed.
+        Raises LocalProtocolError: the thread was closed.
         """
         await self.idle()
         if self._pool is None:
@@ -43,7 +43,7 @@ class OneThread:
         return await asyncio.shield(self._running)
 
     async def close(self) -> None:
-        """End the thread when it has finished. Idempotent.
+        """End the thread after its running call. Idempotent.
 
         Cancellation: the thread ends nevertheless.
         """
@@ -55,4 +55,4 @@ class OneThread:
 
 def _seen(done: asyncio.Future[Any]) -> None:
     if not done.cancelled():
-        done.exception()  # nobody may be there for it any longer
+        done.exception()  # mark the error as retrieved: the caller may be cancelled

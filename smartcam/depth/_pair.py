@@ -1,4 +1,4 @@
-"""A calibrated pair of cameras: its frames rectified, its disparities as metres."""
+"""Rectify the frames of a calibrated pair of cameras, and convert disparities to metres."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
 
 SIDES: Final = ("left", "right")
 
-SAME_SHAPE: Final = 0.01
-"""Share by which a picture's ratio of width to height may differ from the calibrated one."""
+MAX_ASPECT_DEVIATION: Final = 0.01
+"""Largest relative deviation of a picture's aspect ratio from the calibrated one."""
 
 MAX_ROTATION_ERROR: Final = 1e-3
-"""Largest error of an element of a rotation: ROS writes five digits."""
+"""Largest error of an element of a rotation matrix: ROS writes five digits."""
 
-REMAPPED: Final = (1 / 32) ** 2 / 12
-"""Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32.
+REMAP_VARIANCE_PX2: Final = (1 / 32) ** 2 / 12
+"""Variance of a disparity by OpenCV's remap, which rounds to 1/32 pixel, in pixels^2.
 
-It does so in both pictures, of which a window averages about a half.
+Both pictures are rounded; averaging over a window halves the sum of the two variances.
 """
 
-SMALLER: Final = 1.25
-"""Factor of shrinking above which a picture is averaged first: remap reads four pixels only."""
+MIN_AVERAGING_FACTOR: Final = 1.25
+"""Reduction of size above which a picture is averaged first: remap reads only four pixels."""
 
 
 @takes(left=check_path, right=check_path)
 def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str]) -> CameraChain:
-    """Return the pair of two ``camera_info`` files, as ROS' ``camera_calibration`` writes them.
+    """Read a pair from two ``camera_info`` files, as ROS' ``camera_calibration`` writes them.
 
-    Where the right camera is, only their rectification tells: ``T_right_left`` is made of
-    ``rectification_matrix`` and ``projection_matrix``. A file that is read blocks.
+    ``T_right_left`` is computed from ``rectification_matrix`` and ``projection_matrix``. Reading
+    blocks.
 
     Raises:
-        CalibrationError: ``MALFORMED``, ``NOT_FINITE`` or ``SHAPE``: a file is not one;
-            ``NOT_RIGID``: a rectification is no rotation; ``SWAPPED_SIDES``: the right one is not
-            that of the right camera of a pair.
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE`` or ``SHAPE``: a file is no ``camera_info``;
+            ``NOT_RIGID``: a rectification is no rotation; ``SWAPPED_SIDES``: the second file is not
+            from the right camera of a pair.
         MissingExtraError: PyYAML is not installed.
         OSError: one of the files cannot be read.
     """
@@ -65,8 +65,8 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
             code=Code.SWAPPED_SIDES,
             got=float(two.projection[0, 3]),
         )
-    # p_rectified = R1 p_left, and in the right rectified frame that and the shift, so that
-    # p_right = R2^T (R1 p_left + shift)
+    # p_rectified = R1 p_left; the right rectified frame is shifted, so p_right = R2^T (R1 p_left +
+    # shift)
     first, second = (_rotation(info.rectification, path) for info, path in given)
     transform = Transform("right", "left", second.T @ first, second.T @ np.array([shift, 0, 0]))
     return CameraChain(
@@ -75,7 +75,7 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
 
 
 def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Return the rotation that a matrix of five digits was."""
+    """Return the rotation nearest to a matrix that was written with five digits."""
     u, _, v = np.linalg.svd(matrix)
     turn = np.asarray(u @ v)
     if np.linalg.det(turn) < 0 or np.abs(turn - matrix).max() > MAX_ROTATION_ERROR:
@@ -89,20 +89,20 @@ def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDAr
 
 def _text(path: str | os.PathLike[str]) -> str:
     with Path(path).open("rb") as file:
-        said = file.read(MAX_FILE_BYTES + 1)
-    if len(said) > MAX_FILE_BYTES:
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
         raise CalibrationError(
             f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most", code=Code.MALFORMED
         )
     try:
-        return said.decode()
+        return content.decode()
     except UnicodeDecodeError as exc:
         raise CalibrationError(f"{path}: expected text: {exc}", code=Code.MALFORMED) from exc
 
 
 def scaled(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
-    """Return the lens of a picture that was made larger or smaller."""
-    # pixels count from the middle of the first one, so its corner, at -1/2, is what stays
+    """Return the lens for a scaled picture."""
+    # pixels count from the middle of the first pixel, whose corner at -1/2 does not move
     across, down = size[0] / camera.size[0], size[1] / camera.size[1]
     matrix = camera.matrix.copy()
     matrix[0] = [across * matrix[0, 0], 0, across * (matrix[0, 2] + 0.5) - 0.5]
@@ -116,12 +116,12 @@ def scaled(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
 
 
 class CalibratedPair:
-    """A calibration of a pair, worked out for pictures of one size.
+    """A calibration of a pair, prepared for pictures of one size.
 
-    Everything here blocks; a thread does it.
+    All methods block: call them in a thread.
 
-    Raises ConfigurationError: it is no pair side by side; CalibrationError: as
-    :meth:`StereoCalibration.rectify` has it.
+    Raises ConfigurationError: the cameras are not side by side; CalibrationError: as
+    :meth:`StereoCalibration.rectify`.
     """
 
     def __init__(
@@ -149,27 +149,27 @@ class CalibratedPair:
             )
         self.camera_info = CameraModel(size=found.size, matrix=found.projections[0][:, :3])
         self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
-        self._spread = _spread(found.rotations[1], covariance)
+        self._covariance_root = _covariance_root(found.rotations[1], covariance)
         self._maps, self._masks = found.maps, found.masks
         self.rotation: NDArray[np.float64] = found.rotations[0]
         self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
 
     def rectified(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:
-        """Return a picture of any size, (H, W) or (H, W, C), rectified; 0 where it has no source.
+        """Return the rectified picture, (H, W) or (H, W, C); 0 outside of the given picture.
 
-        Raises FrameFormatError: it is not of the calibrated shape.
+        Raises FrameFormatError: the picture's aspect ratio is not the calibrated one.
         """
         cv2 = load("cv2")
         height, width = picture.shape[:2]
         shape = self._shapes[side]
-        if abs(width * shape[1] / (height * shape[0]) - 1) > SAME_SHAPE:
+        if abs(width * shape[1] / (height * shape[0]) - 1) > MAX_ASPECT_DEVIATION:
             raise FrameFormatError(
                 f"{source}: expected a picture of the shape that the {SIDES[side]} camera was "
                 f"calibrated with, {shape[0]}x{shape[1]} made larger or smaller, got "
                 f"{width}x{height}: cut, or of another mode of the sensor?",
                 source=source,
             )
-        if width > SMALLER * self.size[0]:
+        if width > MIN_AVERAGING_FACTOR * self.size[0]:
             picture = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA)
             width, height = self.size
         made_for, maps = self._fixed[side]
@@ -181,7 +181,7 @@ class CalibratedPair:
         return np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
 
     def drop_outside(self, disparity: NDArray[np.float32]) -> None:
-        """Make NaN of what is where either picture has no source."""
+        """Set disparities to NaN where a rectified picture has no source."""
         first, second = self._masks
         if first.all() and second.all():
             return
@@ -190,7 +190,7 @@ class CalibratedPair:
         disparity[~(first & np.take_along_axis(second, column, axis=1))] = np.nan
 
     def depth(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return metres (H, W), 0 where there is no disparity above 0."""
+        """Return depths in metres (H, W), 0 where no disparity is above 0."""
         metres = np.zeros_like(disparity)
         np.divide(self.focal * self.baseline, disparity, out=metres, where=disparity > 0)
         return metres
@@ -198,14 +198,14 @@ class CalibratedPair:
     def sigma(
         self, depth: NDArray[np.float32], disparity_sigma: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return the standard deviation of depths, metres; NaN where there is none."""
-        # Z = f b / d, so that sigma_Z = Z^2 / (f b) sigma_d, and what the calibration may be off
-        # counts as a disparity, too
+        """Return the standard deviation of depths, metres; NaN where there is no depth."""
+        # Z = f b / d, so sigma_Z = Z^2 / (f b) sigma_d; the calibration's error is added as an
+        # error of the disparity
         known = depth > 0
         z = np.where(known, depth, np.float32(1))
-        variance = disparity_sigma.astype(np.float32) ** 2 + np.float32(REMAPPED)
-        if self._spread is not None:
-            variance += self._of_calibration(z, self._spread)
+        variance = disparity_sigma.astype(np.float32) ** 2 + np.float32(REMAP_VARIANCE_PX2)
+        if self._covariance_root is not None:
+            variance += self._of_calibration(z, self._covariance_root)
         sigma = z * z / np.float32(self.focal * self.baseline) * np.sqrt(variance)
         if self._focal_sigma:
             sigma = np.hypot(sigma, z * np.float32(self._focal_sigma / self.focal))
@@ -214,7 +214,7 @@ class CalibratedPair:
     def _of_calibration(
         self, z: NDArray[np.float32], spread: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Return the variance of the disparity that the transform's covariance leads to."""
+        """Return the variance of the disparity that follows from the transform's covariance."""
         # A point (X, Y, Z) is at P - (b, 0, 0) in the right rectified frame; a small turn w and
         # shift t of the left camera in it moves that by w x P + t, and its column by
         # f (dx / Z - x' dz / Z), with x' = (X - b) / Z: a row of the six unknowns' factors.
@@ -236,7 +236,7 @@ class CalibratedPair:
 def _parts(
     calibration: StereoCalibration | CameraChain,
 ) -> tuple[tuple[CameraModel, CameraModel], Transform, NDArray[np.float64] | None]:
-    """Return lenses, ``T_right_left`` and its covariance, where that is known."""
+    """Return lenses, ``T_right_left`` and its covariance, None if unknown."""
     if not isinstance(calibration, CameraChain):
         return (
             (calibration.left, calibration.right),
@@ -252,10 +252,10 @@ def _parts(
     return (left, right), calibration.transforms[0], None
 
 
-def _spread(
+def _covariance_root(
     turn: NDArray[np.float64], covariance: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
-    """Return A (6, 6), A A^T the covariance in the right rectified frame; None: none."""
+    """Return A (6, 6) with A A^T the covariance in the right rectified frame; None if unknown."""
     if covariance is None or not covariance.any():
         return None
     both = np.kron(np.eye(2), turn)

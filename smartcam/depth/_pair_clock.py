@@ -17,28 +17,28 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import ClockStatistics
 
 MAX_PAIRS: Final = 600
-"""Pairs that are remembered: 20 s at 30 pairs a second."""
+"""Largest number of pairs that are kept: 20 s at 30 pairs per second."""
 
 SKEW_PAIRS: Final = 30
-"""Pairs over which the skew is measured."""
+"""Number of recent pairs over which the skew is measured."""
 
 MIN_PAIRS: Final = 30
-"""Pairs needed to know a rate."""
+"""Least number of pairs to estimate frame rates."""
 
 
 class _SeenPair(NamedTuple):
-    captured: tuple[float, float]  # left and right, seconds of ours
+    captured: tuple[float, float]  # left and right, seconds of the local clock
     sequence: tuple[int, int]
 
 
 class PairClock:
-    """Skew and drift of two cameras, from the frames that were paired."""
+    """Estimate skew and drift of two cameras from their paired frames."""
 
     def __init__(self) -> None:
         self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
 
     def saw(self, left: Frame, right: Frame) -> None:
-        """Take a pair; one whose numbers begin again begins everything again."""
+        """Record a pair; restart if a camera's frame numbers restarted."""
         now = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
         if self._seen and not all(
             a < b for a, b in zip(self._seen[-1].sequence, now.sequence, strict=True)
@@ -47,17 +47,17 @@ class PairClock:
         self._seen.append(now)
 
     def skew(self) -> float | None:
-        """Return the median skew of the last pairs, seconds the right one is later."""
+        """Return the median time, seconds, by which the right frames of recent pairs are later."""
         recent = list(self._seen)[-SKEW_PAIRS:]
         if not recent:
             return None
         return statistics.median(one.captured[1] - one.captured[0] for one in recent)
 
     def drift(self, clocks: Sequence[ClockStatistics | None]) -> tuple[float | None, str]:
-        """Return by how much the right clock is faster, and what says so.
+        """Return the right clock's drift against the left clock, and the source of this value.
 
-        Both cameras count their frames by their own clocks: where those tell no time, and the
-        nominal rates are the same, the ratio of the rates is that of the clocks.
+        Each camera's own clock sets its frame rate. Without timestamps of these clocks, and at the
+        same nominal rate, the ratio of the frame rates is the ratio of the clocks.
         """
         left, right = (None if one is None else one.drift for one in clocks)
         if left is not None and right is not None:
@@ -69,7 +69,7 @@ class PairClock:
         return (drift, "frames") if abs(drift) <= MAX_DRIFT else (None, "")
 
     def _rates(self) -> tuple[float, float] | None:
-        """Return both cameras' frames per second of our clock."""
+        """Return both cameras' frame rates by the local clock."""
         seen = list(self._seen)
         if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None

@@ -37,17 +37,16 @@ TYPES: Final = {
     **{("U", size): f"<u{size}" for size in (1, 2, 4, 8)},
     **{("F", size): f"<f{size}" for size in (4, 8)},
 }
-"""NumPy's type for each TYPE and SIZE."""
+"""NumPy's type for each pair of TYPE and SIZE."""
 
 MAX_UNPACKED_BYTES: Final = 1 << 30
-"""Largest number of bytes that compressed points may unpack to, as many as an uncompressed file may
-have."""
+"""Largest size of unpacked points, bytes: the limit of uncompressed files."""
 
 COLOURS: Final = ("rgb", "rgba")
-"""Fields of 4 bytes with a colour, blue in the lowest byte; in a float its bits are the colour."""
+"""Fields of 4 bytes with a colour, blue in the lowest byte; a float holds it as its bits."""
 
-PADDING: Final = "_"
-"""Name of fields for padding, which are not read and may come more than once."""
+PADDING_NAME: Final = "_"
+"""Name of padding fields, which are skipped and may occur more than once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +60,7 @@ class _PcdHeader:
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the columns of a file's points; else BadTableError."""
+    """Return the columns of a file's points; raise BadTableError if the file is not valid."""
     head = _header(data)
     columns = READERS[head.data](data, head)
     for name in COLOURS:
@@ -96,7 +95,7 @@ def _header(data: bytes) -> _PcdHeader:
             f"up to {MAX_FIELDS} FIELDS, with SIZE, TYPE and COUNT of each",
             f"{len(names)}, {len(sizes)}, {len(kinds)} and {len(counts)}",
         )
-    named = [name for name in names if name != PADDING]
+    named = [name for name in names if name != PADDING_NAME]
     if len(set(named)) < len(named):
         raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
     types = []
@@ -124,7 +123,7 @@ def _one(lines: Mapping[str, list[str]], name: str) -> int:
 
 
 def _row(head: _PcdHeader) -> np.dtype[Any]:
-    """Return the rows' type, whose fields are numbered: the names may come twice."""
+    """Return the rows' type; its fields are numbered, since names may occur twice."""
     fields = zip(head.types, head.counts, strict=True)
     row = np.dtype([(str(place), kind, (count,)) for place, (kind, count) in enumerate(fields)])
     check_row(row)
@@ -136,14 +135,14 @@ def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     return {
         name: rows[str(place)][:, 0].copy()
         for place, (name, count) in enumerate(zip(head.names, head.counts, strict=True))
-        if count == 1 and name != PADDING
+        if count == 1 and name != PADDING_NAME
     }
 
 
 def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
-    """Return columns that are stored one after the other, and compressed."""
+    """Return columns that are stored one after the other in compressed form."""
     size = head.points * _row(head).itemsize
-    if size > MAX_UNPACKED_BYTES:  # 3 bytes of LZF can stand for 264
+    if size > MAX_UNPACKED_BYTES:  # 3 bytes of LZF can expand to 264
         raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
@@ -157,7 +156,7 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     body = unpacked(data[head.start + 8 : head.start + 8 + packed], size)
     for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
         many = count * head.points
-        if count == 1 and name != PADDING:
+        if count == 1 and name != PADDING_NAME:
             columns[name] = np.frombuffer(body, kind, many, place).copy()
         place += many * np.dtype(kind).itemsize
     return columns
@@ -168,7 +167,7 @@ def unpacked(data: bytes, size: int) -> bytes:
     out, place, end = bytearray(), 0, len(data)
     while place < end and len(out) <= size:
         control, place = data[place], place + 1
-        if control < 32:  # that many bytes plus one, uncompressed
+        if control < 32:  # control + 1 uncompressed bytes follow
             out += data[place : place + control + 1]
             place += control + 1
             continue
@@ -182,7 +181,7 @@ def unpacked(data: bytes, size: int) -> bytes:
         if begin < 0:
             raise BadTableError("a place in what is unpacked", f"{-begin} bytes before it")
         length += 2
-        part = out[begin : begin + length]  # which may overlap with its own output
+        part = out[begin : begin + length]  # may overlap with its own output
         out += (part * (length // len(part) + 1))[:length]
     if len(out) != size or place != end:
         raise BadTableError(f"{end} bytes that unpack to {size}", f"{place} to {len(out)}")
@@ -193,14 +192,14 @@ def _text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     types, names = [], []
     for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
         types += [np.dtype(kind)] * count
-        names += [name if count == 1 else PADDING] * count
+        names += [name if count == 1 else PADDING_NAME] * count
     columns = from_text(data, head.start, 0, head.points, types)
     pairs = zip(names, columns, strict=True)
-    return {name: column for name, column in pairs if name != PADDING}
+    return {name: column for name, column in pairs if name != PADDING_NAME}
 
 
 READERS: Final = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}
-"""The readers of points by the word behind DATA."""
+"""Readers of points by the word after DATA."""
 
 KNOWN: Final = (
     *("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT"),
@@ -209,7 +208,7 @@ KNOWN: Final = (
 
 
 def write(cloud: Cloud, text: bool) -> bytes:
-    """Return a cloud as a file in PCL's form: colours as a float's bits, in text as a number."""
+    """Return a cloud as a PCD file: colours are a float's bits, in text a number."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
     if cloud.colours is not None:
         red, green, blue = cloud.colours.T.astype(np.uint32)

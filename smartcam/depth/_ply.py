@@ -1,4 +1,4 @@
-"""PLY files: the vertices of what others write, and our own.
+"""Read and write the vertices of PLY files.
 
 Source: Greg Turk, The PLY Polygon File Format (1994).
 """
@@ -46,27 +46,27 @@ TYPES: Final = {
     "float32": "f4",
     "float64": "f8",
 }
-"""The document's names, and those that others write."""
+"""Types by their names in the format's document, and by names that other programs write."""
 
 MAX_LIST_ROWS: Final = 1 << 20
-"""Largest number of rows of lists before the vertices, such as cameras; faces stand behind."""
+"""Largest number of rows of lists before the vertices; faces come after them."""
 
 ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 @dataclass(slots=True)
 class _PlyElement:
-    """A header's description of rows of one kind."""
+    """An element of the header: rows of one kind."""
 
     name: str
     count: int
     properties: dict[str, str] = field(default_factory=dict)  # numpy's types by name
-    # numpy's types in the order of a row: of a number, or of a list's size and its numbers
+    # numpy's types in the order of a row: one for a number, two for a list (size and items)
     parts: list[tuple[str, ...]] = field(default_factory=list)
 
     @property
     def lists(self) -> bool:
-        """True if its rows are of any length."""
+        """True if the rows have lists, and so no fixed length."""
         return any(len(part) > 1 for part in self.parts)
 
     def row(self, order: str) -> np.dtype[Any]:
@@ -80,7 +80,7 @@ class _PlyElement:
         return row
 
     def end(self, data: bytes, start: int, order: str) -> int:
-        """Return the place at which the rows end that begin at ``start``."""
+        """Return the offset after the rows that begin at ``start``."""
         if not self.lists:
             return start + (self.count * self.row(order).itemsize if self.count else 0)
         if self.count > MAX_LIST_ROWS:
@@ -101,7 +101,7 @@ class _PlyElement:
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the columns of a file's vertices; else BadTableError."""
+    """Return the columns of a file's vertices; raise BadTableError if the file is not valid."""
     order, elements, start = _header(data)
     before, vertex = _vertex(elements)
     row = vertex.row(order)
@@ -116,7 +116,7 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
-    """Return the bytes' order (empty for text), the elements, and where the rows begin."""
+    """Return the byte order (empty for text), the elements, and the offset of the first row."""
     line, place = header_line(data, 0) if data.startswith(b"ply") else ("", 0)
     if line.rstrip() != "ply":
         raise BadTableError("a PLY file, which begins with ply", shown(data[:60]))
@@ -161,7 +161,7 @@ def _add_part(element: _PlyElement, *part: str) -> None:
 
 
 def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
-    """Return the elements before the vertices, and the element of the vertices."""
+    """Return the elements before the vertices, and the vertices' element."""
     for place, one in enumerate(elements):
         if one.name == "vertex":
             return elements[:place], one
@@ -170,7 +170,7 @@ def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement
 
 
 def write(cloud: Cloud, text: bool) -> bytes:
-    """Return a cloud as a file."""
+    """Return a cloud as a PLY file."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
     names = dict.fromkeys("xyz", "float")
     if cloud.colours is not None:

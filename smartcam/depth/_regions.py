@@ -22,23 +22,23 @@ DepthArea: TypeAlias = "tuple[int, int, int, int] | Sequence[tuple[float, float]
 """A box ``(x, y, width, height)``, a polygon (N, 2) of ``x, y``, or a mask (H, W) of bool; in
 pixels from the middle of the upper left one."""
 
-OF_A_SIGMA: Final = 1.4826
-"""Standard deviation of normal noise, as a multiple of the median of its absolute deviations."""
+SIGMA_PER_MAD: Final = 1.4826
+"""Standard deviation of normal noise as a multiple of its median absolute deviation (MAD)."""
 
-OF_A_MEDIAN: Final = math.pi / 2 - 1
-"""Excess of a median's variance over a mean's, in parts of one pixel's variance, for normal noise
-that is independent in each pixel; smooth noise adds next to nothing."""
+MEDIAN_EXCESS_VARIANCE: Final = math.pi / 2 - 1
+"""Excess of a median's variance over a mean's, as a multiple of a pixel's variance divided by the
+number of pixels, for independent normal noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegionDepth:
-    """The depth of a region, and its errors.
+    """The depth of a region, and its standard deviations.
 
     Attributes:
         median: median of the depths, metres.
-        sigma: standard deviation of ``median`` by noise alone, metres.
-        spread: standard deviation of one pixel, metres, by the median of the deviations: single
-            outliers do not count; a slope does.
+        sigma: standard deviation of ``median`` from noise alone, metres.
+        spread: standard deviation of one pixel, metres, from the median absolute deviation, which
+            single outliers do not change; a slope does.
         count: number of pixels with a depth.
         pixels: number of pixels of the region.
     """
@@ -62,17 +62,16 @@ def region_depth(
 
     Args:
         depth: (H, W): float in metres, or uint16 in steps of ``scale``.
-        region: a box, a polygon or a mask; None: the whole map. Parts outside of the map do not
-            count.
+        region: a box, a polygon or a mask; None: the whole map. Parts outside of the map are
+            ignored.
         scale: metres of a step of uint16.
-        shared: number of pixels that share the same noise, for ``sigma``: 1 if each has its own;
-            :attr:`SpatialFilter.shared` after such a filter (holes make it less: then ``sigma`` is
-            too large, by a fifth with 5 % of holes). A matcher by windows shares about as many as
-            its window has.
+        shared: number of pixels with common noise, for ``sigma``: 1 if each pixel has its own
+            noise; :attr:`SpatialFilter.shared` after this filter (holes reduce it: ``sigma`` is a
+            fifth too large with 5 % of holes); about the pixels of the window for a window matcher.
 
     Raises:
         ConfigurationError: the region is not valid, or ``shared`` is below 1.
-        FrameFormatError: no pixel of the region has a depth, or the array is no map of depth.
+        FrameFormatError: no pixel of the region has a depth, or the array is no depth map.
     """
     if not (shared >= 1 and math.isfinite(shared)):
         raise ConfigurationError(
@@ -83,12 +82,13 @@ def region_depth(
     there = inside[inside > 0].astype(float)
     if not there.size:
         raise FrameFormatError(
-            f"region_depth: expected a depth in {_told(region)}, got none in {inside.size} pixels"
+            f"region_depth: expected a depth in {_described(region)}, "
+            f"got none in {inside.size} pixels"
         )
     median = float(np.median(there))
-    spread = OF_A_SIGMA * float(np.median(np.abs(there - median)))
-    # variance of the median, in parts of a pixel's
-    variance = min(1.0, (shared + OF_A_MEDIAN) / there.size)
+    spread = SIGMA_PER_MAD * float(np.median(np.abs(there - median)))
+    # variance of the median as a share of a pixel's variance
+    variance = min(1.0, (shared + MEDIAN_EXCESS_VARIANCE) / there.size)
     return RegionDepth(
         median=median,
         sigma=spread * math.sqrt(variance),
@@ -101,10 +101,10 @@ def region_depth(
 def equalize_depth(
     depth: NDArray[Any], region: DepthArea | None = None, *, scale: float = MILLIMETRE
 ) -> NDArray[np.uint8]:
-    """Return a picture of a region that shows small differences.
+    """Return a picture that makes small differences in a region visible.
 
-    All its greys have the same number of pixels: the nearest is 255, the farthest 1. Holes, and
-    pixels of the box outside of a polygon or a mask, are black, 0.
+    Each grey level has the same number of pixels: the nearest are 255, the farthest 1. Holes, and
+    pixels outside of a polygon or a mask, are black, 0.
 
     Args:
         depth: (H, W): float in metres, or uint16 in steps of ``scale``.
@@ -116,13 +116,13 @@ def equalize_depth(
 
     Raises:
         ConfigurationError: the region is not valid, or wholly outside of the map.
-        FrameFormatError: the array is no map of depth.
+        FrameFormatError: the array is no depth map.
     """
     metres = as_metres(depth, scale)
     mask = _mask(region, metres.shape)
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
-        raise ConfigurationError(f"equalize_depth: {_told(region)} is outside of the map")
+        raise ConfigurationError(f"equalize_depth: {_described(region)} is outside of the map")
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     shown = mask[box] & (metres[box] > 0)
     picture = np.zeros(shown.shape, np.uint8)
@@ -132,7 +132,7 @@ def equalize_depth(
 
 
 def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return levels as greys from 1 to 255, with as many pixels of each grey."""
+    """Return levels as greys from 1 to 255, with equally many pixels of each grey."""
     _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
     upto = np.cumsum(counts)
     rest = upto[-1] - upto[0]
@@ -142,7 +142,7 @@ def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
     return greys[place.reshape(levels.shape)]
 
 
-def _told(region: DepthArea | None) -> str:
+def _described(region: DepthArea | None) -> str:
     if region is None:
         return "the map"
     given = np.asarray(region)
@@ -176,7 +176,7 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels whose middles lie in a polygon, by the even-odd rule."""
+    """Return the mask of the pixels with centres in a polygon, by the even-odd rule."""
     columns = np.arange(shape[1], dtype=float)
     rows = np.arange(shape[0], dtype=float)[:, None]
     inside = np.zeros(shape, bool)
@@ -184,6 +184,6 @@ def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np
         if y0 == y1:
             continue
         crossed = (y0 <= rows) != (y1 <= rows)
-        met = x0 + (rows - y0) * (x1 - x0) / (y1 - y0)
-        inside ^= crossed & (met <= columns)
+        crossings = x0 + (rows - y0) * (x1 - x0) / (y1 - y0)
+        inside ^= crossed & (crossings <= columns)
     return inside

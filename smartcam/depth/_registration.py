@@ -30,22 +30,21 @@ NEIGHBOURS: Final = 20
 """Number of neighbours that the plane around each point is fitted to."""
 
 MAX_STEPS: Final = 60
-MORE_STEPS: Final = 10
-"""Number of further steps after the last regular one, since the cloud may alternate between
-neighbours."""
+FURTHER_STEPS: Final = 10
+"""Number of extra steps that test convergence, since matches may alternate between neighbours."""
 
-TURN_STEP: Final = 1e-5
-SHIFT_STEP: Final = 1e-4
-"""Smaller steps count as none: in radians, and as a part of ``max_distance``."""
+MIN_TURN_STEP: Final = 1e-5
+MIN_SHIFT_STEP: Final = 1e-4
+"""Least steps that count: in radians, and as a share of ``max_distance``."""
 
-MAX_REACH_FACTOR: Final = 5.0
-"""Points farther off than this many times ``max_distance`` at the beginning take no part.
+MAX_DISTANCE_FACTOR: Final = 5.0
+"""Points that start farther off than this multiple of ``max_distance`` are left out.
 
 small-gicp takes very long to find the neighbours of points that are far away.
 """
 
-MAX_REST_SHARE: Final = 1e-3
-"""A fit has converged if :data:`MORE_STEPS` move it by less than this part of ``max_distance``."""
+MAX_FURTHER_SHARE: Final = 1e-3
+"""Largest move by :data:`FURTHER_STEPS` of a converged fit, as a share of ``max_distance``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,21 +55,20 @@ class Registration:
 
     Attributes:
         pose: :class:`~smartcam.calibration.Transform`, from source to target.
-        converged: whether the steps ended, enough of the source lies on the target, and every
+        converged: whether the iteration ended, enough of the source lies on the target, and every
             direction is determined.
-        reason: reason why it has not converged, in words; empty if it has.
+        reason: reason why the registration has not converged, in words; else empty.
         rms: RMS distance of the matched points from the target's planes, or for ``icp`` from its
             points, metres.
-        overlap: part of the source's points with a target point within ``max_distance``, 0 to 1.
+        overlap: share of the source's points with a target point within ``max_distance``, 0 to 1.
         matched: number of these points.
-        information: (6, 6), for a small turn in radians about the target's axes, of the source as
-            it was turned, and then a shift in metres: the sum of squares of how the matched
-            points' distances from the target's planes change with it. Without a unit of noise:
-            divide by a distance's variance.
-        covariance: (6, 6), of the same; None for ``icp``, whose model knows no surfaces, and where
-            a direction is not determined.
-        undetermined: (K, 6) such steps that the surfaces leave open; they move the source's points
-            by a metre in the mean.
+        information: (6, 6), J^T J of the matched points' distances from the target's planes, for a
+            small turn in radians about the target's axes, then a shift in metres. Divide it by the
+            variance of a distance to get the inverse covariance.
+        covariance: (6, 6), of the same turn and shift; None for ``icp``, which has no surfaces, and
+            if a direction is not determined.
+        undetermined: (K, 6), turns and shifts that the surfaces do not determine, scaled to move
+            the source's points by a metre on average.
     """
 
     pose: Transform
@@ -89,8 +87,8 @@ class _Neighbours(NamedTuple):
 
     moved: Array  # (M, 3), points of the source
     nearest: NDArray[np.intp]  # (M,), index of the matched point of the target
-    offsets: Array  # (M, 3), vectors from one to the other
-    arms: Array  # (M, 3), points of the source, turned, from its origin
+    offsets: Array  # (M, 3), vectors between these two points
+    arms: Array  # (M, 3), rotated vectors from the source's origin to its points
 
 
 @takes(
@@ -113,23 +111,23 @@ def register(
 ) -> Registration:
     """Return the pose of a cloud in another cloud.
 
-    The pose nearest to ``initial`` is found, which should be off by less than ``max_distance``;
-    points that are off by five times as much take no part. Python's GIL is held all the time, for
-    tenths of a second with 100,000 points: beside an event loop, run this in another process.
+    The result is the pose nearest to ``initial``, whose error should be less than ``max_distance``;
+    points with five times this error are left out. The call holds Python's GIL, for tenths of a
+    second with 100,000 points: beside an event loop, run it in another process.
 
     Args:
         source: cloud of at least 20 points.
-        target: cloud of at least 20 points, which the source is moved to.
+        target: cloud of at least 20 points that does not move.
         method: ``gicp`` from surface to surface, ``plane`` from point to surface, ``icp`` from
             point to point.
         voxel: size of the voxels that both clouds are thinned to first, metres; None: no thinning.
         max_distance: largest distance, metres, at which two points are matched.
-        initial: ``T_target_source`` to begin with, whose frames' names the pose gets; None: the
-            clouds lie almost as they should, in frames ``target`` and ``source``.
-        min_overlap: part of the source that must lie on the target.
+        initial: first estimate of ``T_target_source``, with the frames' names for the result; None:
+            the identity, between frames ``target`` and ``source``.
+        min_overlap: least share of the source that must lie on the target.
 
     Raises:
-        ConfigurationError: there is no such method, lengths that are not above 0, fewer than 20
+        ConfigurationError: an unknown method, a length that is not above 0, or fewer than 20
             points.
         MissingExtraError: the extra ``depth`` is not installed.
     """
@@ -149,7 +147,7 @@ def register(
     points, goals = clouds
     tree = load("scipy.spatial").cKDTree(goals)
     distances, _ = tree.query(
-        begin.apply(points), distance_upper_bound=MAX_REACH_FACTOR * max_distance
+        begin.apply(points), distance_upper_bound=MAX_DISTANCE_FACTOR * max_distance
     )
     near = points[np.isfinite(distances)]
     pose, ended = begin, True
@@ -175,7 +173,7 @@ def _check(method: str, max_distance: float, min_overlap: float) -> None:
 def _aligned(
     points: Array, goals: Array, begin: Transform, kind: str, reach: float
 ) -> tuple[Transform, bool]:
-    """Return the pose, and whether the steps ended; both clouds are centred for it."""
+    """Return the pose, and whether the iteration converged; both clouds are centred first."""
     gicp = load("small_gicp")
     here, there = points.mean(axis=0), goals.mean(axis=0)
     clouds = [gicp.PointCloud(points - here), gicp.PointCloud(goals - there)]
@@ -192,8 +190,8 @@ def _aligned(
             registration_type=kind,
             max_correspondence_distance=reach,
             max_iterations=most,
-            rotation_epsilon=TURN_STEP,
-            translation_epsilon=SHIFT_STEP * reach,
+            rotation_epsilon=MIN_TURN_STEP,
+            translation_epsilon=MIN_SHIFT_STEP * reach,
         )
 
     motion = np.eye(4)
@@ -203,12 +201,12 @@ def _aligned(
     motion, ended = np.asarray(found.T_target_source, np.float64), bool(found.converged)
     if np.isfinite(motion).all() and not ended:
         before = motion
-        motion = np.asarray(stepped(before, MORE_STEPS).T_target_source, np.float64)
+        motion = np.asarray(stepped(before, FURTHER_STEPS).T_target_source, np.float64)
         change = (points - here) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
-        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_REST_SHARE * reach)
+        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_FURTHER_SHARE * reach)
     if not np.isfinite(motion).all():
         return begin, False
-    # Many small turns one after the other are no rotation to the last digits.
+    # The product of many small turns is not exactly a rotation.
     left, _, right = np.linalg.svd(motion[:3, :3])
     rotation = left @ right
     translation = motion[:3, 3] - rotation @ here + there
@@ -249,7 +247,7 @@ def _judged(
         planes = planes_of(goals, tree, NEIGHBOURS, once).taken(places.reshape(-1))
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
-        reasons += [_in_words(one, match.moved - centre) for one in steps]
+        reasons += [_described(one, match.moved - centre) for one in steps]
         left_open = steps.copy()
         left_open[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
         rows = slopes(match.arms, planes.normals)
@@ -278,8 +276,8 @@ def _judged(
 def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
     """Return the covariance of a fit to planes, from its residuals.
 
-    Residuals beside the same point of the target share its error, so they are added before they are
-    squared.
+    Residuals at the same point of the target have its error in common, so they are added before
+    they are squared.
     """
     # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
     # groups as Liang and Zeger have it (1986).
@@ -292,8 +290,8 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
     return covariance
 
 
-def _in_words(step: Array, arms: Array) -> str:
-    """Describe the motion around the matched points' centre that stays undetermined."""
+def _described(step: Array, arms: Array) -> str:
+    """Describe an undetermined motion about the matched points' centre in words."""
     turn, shift = step[:3], step[3:]
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     size = np.linalg.norm(turn) * reach

@@ -1,7 +1,7 @@
-"""A table with wooden blocks, some of them black, and a camera at a robot's hand, all simulated.
+"""Simulate a table with wooden blocks, some of them black, and a camera at a robot's hand.
 
 The robot's frame: z up, the table is z = 0. The camera looks straight down. Its pictures are drawn
-ray by ray; depth has the noise, the holes and the mixed pixels of two cameras that are compared.
+ray by ray; depth has the noise, holes and mixed pixels of stereo matching.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ BLOCK: Final = (0.075, 0.025, 0.015)
 """Length, width and height of a block, metres."""
 
 SIZE: Final = (640, 480)
-"""Pixels of the camera."""
+"""Width and height of the camera's pictures, pixels."""
 
 FOCAL: Final = 600.0
-"""Pixels."""
+"""Focal length, pixels."""
 
 BASELINE: Final = 0.05
 """Metres between the two cameras that see depth."""
 
 DISPARITY_SIGMA: Final = 0.1
-"""Pixels: noise of a depth is ``Z^2 / (FOCAL * BASELINE)`` times this."""
+"""Noise of a disparity, pixels: that of a depth is ``Z^2 / (FOCAL * BASELINE)`` times as much."""
 
 CAMERA_SIGMA: Final = 2e-4
-"""Metres on each axis by which the camera's place at the hand is uncertain."""
+"""Standard deviation of the camera's place at the hand, metres on each axis."""
 
-GRIP: Final = 5e-3
-"""Metres by which the gripper may miss a block and still take it."""
+GRIP_TOLERANCE_METRES: Final = 5e-3
+"""Largest distance from a block at which the gripper still grasps it, metres."""
 
 MIN_GAP_METRES: Final = 0.01
-"""Least distance, metres, between things on the table, for a gripper and for the eye."""
+"""Least distance between objects on the table, metres, which leaves room for the gripper."""
 
 GREY_SIGMA: Final = 3.0
-"""Noise of a picture's levels."""
+"""Standard deviation of a picture's grey levels."""
 
-HOLES: Final = (0.01, 0.4)
-"""Part of the pixels without a depth: anywhere, and where it jumps."""
+HOLE_SHARES: Final = (0.01, 0.4)
+"""Share of the pixels without a depth: in all of the picture, and at jumps of the depth."""
 
-JUMP: Final = 0.004
-"""Metres of depth between two neighbouring pixels that count as a jump."""
+MIN_JUMP_METRES: Final = 0.004
+"""Least difference in depth of neighbouring pixels that counts as a jump, metres."""
 
-FINE: Final = 2
+RAYS_PER_SIDE: Final = 2
 """Number of rays along each side of a pixel."""
 
 AXES: Final = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -59,15 +59,15 @@ COLOURS: Final = {
     "black": (24.0, 23.0, 25.0),
     "table": (158.0, 168.0, 172.0),
 }
-"""Red, green and blue of each surface before the light falls on it."""
+"""Reflectance of each surface as red, green and blue."""
 
 SHADES: Final = (0.72, 0.84, 1.0)
-"""Light on the sides along the width, along the length, and on top."""
+"""Brightness of the sides along the width, along the length, and of the top."""
 
 
 @dataclass(slots=True)
 class WoodenBlock:
-    """A box that lies flat, in the robot's frame: metres and radians."""
+    """A box that lies flat; lengths in metres in the robot's frame, angles in radians."""
 
     x: float
     y: float
@@ -78,12 +78,12 @@ class WoodenBlock:
 
     @property
     def top(self) -> float:
-        """Height of its upper side, metres."""
+        """Height of the upper side, metres."""
         return self.z + self.size[2]
 
 
 class TableSight(NamedTuple):
-    """The picture and depth that the camera sees from a place."""
+    """A picture and depth maps from one place of the camera."""
 
     camera: tuple[float, float, float]  # place of the camera, metres
     rgb: NDArray[np.uint8]  # (H, W, 3)
@@ -101,22 +101,22 @@ def to_robot(
 
 
 class Grip(NamedTuple):
-    """The errors with which a gripper took a block, or a thing was found."""
+    """Errors of a grasp or of an estimated pose."""
 
-    off: float  # metres on the table, between where it was and where it was thought to be
-    turned: float  # radians: the same of its angle
+    off: float  # distance from the true place, metres
+    turned: float  # difference from the true angle, radians
 
 
 class TowerTable:
-    """The table, what lies on it, and the robot that takes it.
+    """The table, the blocks on it, and a robot with a gripper.
 
     Args:
-        seed: seed of all noise, and of how far the camera is beside where the robot thinks it is.
+        seed: seed of all noise, and of the error of the camera's place.
 
     Attributes:
-        blocks: what lies there; who builds knows nothing of it.
+        blocks: true blocks on the table, which a building program must not read.
         random: generator of all noise.
-        held: what the gripper has.
+        held: block in the gripper; None if it is empty.
     """
 
     def __init__(self, seed: int) -> None:
@@ -126,7 +126,7 @@ class TowerTable:
         self._beside = self.random.normal(0, CAMERA_SIGMA, 3)
 
     def look(self, camera: tuple[float, float, float], maps: int = 1) -> TableSight:
-        """Return a picture and so many depth maps, as seen from about a place (metres)."""
+        """Return a picture and ``maps`` depth maps from roughly the given place (metres)."""
         true = np.add(camera, self._beside)
         rays = _TableRays((float(true[0]), float(true[1]), float(true[2])))
         for block in self.blocks:
@@ -137,21 +137,21 @@ class TowerTable:
         return TableSight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
 
     def tower(self) -> list[WoodenBlock]:
-        """Return the blocks of the tower, the lowest first: of the highest stack."""
+        """Return the blocks of the highest stack, the lowest first."""
         top = max(self.blocks, key=lambda one: one.top)
         stack = [one for one in self.blocks if _apart(one, top) < BLOCK[0] / 2]
         return sorted(stack, key=lambda one: one.z)
 
     def pick(self, x: float, y: float, angle: float) -> Grip:
-        """Close the gripper at a pose on the table; a block within :data:`GRIP` is taken.
+        """Close the gripper at a pose on the table, and grasp a block within its tolerance.
 
-        Returns how far the next black block was from there; ``held`` is None if it is missed.
+        Returns the errors from the nearest black block; ``held`` is None if it is missed.
         """
         wanted = WoodenBlock(x, y, angle)
         loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]
         block = min(loose, key=lambda one: _apart(one, wanted))
         grip = Grip(_apart(block, wanted), math.remainder(angle - block.angle, math.pi))
-        if grip.off < GRIP and block.size == BLOCK:
+        if grip.off < GRIP_TOLERANCE_METRES and block.size == BLOCK:
             self.blocks.remove(block)
             c, s = math.cos(angle), math.sin(angle)
             x, y = block.x - x, block.y - y
@@ -159,7 +159,7 @@ class TowerTable:
         return grip
 
     def place(self, x: float, y: float, angle: float) -> WoodenBlock:
-        """Put what is held onto the tower, with the gripper at a pose; return how it lies there."""
+        """Put the held block onto the tower, and return it as it lies there."""
         held, self.held = self.held, None
         if held is None:
             raise ValueError("the gripper is empty")
@@ -171,20 +171,20 @@ class TowerTable:
         return held
 
     def add(self) -> None:
-        """Have a person put a wooden block onto the tower, across and not quite straight."""
+        """Add a wooden block to the tower as a person would, across and not quite straight."""
         top = self.tower()[-1]
         dx, dy = self.random.uniform(-0.004, 0.004, 2)
         angle = top.angle + math.pi / 2 + self.random.uniform(-0.15, 0.15)
         self.blocks.append(WoodenBlock(top.x + dx, top.y + dy, angle, z=top.top))
 
     def remove(self) -> None:
-        """Have a person take the highest block away."""
+        """Remove the highest block as a person would."""
         self.blocks.remove(self.tower()[-1])
 
     def _measured(self, fine: NDArray[np.float32], maps: int) -> list[NDArray[np.uint16]]:
-        """Return depth as two cameras would measure it: mixed at edges, noisy, with holes."""
+        """Return depth maps as of two cameras: mixed at edges, noisy, with holes."""
         depth = _pixels(fine)
-        middle = fine[FINE // 2 :: FINE, FINE // 2 :: FINE]
+        middle = fine[RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE, RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE]
         rough = _jumps(middle)
         hidden = _hidden(middle)
         found: list[NDArray[np.uint16]] = []
@@ -192,7 +192,7 @@ class TowerTable:
             sigma = depth**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA
             noisy = depth + sigma * self.random.standard_normal(depth.shape, np.float32)
             chance = self.random.random(depth.shape, np.float32)
-            lost = hidden | (chance < HOLES[0]) | (rough & (chance < HOLES[1]))
+            lost = hidden | (chance < HOLE_SHARES[0]) | (rough & (chance < HOLE_SHARES[1]))
             found.append(np.where(lost, 0, np.rint(1e3 * noisy)).astype(np.uint16))
         return found
 
@@ -203,10 +203,10 @@ def _apart(one: WoodenBlock, other: WoodenBlock) -> float:
 
 def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of the rays of each pixel."""
-    places = [(row, column) for row in range(FINE) for column in range(FINE)]
-    total = fine[::FINE, ::FINE].copy()
+    places = [(row, column) for row in range(RAYS_PER_SIDE) for column in range(RAYS_PER_SIDE)]
+    total = fine[::RAYS_PER_SIDE, ::RAYS_PER_SIDE].copy()
     for row, column in places[1:]:
-        total += fine[row::FINE, column::FINE]
+        total += fine[row::RAYS_PER_SIDE, column::RAYS_PER_SIDE]
     total /= len(places)
     return total
 
@@ -215,7 +215,7 @@ def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that have a neighbour beyond an edge."""
     found = np.zeros(depth.shape, bool)
     for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis)) > JUMP
+        step = np.abs(np.diff(depth, axis=axis)) > MIN_JUMP_METRES
         first, second = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         found[first] |= step
         found[second] |= step
@@ -224,7 +224,7 @@ def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that the second camera, to the right, does not see."""
-    there = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # its columns
+    there = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # columns in its picture
     nearer = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     found = np.zeros(depth.shape, bool)
     found[:, :-1] = there[:, :-1] >= nearer[:, 1:]
@@ -232,12 +232,12 @@ def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 class _TableRays:
-    """The rays of a camera; where they end has a depth and a colour."""
+    """The rays of a camera, with the depth and colour at the end of each ray."""
 
     def __init__(self, camera: tuple[float, float, float]) -> None:
-        width, height = (FINE * one for one in SIZE)
-        columns = ((np.arange(width) + 0.5) / FINE - 0.5 - SIZE[0] / 2) / FOCAL
-        rows = ((np.arange(height) + 0.5) / FINE - 0.5 - SIZE[1] / 2) / FOCAL
+        width, height = (RAYS_PER_SIDE * one for one in SIZE)
+        columns = ((np.arange(width) + 0.5) / RAYS_PER_SIDE - 0.5 - SIZE[0] / 2) / FOCAL
+        rows = ((np.arange(height) + 0.5) / RAYS_PER_SIDE - 0.5 - SIZE[1] / 2) / FOCAL
         self._camera = camera
         self._across: NDArray[np.float32] = columns.astype(np.float32)
         self._down: NDArray[np.float32] = rows.astype(np.float32)[:, None]
@@ -246,15 +246,15 @@ class _TableRays:
         self.colour[:] = COLOURS["table"]
 
     def picture(self) -> NDArray[np.float32]:
-        """Return the picture of the colours under the light, (H, W, 3)."""
+        """Return the shaded picture, (H, W, 3)."""
         seen = _pixels(self.colour)
         x, y, z = self._camera
-        light = 1.0 + 0.5 * (x - 0.4 - self._down[::FINE] * z)
-        seen *= (light - 0.7 * (y - self._across[::FINE] * z))[..., None]
+        light = 1.0 + 0.5 * (x - 0.4 - self._down[::RAYS_PER_SIDE] * z)
+        seen *= (light - 0.7 * (y - self._across[::RAYS_PER_SIDE] * z))[..., None]
         return seen
 
     def draw(self, block: WoodenBlock) -> None:
-        """Draw a block where it is nearer than what is there: three slabs, seen from its frame."""
+        """Draw a block where it is nearer than the scene so far, by the slab method."""
         box = self._box_of(block)
         across, down = self._across[box[1]], self._down[box[0]]
         shape = np.broadcast_shapes(across.shape, down.shape)
@@ -282,7 +282,7 @@ class _TableRays:
         self.colour[box][hit] = shade[hit][:, None] * np.asarray(COLOURS[block.colour], np.float32)
 
     def _box_of(self, block: WoodenBlock) -> tuple[slice, slice]:
-        """Return the rows and columns in which it is."""
+        """Return the rows and columns that the block covers."""
         reach = math.hypot(*block.size[:2]) / 2
         off_x, off_y = block.x - self._camera[0], block.y - self._camera[1]
         lows: list[int] = []
@@ -293,8 +293,8 @@ class _TableRays:
                 for sign in (-1, 1)
                 for z in (block.z, block.top)
             ]
-            lows.append(max(0, FINE * (math.floor(min(ends)) - 1)))
-            highs.append(max(0, FINE * (math.ceil(max(ends)) + 2)))
+            lows.append(max(0, RAYS_PER_SIDE * (math.floor(min(ends)) - 1)))
+            highs.append(max(0, RAYS_PER_SIDE * (math.ceil(max(ends)) + 2)))
         return slice(lows[0], highs[0]), slice(lows[1], highs[1])
 
 
@@ -302,10 +302,10 @@ class _TableRays:
 
 
 def laid(seed: int, supply: int = 5) -> TowerTable:
-    """Return a table with a tower of two wooden blocks and things that lie about.
+    """Return a table with a tower of two wooden blocks and other objects around it.
 
-    ``supply``: black blocks that a robot at (0, 0) reaches. One more is too far for it, two black
-    things are no blocks, and three blocks are wooden.
+    ``supply``: number of black blocks within reach of a robot at (0, 0). One more is out of reach,
+    two black objects are no blocks, and three blocks are wooden.
     """
     table = TowerTable(seed)
     random = table.random
@@ -322,9 +322,9 @@ def laid(seed: int, supply: int = 5) -> TowerTable:
 
 
 def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
-    """Return a thing that lies where there is room for a gripper, and within a robot's reach.
+    """Return an object at a random place with room for a gripper, within the robot's reach.
 
-    Nor does it lie where the tower, when it is high, hides it from a camera above the middle.
+    A high tower must not hide the place from a camera above the middle.
     """
     tower = table.blocks[0]
     for _ in range(100_000):

@@ -1,4 +1,4 @@
-"""Use two cameras as one that measures depth."""
+"""Measure depth with two cameras."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import GroupStatistics
     from smartcam.geometry import CameraModel
 
-SEARCHED: Final = 5
-"""By default, disparities are searched up to the width divided by this."""
+WIDTH_TO_DISPARITIES: Final = 5
+"""Ratio of the picture's width to the default range of disparities."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,8 +44,8 @@ class DepthFrame:
         depth: (H, W), float32, metres along the optical axis; 0 where it is unknown.
         sigma: (H, W), float32, standard deviation of ``depth``, metres; NaN where it is unknown.
         disparity: (H, W), float32, pixels; NaN where it is unknown.
-        left: the rectified left picture, uint8: (H, W), or, red first, (H, W, 3); 0 where it has
-            no source.
+        left: the rectified left picture, uint8: (H, W), or, red first, (H, W, 3); 0 outside of the
+            camera's picture.
         camera_info: lens of the rectified left camera, without distortion.
         baseline: metres between the cameras.
         captured: time of the left frame's capture, seconds of ``time.monotonic()``.
@@ -68,10 +68,10 @@ class DepthFrame:
 
 @dataclass(frozen=True, slots=True)
 class StereoStatistics:
-    """The counts of a pair's frames, and the difference of its clocks.
+    """Counts of a pair's frames, and the difference of its clocks.
 
     Attributes:
-        group: statistics of the frames' pairing; its ``skew`` is the largest.
+        group: statistics of the frames' pairing; its ``skew`` is the largest skew.
         skew: seconds by which the right frames are later: the median of the last pairs; None: no
             pair came yet.
         drift: rate by which the right camera's clock is faster than the left one's, seconds per
@@ -96,8 +96,8 @@ class StereoDepth:
             async for frame in cameras:
                 frame.depth, frame.sigma, frame.skew
 
-    The frames may have any size of the calibrated shape, and any format with brightness. They are
-    paired by when they were captured. Matching runs in a thread, on demand: a slow reader skips
+    The frames may have any size of the calibrated aspect ratio, and any format with brightness.
+    They are paired by capture time. Matching runs in a thread, on demand: a slow reader skips
     pairs, and never lags.
 
     Args:
@@ -106,18 +106,18 @@ class StereoDepth:
         right: source of the right camera.
         calibration: calibration of the pair: smartcam's own, or one from :func:`read_camera_infos`
             or from ``smartcam.calibration.formats.read_cameras`` with two cameras.
-        matcher: None: ``sgbm`` for disparities up to a fifth of the width.
-        size: width and height of the rectified pictures, pixels; None: as the left one was
-            calibrated.
-        alpha: 0 to 1, from no invalid pixels to no lost ones.
+        matcher: matcher of the pictures; None: ``sgbm`` for disparities up to a fifth of the width.
+        size: width and height of the rectified pictures, pixels; None: the size of the left
+            calibration.
+        alpha: part of the pictures that is kept: 0: only valid pixels; 1: all source pixels.
         colour: whether :attr:`DepthFrame.left` is in colour.
         focal_sigma: standard deviation of the focal length, pixels of the calibrated left picture;
-            a calibration of a pair has only that of the cameras' poses.
+            a calibration of a pair has only the uncertainty of the poses.
         within: largest skew, seconds; None: half of the time between two frames.
         timeout: seconds that an iteration waits for a pair; None: without limit.
 
     Raises:
-        ConfigurationError: a value that is not valid, or no calibration of two cameras.
+        ConfigurationError: a value that is not valid, or a calibration of other than two cameras.
     """
 
     @takes(size=or_none(a_list), alpha=a_number, colour=check_flag, focal_sigma=a_number)
@@ -162,7 +162,7 @@ class StereoDepth:
         self._closed = False
 
     async def __aenter__(self) -> Self:
-        """Make the maps, and open both cameras; they do not stream yet.
+        """Compute the rectification maps, and open both cameras; they do not stream yet.
 
         Raises:
             CalibrationError: the rectified pictures would be empty.
@@ -191,7 +191,7 @@ class StereoDepth:
     async def close(self) -> None:
         """Close both cameras and end the thread. Idempotent.
 
-        Cancellation: as of :meth:`FrameSource.close`; the thread ends nevertheless.
+        Cancellation: as in :meth:`FrameSource.close`; the thread ends nevertheless.
         """
         self._closed = True
         try:
@@ -230,7 +230,7 @@ class StereoDepth:
         return pair.focal * pair.baseline / max(matcher.nearest, 1)
 
     def statistics(self) -> StereoStatistics:
-        """Return the account as it is now."""
+        """Return the current statistics."""
         sources = self._group.sources
         clocks = [sources[name].statistics().clock for name in ("left", "right")]
         skew = self._clock.skew()
@@ -244,12 +244,12 @@ class StereoDepth:
 
         Raises:
             FrameTimeoutError: no pair came in time.
-            FrameFormatError: a frame is cut, or has no brightness; the next one may have.
+            FrameFormatError: a frame is cut, or has no brightness; later frames may be good.
             FrameSourceError: a camera ended with an error.
             LocalProtocolError: the pair is not open.
 
-        Cancellation: safe; a pair that is being matched is thrown away, and the next call waits for
-        the end of that before it takes the newest pair.
+        Cancellation: safe; the pair that is being matched is dropped. The next call waits until
+        matching ends, then uses the newest pair.
         """
         worker, pair, matcher = self._opened()
         await worker.idle()
@@ -265,7 +265,7 @@ class StereoDepth:
 
 def _default_matcher(width: int) -> StereoMatcher:
     return StereoMatcher(
-        num_disparities=min(MAX_DISPARITIES, 16 * math.ceil(width / SEARCHED / 16))
+        num_disparities=min(MAX_DISPARITIES, 16 * math.ceil(width / WIDTH_TO_DISPARITIES / 16))
     )
 
 
@@ -298,7 +298,7 @@ def _depth(
 
 
 def _bytes(frame: Frame, pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return pixels of more than 8 bits by their 8 highest."""
+    """Return pixels as uint8: of more bits, the 8 highest."""
     if pixels.dtype == np.uint8:
         return pixels
     return (pixels >> (frame.format.depth - 8)).astype(np.uint8)

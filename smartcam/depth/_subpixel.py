@@ -1,4 +1,4 @@
-"""Refine disparities to parts of a pixel by least squares, with their sigma."""
+"""Refine disparities to subpixel precision by least squares, with their sigma."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ MIN_FILLED_SHARE: Final = 0.5
 """Least share of a window's pixels that must have disparities."""
 
 HOLE_MARGIN_PX: Final = 2
-"""Within this distance from a hole, pixels, nothing is refined."""
+"""Distance from a hole, pixels, within which disparities are not refined."""
 
 MIN_VARIANCE: Final = 1 / 6
 """Least variance of the difference of two pictures, whose grey levels are whole numbers."""
 
 MAX_INLIER_SIGMAS: Final = 4.0
-"""Standard deviations of a pixel's noise above which its difference does not count."""
+"""Difference above which a pixel is an outlier, in standard deviations of its noise."""
 
 MIDDLE_GREY: Final = 128
 """Grey level that is subtracted, so that squares keep their precision."""
@@ -78,8 +78,8 @@ def refined(
     plane = _plane(start, known, sums)
     smooth = (plane.rough <= MAX_ROUGHNESS_PX) & (plane.pixels >= MIN_FILLED_SHARE * window**2)
     smooth &= _whole_around(known)
-    # near an edge of depth a coarse value may be that of its other side
-    told = np.fmax(sigma, plane.rough)
+    # near an edge, a coarse value may belong to the other side of the edge
+    found_sigma = np.fmax(sigma, plane.rough)
     found, usable = start, known
     fit = _fitted(_linearized(pictures, found, known), found, None, plane, sums)
     for step in range(MAX_GAUSS_NEWTON_STEPS):
@@ -99,20 +99,20 @@ def refined(
         found = np.where(usable, fit.disparity, start)
         if last:
             break
-    told = np.where(usable, fit.sigma, told)
+    found_sigma = np.where(usable, fit.sigma, found_sigma)
     found[~known] = np.nan
-    told[~known] = np.nan
-    return found.astype(np.float32, copy=False), told.astype(np.float32, copy=False)
+    found_sigma[~known] = np.nan
+    return found.astype(np.float32, copy=False), found_sigma.astype(np.float32, copy=False)
 
 
 def _moved(fit: _Refined, before: Field, usable: NDArray[np.bool_]) -> float:
-    """Return the RMS movement of the usable disparities by a step, in sigmas."""
+    """Return the RMS change of the usable disparities by a step, in sigmas."""
     moves = (fit.disparity - before)[usable] / fit.sigma[usable]
     return float(np.sqrt((moves**2).mean())) if len(moves) else 0.0
 
 
 def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels without a hole nearby, as there is behind a near edge."""
+    """Return the mask of the pixels without a hole nearby, as at edges of near objects."""
     around = np.ones((2 * HOLE_MARGIN_PX + 1, 2 * HOLE_MARGIN_PX + 1), np.uint8)
     return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
 
@@ -149,7 +149,7 @@ class _DisparityPlane(NamedTuple):
 
 def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
     mask = known.astype(np.float32)
-    # kept near 0, so that the squares below keep their precision
+    # values near 0 keep the precision of the squares below
     values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
     count = np.maximum(sums(mask), 1)
     total = sums(values)
@@ -167,12 +167,12 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _Di
 
 
 class _LinearMatch(NamedTuple):
-    """The difference of the pictures and its slope by disparity; 0 where they are unknown."""
+    """The difference of the pictures and its slope by disparity; 0 if unknown."""
 
     e: Field  # left minus right picture, grey levels
     g: Field  # slope of both, grey levels per pixel
     r: Field  # right picture, grey levels about the middle of their range
-    mask: Field  # 1 where they are known, else 0
+    mask: Field  # 1 where the other fields are known, else 0
 
 
 def _linearized(
@@ -190,7 +190,7 @@ def _linearized(
 
 
 class _Refined(NamedTuple):
-    """All (H, W); the sigma is infinite where there is no texture."""
+    """Refined disparities, all (H, W); the sigma is infinite without texture."""
 
     disparity: Field  # disparities, pixels
     sigma: Field  # sigma from uncorrelated noise, pixels
@@ -201,7 +201,7 @@ class _Refined(NamedTuple):
 
 
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
-    """Return the equations without pixels of another surface, whose disparity is far off."""
+    """Return the equations without outliers, such as pixels of another surface."""
     fits = np.abs(linear.e - fit.expected) <= MAX_INLIER_SIGMAS * np.sqrt(fit.variance)
     return _LinearMatch(*(one * fits for one in linear))
 
@@ -238,11 +238,11 @@ def _fitted(
     se = sums(e_)
     see, sre = sums(e_ * e) - se * se / m, sums(e_ * level) - st * se / m
     srr = np.maximum(srr - st * st / m, 0)
-    # the uncertainty of the gain beforehand, as an additional variance of R
-    held = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
-    gain = sre / (srr + held)
+    # the prior uncertainty of the gain, as an additional variance of R
+    gain_weight = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
+    gain = sre / (srr + gain_weight)
     variance = np.maximum((see - gain * sre) / np.maximum(m - 3, 1), MIN_VARIANCE)
-    rr = np.maximum(mean - sr * sr / n, 0) + held
+    rr = np.maximum(mean - sr * sr / n, 0) + gain_weight
     gr = sums(rg) - sg * sr / n
     curvature = sums(gg) - sg * sg / n - gr * gr / rr
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
@@ -278,7 +278,7 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
         for one in others:
             weight *= factors[one]
         value += weight
-    # central differences, as those of the left picture, and linear between
+    # central differences as in the left picture, with linear interpolation
     slope = (1 - t) * (pixels[3] - pixels[1]) / 2 + t * (pixels[4] - pixels[2]) / 2
     return value, slope
 
@@ -286,15 +286,15 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
 def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     """Return the factor by which the neighbours' correlation changes the variance of sums of g e.
 
-    It is 1 without correlation. A rectified picture has some, since its pixels share those of the
-    source.
+    The factor is 1 without correlation. Pixels of a rectified picture are correlated, since
+    neighbours use the same source pixels.
     """
     # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge, as of normal values: Isserlis, On a
     # formula for the product-moment coefficient (1918). Of white noise only lag 0 is there. Where
     # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
-    # one constant and gain for the whole picture: those of windows would take noise with them
+    # one constant and gain for the whole picture, since those of windows would absorb noise
     level = (fit.linear.r - (fit.linear.r * mask).sum() / np.maximum(mask.sum(), 1)) * mask
     e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
     e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))

@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-ROWS: Final = 1 << 15
-"""Number of points at a time; the neighbours of each are in memory."""
+POINTS_AT_A_TIME: Final = 1 << 15
+"""Number of points whose neighbours are in memory at a time."""
 
 MIN_INFORMATION_FACTOR: Final = 12.0
-"""Factor by which a direction's information must exceed that from noise of the normals alone.
+"""Least ratio of a direction's information to that from noise of the normals alone.
 
-Along what planes, edges and corridors leave open it is 0.8 to 1.4, whatever the noise; along what
-cylinders and spheres leave open up to 11, since they are no planes; in a corner 29 and more.
+On simulated clouds the ratio is 0.8 to 1.4 for the free directions of planes, edges and corridors,
+up to 11 for those of cylinders and spheres, and 29 or more in a corner.
 """
 
 
 class SurfacePlanes(NamedTuple):
-    """The planes about points.
+    """Planes fitted around points.
 
     Attributes:
         normals: (N, 3), of length 1.
@@ -43,23 +43,23 @@ class SurfacePlanes(NamedTuple):
 
 
 def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
-    """Return the planes about points of an index: through their nearest, themselves among them.
+    """Fit a plane around each point of an index, through its nearest points and itself.
 
     ``tree``: search tree of all points.
     """
     found = []
-    for start in range(0, len(index), ROWS):
-        _, nearest = tree.query(points[index[start : start + ROWS]], k=neighbours)
+    for start in range(0, len(index), POINTS_AT_A_TIME):
+        _, nearest = tree.query(points[index[start : start + POINTS_AT_A_TIME]], k=neighbours)
         found.append(_fitted(points[nearest]))
     return SurfacePlanes(*(np.concatenate(one) for one in zip(*found, strict=True)))
 
 
 def _fitted(groups: Array) -> SurfacePlanes:
-    """Return planes through groups (N, K, 3) of points."""
+    """Fit planes through groups (N, K, 3) of points."""
     offsets = groups - groups.mean(axis=1, keepdims=True)
     spreads = offsets.transpose(0, 2, 1) @ offsets / groups.shape[1]
     values, vectors = np.linalg.eigh(spreads)
-    # An eigenvector turns towards another by noise of variance l0 l1 / (K (l1 - l0)^2).
+    # Noise turns an eigenvector towards another with variance l0 l1 / (K (l1 - l0)^2).
     # Source: Anderson, Asymptotic theory for principal component analysis (1963).
     apart = np.maximum((values[:, 1:] - values[:, :1]) ** 2, np.finfo(float).tiny)
     tilts = values[:, :1] * values[:, 1:] / (groups.shape[1] * apart)
@@ -67,7 +67,7 @@ def _fitted(groups: Array) -> SurfacePlanes:
 
 
 def slopes(arms: Array, directions: Array) -> Array:
-    """Return the derivatives (N, 6) of shifts along directions (N, 3), turn before shift.
+    """Return the derivatives (N, 6) of displacements along directions (N, 3) by turn and shift.
 
     ``arms`` (N, 3): vectors to the points from the centre of the turn.
     """
@@ -75,10 +75,10 @@ def slopes(arms: Array, directions: Array) -> Array:
 
 
 def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
-    """Return the steps (K, 6), turn in radians and shift in metres, that planes leave open.
+    """Return the steps (K, 6), turn in radians and shift in metres, that planes do not determine.
 
     ``arms`` (N, 3): vectors to the points on the planes from their centre, about which the steps
-    turn. Each step moves the points by one metre in the mean.
+    turn. Each step moves the points by one metre on average.
     """
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     scaled = arms / reach
@@ -88,11 +88,11 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     for axis in range(2):
         part = slopes(scaled, planes.along[:, :, axis]) * np.sqrt(planes.tilts[:, axis, None])
         noise += part.T @ part
-    # Rounding to float32 is noise, too: a flat cloud without any has no tilts.
+    # Rounding to float32 is noise, too: without it, a flat cloud would have no tilts.
     noise += 1e-7 * np.trace(information) * np.eye(6)
     ratios, steps = load("scipy.linalg").eigh(information, noise)
     basis, _ = np.linalg.qr(steps[:, ratios < MIN_INFORMATION_FACTOR])
-    # Any mixture of open steps is open: turns come first, then shifts, which have no turn.
+    # Any combination of undetermined steps is undetermined: return turns first, then pure shifts.
     apart, _, _ = np.linalg.svd(basis.T[:, :3])
     found: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
     return found

@@ -1,4 +1,4 @@
-"""Rows of numbers in files: as bytes and as text."""
+"""Read and write rows of numbers in files, as bytes and as text."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ MAX_ROW_BYTES: Final = 1 << 12
 """Largest number of bytes of a row."""
 
 MAX_LINE_BYTES: Final = 1 << 20
-"""Largest number of bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
+"""Largest number of bytes of a line of text, which leaves room for digits and spaces."""
 
-WORDS: Final = 1 << 18
-"""Numbers of text at a time; each is an object in memory for a while."""
+NUMBERS_AT_A_TIME: Final = 1 << 18
+"""Number of text items that are parsed at a time, which bounds the memory."""
 
 
 class BadTableError(Exception):
-    """Error for bytes that do not fit; the caller, which knows the file's name, translates it."""
+    """Error in a file's content; the caller adds the file's name."""
 
     def __init__(self, expected: str, came: str) -> None:
         super().__init__(f"expected {expected}, got {came}")
 
 
 def shown(data: bytes | str) -> str:
-    """Return the beginning of what came, quoted for an error; at most a line."""
+    """Return the beginning of wrong data in quotes, for an error text of one line."""
     text = data.decode("ascii", "backslashreplace") if isinstance(data, bytes) else data
     return repr(text if len(text) <= 60 else f"{text[:60]}...")
 
 
 def header_line(data: bytes, start: int) -> tuple[str, int]:
-    """Return a header's line and where the next one begins; it ends in LF, or CR LF."""
+    """Return a line of the header, without LF or CR LF, and the offset of the next line."""
     end = data.find(b"\n", start, MAX_HEADER_BYTES)
     if end < 0:
         raise BadTableError(
@@ -57,7 +57,7 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
 
 
 def count_of(text: str, what: str) -> int:
-    """Return a count; else BadTableError."""
+    """Return a count from text; raise BadTableError if the text is no count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
         _fail(f"a number of {what}", text)
     return int(text)
@@ -68,13 +68,13 @@ def _fail(expected: str, came: bytes | str) -> NoReturn:
 
 
 def check_row(row: np.dtype[Any]) -> None:
-    """Check that rows are not too long, since each is in memory."""
+    """Raise BadTableError if rows are too long."""
     if row.itemsize > MAX_ROW_BYTES:
         raise BadTableError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row.itemsize}")
 
 
 def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArray[Any]:
-    """Return so many rows from a place on; what comes behind them is not looked at."""
+    """Return ``count`` rows from the offset ``start``; bytes after them are ignored."""
     there = len(data) - start
     if count * row.itemsize > there:
         raise BadTableError(
@@ -86,9 +86,9 @@ def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArr
 def from_text(
     data: bytes, start: int, skipped: int, count: int, types: Sequence[np.dtype[Any]]
 ) -> tuple[NDArray[Any], ...]:
-    """Return columns of so many lines of numbers, after some that are skipped.
+    """Return the columns of ``count`` lines of numbers, after ``skipped`` lines.
 
-    Numbers of whole types must be whole, and fit.
+    Numbers for integer types must be whole and in range.
     """
     check_row(np.dtype([(str(place), one) for place, one in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
@@ -97,7 +97,7 @@ def from_text(
     done, place, left = 0, start, skipped
     while done < count:
         lines: list[list[bytes]] = []
-        while len(lines) < min(WORDS // len(types), count - done):
+        while len(lines) < min(NUMBERS_AT_A_TIME // len(types), count - done):
             if place >= len(data):
                 raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
             end = data.find(b"\n", place)
@@ -134,7 +134,7 @@ def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
 
 
 def to_text(columns: Iterable[NDArray[Any]]) -> bytes:
-    """Return columns as lines; floats so that float32 is the same when it is read."""
+    """Return columns as lines of text; float32 values are exact when read again."""
     words = [
         [f"{value:.9g}" for value in column.tolist()]
         if column.dtype.kind == "f"

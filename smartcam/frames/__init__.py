@@ -1,4 +1,4 @@
-"""Pictures of any camera, the newest first.
+"""Read the pictures of any camera; readers get the newest.
 
 ::
 
@@ -6,9 +6,8 @@
         async for frame in source:
             show(frame.grey())
 
-A source streams only while somebody reads. A slow reader gets the newest frame, with the number of
-frames that it skipped and of those that were lost on the way. The extra ``frames`` brings the
-codecs.
+A source streams only while it has readers. A slow reader gets the newest frame, with counts of
+skipped and lost frames. The extra ``frames`` installs the codecs.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ class FrameAddress:
     """The parts of the URL of a frame source.
 
     Attributes:
-        url: URL as it was given.
+        url: original URL.
         scheme: part of the URL before ``://``, in lower case; ``file`` for a bare path.
         host: name or address; "" if the URL has none.
         port: port; None: the default of the scheme.
@@ -80,33 +80,31 @@ class FrameAddress:
         """Return the URL without the password."""
         return f"FrameAddress({self.shown!r})"
 
-    def parameters(self, known: Sequence[str], said_in: str | None = None) -> dict[str, str]:
+    def parameters(self, known: Sequence[str], part: str | None = None) -> dict[str, str]:
         """Return the parameters in the query, or in another part of the URL.
 
         Raises:
             ConfigurationError: a parameter is unknown, or given twice.
         """
-        said: dict[str, str] = {}
-        for name, value in parse_qsl(
-            self.query if said_in is None else said_in, keep_blank_values=True
-        ):
+        found: dict[str, str] = {}
+        for name, value in parse_qsl(self.query if part is None else part, keep_blank_values=True):
             if name not in known:
                 raise ConfigurationError(
                     f"frame source {self.shown!r}: unknown parameter {name!r}; known are "
                     f"{', '.join(known)}{did_you_mean(name, known)}"
                 )
-            if name in said:
+            if name in found:
                 raise ConfigurationError(
-                    f"frame source {self.shown!r}: parameter {name!r} stands there twice"
+                    f"frame source {self.shown!r}: parameter {name!r} is given twice"
                 )
-            said[name] = value
-        return said
+            found[name] = value
+        return found
 
     def size(self, text: str) -> tuple[int, int]:
-        """Return ``WIDTHxHEIGHT`` as two numbers.
+        """Parse ``WIDTHxHEIGHT``.
 
         Raises:
-            ConfigurationError: the text is something else.
+            ConfigurationError: the text has another form.
         """
         found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
         if found is None:

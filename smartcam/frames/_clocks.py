@@ -6,23 +6,23 @@ import collections
 from dataclasses import dataclass
 from typing import Final
 
-WINDOW: Final = 40
-"""Number of intervals of time that are remembered."""
+MAX_INTERVALS: Final = 40
+"""Largest number of intervals that are kept."""
 
-PIECE_DURATION: Final = 0.5
-"""Seconds of one interval; of its frames only the one with the shortest delay counts."""
+INTERVAL_DURATION: Final = 0.5
+"""Seconds of one interval, of which only the frame with the shortest delay is kept."""
 
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
-"""The clock has jumped if a frame comes this many seconds sooner than the clock allows."""
+"""Seconds by which a frame comes too early for its clock after a jump of the clock."""
 
 MIN_SURE_INTERVALS: Final = 4
-"""Number of intervals after which such a jump is certain: before, all frames may have been late."""
+"""Number of intervals after which such a jump is certain: earlier, all frames may be late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
-"""Seconds of frames needed to measure a drift."""
+"""Least duration of frames, seconds, to measure a drift."""
 
 MAX_DRIFT: Final = 0.01
-"""Largest drift that is followed; a clock with a larger one counts in another unit."""
+"""Largest plausible drift; a clock with a larger drift counts in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,26 +41,26 @@ class ClockStatistics:
 class DeviceClock:
     """The offset of a device's clock from the host's, estimated from the arrival of its frames.
 
-    A frame arrives after it was taken, with a delay that varies. So arrival minus device time has a
-    lower edge, which is the offset between the clocks plus the shortest delay; its slope is the
-    drift. The estimated time is late by the shortest delay, and by nothing else.
+    A frame arrives with a varying delay. So arrival minus device time has a lower edge: the offset
+    between the clocks plus the shortest delay; its slope is the drift. The estimated time is late
+    by the shortest delay only.
 
-    If all frames come late, they have waited somewhere, for however long: the offset rises no
-    faster than a clock can drift. A clock that was set back by less than the time between two
-    frames looks the same; its frames count as older than they are until the offset has adapted.
+    The offset rises no faster than a clock can drift, so a queue that delays all frames does not
+    change it. A clock that was set back by less than the time between two frames looks like a
+    queue; its frames count as too old until the offset has adapted.
 
     Attributes:
         jumps: number of times that the clock was set anew.
     """
 
     def __init__(self) -> None:
-        self._lowest: collections.deque[tuple[float, float]] = collections.deque(maxlen=WINDOW)
+        self._lowest = collections.deque[tuple[float, float]](maxlen=MAX_INTERVALS)
         self._drift: float | None = None
-        self._edge = (0.0, 0.0)  # the one of them that the lower edge goes through
+        self._edge = (0.0, 0.0)  # point on the lower edge
         self._last: float | None = None
         self._piece_began = 0.0
-        self._held: float | None = None  # the offset at the last frame
-        self._before_queue: float | None = None  # the offset before frames were delayed
+        self._last_offset: float | None = None  # offset at the last frame
+        self._before_queue: float | None = None  # offset before frames were delayed
         self.jumps = 0
 
     def statistics(self) -> ClockStatistics:
@@ -79,17 +79,17 @@ class DeviceClock:
         if self._jumped(device, arrival):
             self.jumps += 1
             self._lowest.clear()
-            self._drift = self._held = self._before_queue = None
+            self._drift = self._last_offset = self._before_queue = None
         self._remember(device, arrival - device)
         offset = self._offset(device)
-        if self._held is not None and self._last is not None:
-            highest = self._held + MAX_DRIFT * (device - self._last)
+        if self._last_offset is not None and self._last is not None:
+            highest = self._last_offset + MAX_DRIFT * (device - self._last)
             if offset <= highest:
                 self._before_queue = None
             elif self._before_queue is None:
-                self._before_queue = self._held
+                self._before_queue = self._last_offset
             offset = min(offset, highest)
-        self._held, self._last = offset, device
+        self._last_offset, self._last = offset, device
         return min(arrival, device + offset)
 
     def _jumped(self, device: float, arrival: float) -> bool:
@@ -98,12 +98,12 @@ class DeviceClock:
         if device < self._last:
             return True
         late = arrival - device - self._offset(device)
-        if self._before_queue is not None:  # frames come without delay again
+        if self._before_queue is not None:  # the delay has ended
             late = max(late, arrival - device - self._before_queue)
         return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= MIN_SURE_INTERVALS
 
     def _remember(self, device: float, offset: float) -> None:
-        if not self._lowest or device - self._piece_began >= PIECE_DURATION:
+        if not self._lowest or device - self._piece_began >= INTERVAL_DURATION:
             self._piece_began = device
             self._lowest.append((device, offset))
         elif offset < self._lowest[-1][1]:
@@ -120,7 +120,7 @@ class DeviceClock:
             return None
         half = len(points) // 2
         first, second = _lowest(points[:half], 0.0), _lowest(points[half:], 0.0)
-        for _ in range(3):  # the same again, with the slope subtracted
+        for _ in range(3):  # iterate with the slope subtracted
             slope = _slope(first, second)
             first = _lowest(points[:half], slope)
             second = _lowest(points[half:], slope)
@@ -137,5 +137,5 @@ def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:
 
 
 def _lowest(points: list[tuple[float, float]], slope: float) -> tuple[float, float]:
-    """Return the point that a line of a slope, raised from below, meets first."""
+    """Return the lowest point relative to a line of the given slope."""
     return min(points, key=lambda one: one[1] - slope * one[0])

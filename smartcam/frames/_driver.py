@@ -48,7 +48,7 @@ class FoundSource:
 
     Attributes:
         url: URL that opens it.
-        name: name for people.
+        name: display name.
         formats: formats that it can stream.
         remark: reason why it cannot be opened, or "".
     """
@@ -64,7 +64,7 @@ class FrameSink(ABC):
 
     @abstractmethod
     def frame(self, frame: Frame) -> None:
-        """Take a frame; ``frame.lost`` is the number of frames lost before it."""
+        """Receive a frame; ``frame.lost`` is the number of frames lost before it."""
 
     @abstractmethod
     def lost(self, count: int) -> None:
@@ -101,10 +101,10 @@ class FrameDriver(ABC):
     Attributes:
         times_frames: whether ``captured`` of its frames is on the host's clock even if they have a
             ``device_time``; else the source computes it.
-        lists_features: whether its device tells which features it has, if it has any.
+        lists_features: whether its device can list its features.
         form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
-        waits_for: condition that the device waits for before each picture, for errors, such as
-            ``TriggerSource is Line1``; ``""``: it streams by itself. A waiting device is never
+        waits_for: condition that the device awaits before each picture, for error texts, such as
+            ``TriggerSource is Line1``; ``""``: the device streams freely. A waiting device is never
             considered stuck.
     """
 
@@ -144,18 +144,18 @@ class FrameDriver(ABC):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the device report events; return the coroutine function that stops that.
+        """Start reports of the device's events; return the coroutine function that stops them.
 
         Args:
             names: names of the events.
-            take: function that takes each event.
+            take: function that is called with each event.
             ended: function that is called when no more events will come.
 
         Raises:
             UnsupportedError: devices of this kind report no events.
             FrameSourceError: the device has no such event.
         """
-        raise UnsupportedError(f"{self.name}: a source of this kind tells no events")
+        raise UnsupportedError(f"{self.name}: a source of this kind reports no events")
 
     async def trigger(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
@@ -182,7 +182,7 @@ class FrameDriver(ABC):
         )
 
     async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
-        """Have the device's owner trigger it, and return the picture that this caused.
+        """Trigger the device by the process that owns it, and return the picture.
 
         Args:
             timeout: seconds for the whole call.
@@ -236,7 +236,7 @@ class TaskDriver(FrameDriver):
         """Hand frames to the sink until the task is cancelled."""
 
     async def start(self, sink: FrameSink) -> None:
-        """Begin to deliver."""
+        """Start the task."""
         self._task = asyncio.create_task(self.deliver(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:
@@ -247,5 +247,5 @@ class TaskDriver(FrameDriver):
             await asyncio.wait([task])
 
     async def close(self) -> None:
-        """Stop, if frames are still delivered."""
+        """Stop the task if it is running."""
         await self.stop()

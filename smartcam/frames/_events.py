@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_EVENTS = 100_000
 
 MAX_EVENT_NAMES = 64
-"""A reader may ask for at most this many kinds of events."""
+"""Largest number of kinds of events of one reader."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class FrameEvents:
         self._over: tuple[FrameSourceError | None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Have the device report its events from now on.
+        """Start reports of the device's events.
 
         Raises:
             UnsupportedError: a source of this kind reports no events.
@@ -99,7 +99,7 @@ class FrameEvents:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Switch the events off, unless somebody else reads them."""
+        """Switch the events off, unless another reader uses them."""
         end, self._end = self._end, None
         self._ended(None)
         if end is not None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
 FeatureValue: TypeAlias = "bool | int | float | str"
-"""Value of a feature; of an enumeration it is the name of the entry."""
+"""Value of a feature; for an enumeration, the name of the entry."""
 
 FeatureKind: TypeAlias = Literal["integer", "float", "boolean", "enumeration", "string", "command"]
 
@@ -30,7 +30,7 @@ FEATURE_TIMEOUT: Final = 10.0
 MAX_FEATURE_TIMEOUT: Final = 3600.0
 
 MAX_VALUE_LENGTH: Final = 4096
-"""The name or the text of a feature has at most this many characters."""
+"""Largest number of characters of a feature's name or text value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +40,17 @@ class Feature:
     Attributes:
         name: name of the feature, mostly one of GenICam's SFNC, such as ``ExposureTime``.
         kind: kind of the feature.
-        access: ``rw``, ``ro`` or ``wo``; ``""``: it is not available now; that may depend on
-            another feature.
-        value: value of the feature; None: it cannot be read now, or is a command.
-        minimum: smallest value; None: no number, or not known.
-        maximum: largest value; None: no number, or not known.
-        step: difference between two neighbouring values; None: no number, or there are no steps.
-        unit: unit of the value, such as ``us``; ``""``: it has none.
-        entries: values, by name, that an enumeration can have now.
+        access: ``rw``, ``ro`` or ``wo``; ``""``: not available now, which may depend on another
+            feature.
+        value: value of the feature; None: not readable now, or a command.
+        minimum: smallest value; None: no number, or unknown.
+        maximum: largest value; None: no number, or unknown.
+        step: difference between two neighbouring values; None: no number, or no steps.
+        unit: unit of the value, such as ``us``; ``""``: no unit.
+        entries: names of the values that an enumeration can have now.
         selectors: features that select the instance of this one, such as ``TriggerSelector``.
-        description: text of the device's maker.
-        problem: reason why value or range could not be read; ``""``: they were read.
+        description: text by the device's maker.
+        problem: reason why value or range could not be read; ``""``: no problem.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Feature:
 
     @property
     def range(self) -> str:
-        """Range of the feature for people, such as ``10 to 10000 us in steps of 5``."""
+        """Range of the feature as a text, such as ``10 to 10000 us in steps of 5``."""
         if self.kind == "boolean":
             return "true or false"
         if self.entries:
@@ -124,15 +124,15 @@ class DeviceFeatures(ABC):
 
     @abstractmethod
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the device has afterwards."""
+        """Set a feature; return the device's new value."""
 
     @abstractmethod
     async def execute(self, name: str) -> None:
-        """Execute a command, and wait until the device has done it."""
+        """Execute a command, and wait until it is done."""
 
 
 def spelled(name: str) -> str:
-    """Return a name's letters and digits, which are the same for all spellings of the name."""
+    """Return a name's letters and digits, which are equal for all spellings of the name."""
     return "".join(one for one in name.lower() if one.isalnum())
 
 
@@ -184,11 +184,11 @@ class FrameFeatures:
             return await self._device().describe_all()
 
     async def load(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
-        """Have the device load its features from a user set, such as ``UserSet1``.
+        """Load the device's features from a user set, such as ``UserSet1``.
 
         Args:
             user_set: entry of ``UserSetSelector``; ``Default`` has the maker's values.
-            timeout: seconds for the device to load it.
+            timeout: time limit, seconds.
 
         Raises:
             FrameFeatureError: there is no such set, or the device does not load it now.
@@ -198,11 +198,11 @@ class FrameFeatures:
         await self._with_set(user_set, "UserSetLoad", timeout)
 
     async def save(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
-        """Have the device save its present features in a user set.
+        """Save the device's present features in a user set.
 
         Args:
             user_set: entry of ``UserSetSelector`` that can be written.
-            timeout: seconds for the device to save it.
+            timeout: time limit, seconds.
 
         Raises:
             FrameFeatureError: there is no such set, or the device does not save it.
@@ -212,12 +212,12 @@ class FrameFeatures:
         await self._with_set(user_set, "UserSetSave", timeout)
 
     async def start_with(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
-        """Have the device load a user set whenever it is switched on (``UserSetDefault``).
+        """Set the user set that the device loads when it is switched on (``UserSetDefault``).
 
         Raises:
-            FrameFeatureError: there is no such set, or the device cannot choose one.
+            FrameFeatureError: there is no such set, or the device has no default set.
 
-        Cancellation: the device may have done it.
+        Cancellation: the device may have executed it.
         """
         given = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
         found = {spelled(name): name for name in await self.names(timeout=timeout)}
@@ -273,20 +273,20 @@ class FrameFeature:
             return await self._device().describe(self.name)
 
     async def set(self, value: FeatureValue, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
-        """Set the feature; return the value that the device has then, perhaps rounded.
+        """Set the feature; return the device's new value, perhaps rounded.
 
         Args:
             value: value, or its text: an entry's name, ``true``, a number.
-            timeout: seconds for the device to set it.
+            timeout: time limit, seconds.
 
         Raises:
             ConfigurationError: no feature can have a value of this type.
-            FrameFeatureError: there is no such feature, it cannot be set now, or not to that value;
-                the text has its range.
+            FrameFeatureError: there is no such feature, it cannot be set now, or the value is out
+                of its range, which the text names.
             FrameTimeoutError: the device did not answer within ``timeout``.
             UnsupportedError: a source of this kind has no features.
 
-        Cancellation: the device may have it set.
+        Cancellation: the device may have set the value.
         """
         given = checked_value(value)
         async with _within(timeout, f"feature {self.name} to be set"):
@@ -295,14 +295,14 @@ class FrameFeature:
             return has
 
     async def execute(self, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
-        """Execute the command, and return when the device says that it is done.
+        """Execute the command, and wait until it is done.
 
         Raises:
             FrameFeatureError: there is no such command, or the device refuses it now.
             FrameTimeoutError: the command was not done within ``timeout``.
             UnsupportedError: a source of this kind has no features.
 
-        Cancellation: the device may have done it.
+        Cancellation: the device may have executed it.
         """
         async with _within(timeout, f"command {self.name} to be done"):
             await self._device().execute(self.name)
@@ -325,7 +325,7 @@ def checked_value(value: object) -> FeatureValue:
 
 @contextlib.asynccontextmanager
 async def _within(timeout: object, what: str) -> AsyncIterator[None]:
-    """Bound the time of a block; raise FrameTimeoutError with ``what`` it waited for."""
+    """Limit the time of a block; raise FrameTimeoutError that names ``what`` was awaited."""
     seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
     try:
         async with asyncio.timeout(seconds):

@@ -1,4 +1,4 @@
-"""Hold one picture of a camera, with its times and the number of frames lost before it."""
+"""One picture of a camera, with its times and the number of frames lost before it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FrameTrigger:
     Attributes:
         number: number of the trigger, counted by its source.
         fired: time right before it was sent, seconds of ``time.monotonic()``.
-        evidence: reasons, for people, why this trigger caused the frame.
+        evidence: sentences why this trigger caused the frame.
     """
 
     number: int
@@ -54,30 +54,29 @@ class Frame:
     """One picture as its camera sent it.
 
     Attributes:
-        data: bytes of the picture as they came, without conversion; nobody else writes into them.
+        data: bytes of the picture without conversion, which do not change.
         format: format of the bytes.
         width: width in pixels.
         height: height in pixels.
-        stride: bytes from one row to the next one; 0 if the format is compressed.
+        stride: bytes from one row to the next; 0 if the format is compressed.
         captured: time of the capture, seconds of ``time.monotonic()``.
         utc: time of the capture, seconds since 1970.
-        moment: moment of the capture that these times are of.
+        moment: moment of the capture that ``captured`` and ``utc`` refer to.
         duration: longest possible time from the start of the exposure to ``captured``, seconds: 0
-            if ``captured`` is the start; else it follows from the exposure, readout and transfer
-            times that the source knows.
-        device_time: seconds of the camera's own clock; None: the camera has none, or sent no time.
-            A driver that knows the device's time gives the arrival as ``captured``; the source
-            replaces it by the device's time, converted to the host's clock.
+            if ``captured`` is the start; else computed from the known exposure, readout and
+            transfer times.
+        device_time: seconds of the camera's own clock; None: the camera has no clock, or sent no
+            time. A driver with a device time gives the arrival as ``captured``; the source replaces
+            it by the device time, converted to the host's clock.
         sequence: the camera's number of the frame, which also counts lost frames.
-        lost: number of frames that were lost, on the way or in the camera, between the last frame
-            and this one.
+        lost: number of frames lost, on the way or in the camera, since the frame before.
         source: name of the camera.
-        camera_info: lens of the camera, if it was given; else None.
-        remark: warning about a picture that is whole nevertheless, by the decoder of a compressed
-            frame (such as surplus bytes), or about chunk data that could not be read; mostly empty.
+        camera_info: lens of the camera; None: not given.
+        remark: decoder's warning about a picture that is usable nevertheless (such as surplus
+            bytes), or a problem with chunk data; mostly empty.
         chunks: values that the camera sent with the picture, by the name of their feature, such as
             ``ChunkExposureTime``; empty if it sends none.
-        trigger: trigger by :meth:`FrameSource.trigger` that caused the frame; None: there was none.
+        trigger: trigger by :meth:`FrameSource.trigger` that caused the frame; None: no trigger.
         drawings: marks of the tools of the software camera that judged the picture, each a
             :class:`smartcam.inspection.Drawing`; mostly empty. An agent shares frames without them.
     """
@@ -102,7 +101,7 @@ class Frame:
     drawings: tuple[Drawing, ...] = ()
 
     def __reduce__(self) -> tuple[Callable[[], Frame], tuple[()]]:
-        """Return a function that makes a copy, with bytes of its own, also in another process."""
+        """Return a function that makes a copy with its own bytes, also in another process."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return partial(type(self), **(values | {"data": bytes(self.data)})), ()
 
@@ -120,8 +119,8 @@ class Frame:
         """Return the pixels in the frame's own format, unpacked but not converted.
 
         Returns:
-            (H, W) or (H, W, C), uint8 or uint16, read-only; for a format with several planes, such
-            as NV12, and for a compressed one the bytes, (N,).
+            (H, W) or (H, W, C), uint8 or uint16, read-only; for formats with several planes, such
+            as NV12, and compressed formats, the bytes, (N,).
 
         Raises:
             FrameFormatError: there are fewer bytes than the format needs.
@@ -159,7 +158,7 @@ class Frame:
 
 
 _data: Final = JoinedOnUse(vars(Frame)["data"])
-setattr(Frame, "data", _data)  # noqa: B010 - checkers know the attribute as it is read
+setattr(Frame, "data", _data)  # noqa: B010 - type checkers use the field
 _NAMES: Final = tuple(one.name for one in fields(Frame))
 _OTHERS: Final = tuple(name for name in _NAMES if name != "data")
 _values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_OTHERS)
@@ -167,7 +166,7 @@ _setters: Final = tuple(getattr(Frame, name).__set__ for name in _OTHERS)
 
 
 def amend(frame: Frame, **changes: object) -> Frame:
-    """Return a frame that nobody else has yet, with some attributes changed in it."""
+    """Change some attributes of a new frame in place, and return it."""
     for name, value in changes.items():
         object.__setattr__(frame, name, value)
     return frame

@@ -1,4 +1,4 @@
-"""Read several cameras at once: frames of the same moment."""
+"""Read several cameras at once, in sets of frames of the same moment."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_FRAMES: Final = 8
-"""At most this many frames of each camera wait for those of the others."""
+"""Largest number of frames of each camera that wait for frames of the others."""
 
 UNKNOWN_PERIOD: Final = 0.04
-"""Assumed seconds between frames of a camera whose frame rate is not known."""
+"""Assumed time between frames, seconds, if the frame rate is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class FrameSet:
     """Frames of the same moment, one from each camera.
 
     Attributes:
-        frames: frames by the names that the group gave.
+        frames: frames by the names of the cameras.
         skew: seconds from the first frame to the last, by ``Frame.captured``.
     """
 
@@ -49,7 +49,7 @@ class FrameSet:
 
     @property
     def captured(self) -> float:
-        """Capture time of the last of the frames, seconds of ``time.monotonic()``."""
+        """Capture time of the latest frame, seconds of ``time.monotonic()``."""
         return max(frame.captured for frame in self.frames.values())
 
 
@@ -61,9 +61,8 @@ class GroupStatistics:
         offered: number of complete sets; always delivered + skipped + waiting.
         delivered: number of sets that a reader took.
         skipped: number of sets that were replaced by a newer one.
-        waiting: 1 if there is a set that was not taken yet, else 0.
-        alone: number of each camera's frames without one of the same moment from every other
-            camera.
+        waiting: 1 if a set waits for a reader, else 0.
+        alone: number of each camera's frames that are in no set.
         skew: largest skew of any set, seconds.
     """
 
@@ -84,11 +83,11 @@ class FrameGroup:
             async for both in pair:
                 both["left"], both["right"], both.skew
 
-    It returns the newest set, and skips those that were missed. All cameras stream from the first
-    iteration on until the group is closed. Each frame is in one set at most.
+    An iteration returns the newest set and skips older ones. All cameras stream from the first
+    iteration until the group is closed. Each frame is in one set at most.
 
     Args:
-        sources: sources by name, not open yet; the group opens and closes them.
+        sources: unopened sources by name; the group opens and closes them.
         within: largest skew of a set, seconds; None: half of the time between two frames of the
             fastest camera, so that each frame has one partner.
         timeout: seconds that an iteration waits for a set; None: without limit.
@@ -224,7 +223,7 @@ class FrameGroup:
         if not self._open:
             raise LocalProtocolError("the group of frame sources is not open: use `async with`")
         if not self._readers and self._over is None:
-            # all in one turn of the loop, so that all start together
+            # all in one step of the loop, so that all start together
             self._readers = {
                 name: _GroupReader(source, self, name) for name, source in self._sources.items()
             }
@@ -240,7 +239,7 @@ class FrameGroup:
         )
 
     def _take(self, name: str, frame: Frame) -> None:
-        """Take a frame of a camera, and deliver a set if it completes one."""
+        """Add a camera's frame, and deliver a set if it is complete."""
         kept = self._kept[name]
         kept.append(frame)
         if len(kept) > MAX_WAITING_FRAMES:
@@ -266,7 +265,7 @@ class FrameGroup:
         self._came.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
-        """Forget a frame that is in a set, and the earlier ones, which will be in none."""
+        """Drop a frame that is in a set, and earlier frames, which cannot be in a set any more."""
         kept = self._kept[name]
         while kept.popleft() is not frame:
             self._alone[name] += 1
@@ -288,7 +287,7 @@ class _GroupReader(FrameReader):
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         self._delivered += 1
-        self._group._take(self._member, frame)  # noqa: SLF001 - the two are one
+        self._group._take(self._member, frame)  # noqa: SLF001 - same module
 
     def _end(self, error: FrameSourceError | None) -> None:
         super()._end(error)

@@ -1,4 +1,4 @@
-"""Read pictures from a smart camera that can be asked for its last one."""
+"""Poll the last picture of a smart camera."""
 
 from __future__ import annotations
 
@@ -25,34 +25,33 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels.formats import PixelFormat
 
 
-OURS = ("fps", "name", "timeout")
+OWN_PARAMETERS = ("fps", "name", "timeout")
 
 
 class InSightDriver(FrameDriver):
     """A source that polls the last picture of a smart camera: ``insight://admin@HOST?fps=2``.
 
-    Other parameters of the query are those of the camera, as in :func:`smartcam.connect`. A session
-    with the camera exists only while somebody reads.
+    Other parameters of the query are the camera's, as in :func:`smartcam.connect`. The session with
+    the camera exists only while there are readers.
 
     ============ ============================================================================
     ``fps``      how often it is asked, times per second; usual 2 ``timeout``  seconds for
     connecting, and for a picture; usual 10 ``name``     of the camera ============
     ============================================================================
 
-    The camera does not say when a picture was taken, nor whether it is new. A picture with the same
-    bytes as the last is taken for the same, and is not returned again: if nothing triggers the
-    camera, open it with ``stall=None``. ``captured`` is the arrival of a frame, and ``duration``
-    goes back to the previous request, when the picture did not exist yet; for the first frame it is
-    infinite.
+    The camera does not report when a picture was taken, or whether it is new. A picture with the
+    same bytes as the last is not returned again: if the camera may not be triggered for long, use
+    ``stall=None``. ``captured`` is the arrival of a frame, and ``duration`` the time since the
+    request before; for the first frame it is infinite.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         parts = urlsplit(address.url)
-        said = parse_qsl(parts.query, keep_blank_values=True)
-        own = urlencode([one for one in said if one[0] in OURS])
-        query = urlencode([one for one in said if one[0] not in OURS])
-        mine = address.parameters(OURS, own)
+        given = parse_qsl(parts.query, keep_blank_values=True)
+        own = urlencode([one for one in given if one[0] in OWN_PARAMETERS])
+        query = urlencode([one for one in given if one[0] not in OWN_PARAMETERS])
+        mine = address.parameters(OWN_PARAMETERS, own)
         self._rate = address.number("fps", mine.get("fps", "2"), 0.001, 100)
         self._timeout = address.number("timeout", mine.get("timeout", "10"), 0.05, 600)
         self._settings = CameraSettings.make(
@@ -86,7 +85,7 @@ class InSightDriver(FrameDriver):
         return StreamFormat(_format(pixels), width, height, (self._rate,))
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect, and begin to ask for pictures.
+        """Connect, and start polling pictures.
 
         Raises:
             FrameSourceError: the camera does not answer, or refuses.
@@ -99,7 +98,7 @@ class InSightDriver(FrameDriver):
         self._task = asyncio.create_task(self._poll(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:
-        """Stop asking, and end the session."""
+        """Stop polling, and end the session."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 
-RECORDING: Final = "mcap"
+RECORDING_SCHEME: Final = "mcap"
 """Scheme whose driver reads recordings."""
 
 RECORDING_SUFFIX: Final = ".mcap"
@@ -42,13 +42,13 @@ def open(
         camera_info: lens of the camera, which is added to every frame.
         timeout: seconds that an iteration waits for a frame; None: without limit.
         stall: seconds without a frame after which a streaming device counts as stuck; None: never.
-        linger: seconds for which the source goes on streaming after the last reader.
+        linger: seconds for which the source streams after its last reader has gone.
 
     Raises:
-        ConfigurationError: the URL is wrong; the text names what is known.
+        ConfigurationError: the URL is wrong; the text names the known schemes or parameters.
     """
     address = FrameAddress.parse(url)
-    scheme = RECORDING if _is_recording(address) else address.scheme
+    scheme = RECORDING_SCHEME if _is_recording(address) else address.scheme
     driver = _driver(scheme, address.shown)(address)
     return FrameSource(driver, camera_info=camera_info, timeout=timeout, stall=stall, linger=linger)
 
@@ -57,7 +57,7 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
     """Find sources on this machine and its network.
 
     Args:
-        scheme: scheme of the sources to look for; None: all.
+        scheme: scheme of the sources; None: all schemes.
 
     Raises:
         ConfigurationError: the scheme is unknown.
@@ -71,7 +71,7 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
 
 
 def _is_recording(address: FrameAddress) -> bool:
-    """Return True if a path is that of an MCAP file, or of a folder with such files."""
+    """Return True if a path is an MCAP file or a folder with MCAP files."""
     if address.scheme != "file":
         return False
     path = Path(re.sub(r"#\w+=[^#/]*$", "", address.path))

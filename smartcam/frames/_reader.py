@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from smartcam.frames._source import FrameSource
 
 RELEASE_INTERVAL = 0.05
-"""Seconds between two checks whether a held-back frame can be passed on."""
+"""Seconds between two attempts to pass on a held-back frame."""
 
 FRAME_TIMEOUT = 5.0
-"""Seconds to wait for a frame by default."""
+"""Default time to wait for a frame, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class ReaderStatistics:
         offered: frames that came since the reader began; always delivered + skipped + waiting.
         delivered: frames that the reader took.
         skipped: frames replaced by newer ones before the reader took them.
-        waiting: 1 while a frame waits that the reader has not taken, else 0.
+        waiting: 1 if a frame waits for the reader, else 0.
         lost: frames that never came: lost in the camera or on the way.
     """
 
@@ -43,23 +43,23 @@ class ReaderStatistics:
 
 
 class FrameReader:
-    """One reader of a source: an iterator that returns the newest frame and skips missed ones.
+    """A reader of a source: an iterator that returns the newest frame and skips older ones.
 
-    The device streams while there is a reader that is not closed and still referenced.
+    The device streams while there is a referenced reader that is not closed.
     """
 
     def __init__(self, source: FrameSource, timeout: float | None) -> None:
         self._source: FrameSource | None = source
         self._timeout = timeout
         self._next: Frame | None = None
-        self._last: Frame | None = None  # last frame that was taken
+        self._last: Frame | None = None  # last returned frame
         self._ended = False
         self._error: FrameSourceError | None = None
         self._waiters: list[asyncio.Future[bool]] = []
         self._offered = self._delivered = self._skipped = self._lost = 0
 
     def statistics(self) -> ReaderStatistics:
-        """Return the account as it is now."""
+        """Return the current counts."""
         return ReaderStatistics(
             self._offered,
             self._delivered,
@@ -103,14 +103,14 @@ class FrameReader:
         return frame
 
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame, or wait for one that is not older than ``max_age``.
+        """Return the newest frame if it is not older than ``max_age``; else wait for one.
 
         Args:
             max_age: largest age since the capture, seconds; ``inf``: any.
-            timeout: seconds; None: without limit.
+            timeout: time limit, seconds; None: without limit.
 
         Raises:
-            ConfigurationError: a time that is not valid.
+            ConfigurationError: a time is not valid.
             FrameTimeoutError: no frame came in time.
             FrameSourceError: the source ended.
 
@@ -125,17 +125,17 @@ class FrameReader:
         return await self._first(what, timeout, lambda frame: frame.age <= max_age)
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame, waiting or to come, whose exposure began after a moment.
+        """Return the first frame, from the waiting one on, whose exposure began after a moment.
 
-        If the source does not know when the exposure began, it is the first frame for which that is
-        certain: see :attr:`Frame.began`.
+        If the start of the exposure is not known exactly, the frame is the first that certainly
+        began later: see :attr:`Frame.began`.
 
         Args:
             moment: time of ``time.monotonic()``.
-            timeout: seconds; None: without limit.
+            timeout: time limit, seconds; None: without limit.
 
         Raises:
-            ConfigurationError: a time that is not valid.
+            ConfigurationError: a time is not valid.
             FrameTimeoutError: no frame came in time.
             FrameSourceError: the source ended.
 
@@ -146,15 +146,16 @@ class FrameReader:
         for held in (self._last, self._next):
             if held is not None and held.began >= moment:
                 return self._taken(held)
-        what = "a frame exposed after the moment that was given"
+        what = "a frame exposed after the given moment"
         return await self._first(what, timeout, lambda frame: frame.began >= moment)
 
     async def fresh(self, since: float, until: float) -> None:
-        """Wait until the next frame is one that came after a moment, or until it is too late.
+        """Wait until the next frame is newer than a moment, or until a deadline.
 
         Args:
-            since: time of the loop's clock; frames that came before are skipped.
-            until: time of the loop's clock; then an older frame is accepted, or none.
+            since: time of the loop's clock; earlier frames are skipped.
+            until: deadline on the loop's clock, after which an older frame, or no frame, is
+                accepted.
 
         Cancellation: safe.
         """
@@ -172,7 +173,7 @@ class FrameReader:
         return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
 
     def check_not_ended(self) -> None:
-        """Raise the error that the source ended with, if it has ended.
+        """Raise the source's error if it has ended.
 
         Raises:
             FrameSourceError: the source ended.
@@ -182,19 +183,20 @@ class FrameReader:
             raise self._error or ended
 
     def _waits(self) -> str:
-        """Return an addition to an error's text: the trigger that the device waits for."""
+        """Return the trigger that the device awaits, for an error's text, or ""."""
         waits = "" if self._source is None else self._source.driver.waits_for
         return f": {waits}, and nothing triggered it" if waits else ""
 
     async def _first(
         self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
     ) -> Frame:
-        """Return the first frame that comes and is wanted."""
+        """Return the first wanted frame."""
         end = self._deadline(timeout)
         while (frame := await self._take(end, what)) is not None:
             if wanted(frame):
                 return frame
-        raise FrameSourceError(f"{self._name}: expected {what}, it ended", source=self._name)
+        text = f"{self._name}: expected {what}, the source ended"
+        raise FrameSourceError(text, source=self._name)
 
     @property
     def _name(self) -> str:
@@ -207,7 +209,7 @@ class FrameReader:
         return asyncio.get_running_loop().time() + timeout
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
-        """Return the next frame as soon as it comes; None at the end of the source."""
+        """Return the next frame; None at the end of the source."""
         while self._next is None and not self._ended:
             if not await self._woken(end):
                 raise FrameTimeoutError(
@@ -221,7 +223,7 @@ class FrameReader:
         return None
 
     async def _woken(self, end: float | None) -> bool:
-        """Wait for a frame or the end; return False if the time is over.
+        """Wait for a frame or the end; return False at the time limit.
 
         This uses a future and a timer; asyncio's own functions take twice as long per frame.
         """
@@ -270,16 +272,16 @@ class FrameReader:
 
 
 class FrameTap(FrameReader):
-    """A reader that passes on every frame as it comes, unlike others, which get the newest one.
+    """A reader that passes on every frame as it comes.
 
     While ``busy`` returns True, the last frame is held back, and a source that can wait, such as a
-    file, waits. The frame is passed on when another one comes.
+    file, waits. The next frame releases the held-back one.
 
     Args:
         source: open source; the device streams from now on.
-        take: function that takes a frame and returns at once: False if it did not want the frame,
-            which then counts as skipped.
-        busy: function that returns True if frames should come later.
+        take: function that is called with each frame, and returns False for a frame that counts as
+            skipped. It must not block.
+        busy: function that returns True to delay frames.
     """
 
     def __init__(
@@ -290,10 +292,10 @@ class FrameTap(FrameReader):
         source.attach(self)
 
     async def ended(self) -> None:
-        """Wait until the source has ended, and pass everything on.
+        """Wait until the source has ended, and pass on all frames.
 
         Raises:
-            FrameSourceError: the source ended with it.
+            FrameSourceError: the source ended with this error.
 
         Cancellation: safe.
         """
@@ -306,7 +308,7 @@ class FrameTap(FrameReader):
             raise self._error
 
     def close(self) -> None:
-        """Stop reading, and pass on a frame that was held back. Idempotent."""
+        """Stop reading, and pass on a held-back frame. Idempotent."""
         if self._next is not None:
             self._hand_on(self._next)
         super().close()

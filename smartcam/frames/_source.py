@@ -1,4 +1,4 @@
-"""Define a source of frames, whose device streams while somebody reads."""
+"""Define a source of frames, whose device streams while there are readers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_LINGER = 3600.0
-"""Seconds that a device may go on streaming after the last reader."""
+"""Longest time, seconds, that a device may stream after its last reader has gone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +63,11 @@ class SourceStatistics:
     Attributes:
         streaming: whether the device streams now.
         readers: number of present readers.
-        started: number of times that the device began to stream.
-        frames: number of frames that came, with or without a reader.
-        lost: number of frames that were lost in the camera or on the way.
-        ahead: number of frames whose time was later than their arrival, which replaced it.
-        clock: drift and jumps of the camera's own clock; None: the camera has none.
+        started: number of starts of the device's stream.
+        frames: number of received frames, with or without a reader.
+        lost: number of frames lost in the camera or on the way.
+        ahead: number of frames with a time after their arrival, for which the arrival was used.
+        clock: drift and jumps of the camera's own clock; None: no clock.
     """
 
     streaming: bool
@@ -82,17 +82,15 @@ class SourceStatistics:
 class FrameSource(FrameSink):
     """Frames of one camera, for any number of readers; ``async with`` opens and closes it.
 
-    The device streams while somebody reads, and does nothing otherwise. Made by
-    :func:`smartcam.frames.open`.
+    The device streams only while there are readers. Made by :func:`smartcam.frames.open`.
 
     Args:
-        driver: driver of the device, which only the source uses from now on.
-        camera_info: lens of the camera, which is added to every frame; None: that of the driver.
+        driver: driver of the device, which then belongs to the source.
+        camera_info: lens of the camera, which is added to every frame; None: the driver's.
         timeout: seconds that an iteration waits for a frame; None: without limit.
         stall: seconds without a frame after which a streaming device counts as stuck: readers get a
-            :exc:`~smartcam.FrameSourceError`. None: never, as for a device that waits for triggers.
-        linger: seconds for which it goes on streaming after the last reader, for one that comes
-            back.
+            :exc:`~smartcam.FrameSourceError`. None: never, as for triggered devices.
+        linger: seconds for which the device streams after its last reader has gone.
 
     Raises:
         ConfigurationError: a time that is not valid.
@@ -115,9 +113,9 @@ class FrameSource(FrameSink):
         self._readers: set[weakref.ref[FrameReader]] = set()
         self._format: StreamFormat | None = None
         self._loop: asyncio.AbstractEventLoop | None = None  # while the source is open
-        self._task: asyncio.Task[None] | None = None  # while somebody reads, and while it lingers
-        self._changed = asyncio.Event()  # set when readers came or went, or the driver ended
-        self._took = asyncio.Event()  # set when a reader took a frame, or went
+        self._task: asyncio.Task[None] | None = None  # while it streams or lingers
+        self._changed = asyncio.Event()  # set when readers change, or the driver ends
+        self._took = asyncio.Event()  # set when a reader takes a frame or is closed
         self._held_up = False  # whether the driver waits for readers
         self._streaming = False
         # error that the driver ended with, in a tuple
@@ -125,7 +123,7 @@ class FrameSource(FrameSink):
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
-        self._again = False  # the stream is to begin anew
+        self._again = False  # whether to restart the stream
         self._triggers = TriggerQueue(self)
         self._last_came = self._idle_since = 0.0  # on the loop's clock
 
@@ -136,21 +134,21 @@ class FrameSource(FrameSink):
 
     @property
     def driver(self) -> FrameDriver:
-        """The device's driver, for functions of its kind."""
+        """The device's driver, for driver-specific functions."""
         return self._driver
 
     @property
     def features(self) -> FrameFeatures:
         """Features of the device: ``await source.features["ExposureTime"].set(5000.0)``.
 
-        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls,
-        and RTSP cameras the parameters whose names their maker tells.
+        GigE Vision cameras have the features of their GenICam description, V4L2 devices their
+        controls, and RTSP cameras parameters by names from the maker's documents.
         """
         return FrameFeatures(self._device_features, self._feature_changed)
 
     @property
     def has_features(self) -> bool:
-        """True if devices of this kind have features, and tell which ones."""
+        """True if devices of this kind can list their features."""
         driver = type(self._driver)
         return driver.lists_features and driver.features is not FrameDriver.features
 
@@ -173,7 +171,7 @@ class FrameSource(FrameSink):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the device report events, as :meth:`FrameDriver.watch_events` does.
+        """Start reports of events, as in :meth:`FrameDriver.watch_events`.
 
         Raises:
             LocalProtocolError: the source is not open.
@@ -189,7 +187,7 @@ class FrameSource(FrameSink):
         return self._driver.features
 
     async def _feature_changed(self) -> None:
-        """Take the format of the device after a feature was set."""
+        """Update the stream's format after a feature was set."""
         if self._loop is not None and self._driver.form is not None:
             self._format = self._driver.form
         self._changed.set()
@@ -236,12 +234,12 @@ class FrameSource(FrameSink):
         return self
 
     def _begin(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Start streaming, since somebody reads."""
+        """Start the task that streams for readers."""
         self._task = loop.create_task(self._run(), name=f"frames of {self.name}")
         self._task.add_done_callback(self._stopped)
 
     def _stopped(self, task: asyncio.Task[None]) -> None:
-        """Start again for readers that came meanwhile; end the readers of a cancelled task."""
+        """Restart for new readers; end the readers of a cancelled task."""
         if task is not self._task or self._loop is None:
             return
         self._task = None
@@ -254,7 +252,7 @@ class FrameSource(FrameSink):
         size = (form.width, form.height)
         if self._camera_info is not None and tuple(self._camera_info.size) != size:
             raise FrameFormatError(
-                f"{self.name}: expected frames of the size that camera_info has, "
+                f"{self.name}: expected frames of camera_info's size, "
                 f"{self._camera_info.size[0]}x{self._camera_info.size[1]}, got {form}",
                 source=self.name,
                 available=(str(form),),
@@ -280,7 +278,7 @@ class FrameSource(FrameSink):
         await finish(partial(self._give_back, task))
 
     async def _give_back(self, task: asyncio.Task[None] | None) -> None:
-        """Close the device when the task has ended, even if it never began."""
+        """Close the device after the task, even if the task never began."""
         if task is not None:
             await asyncio.wait({task})
         await self._driver.close()
@@ -299,10 +297,10 @@ class FrameSource(FrameSink):
         return f"<{type(self).__name__} {self.name}>"
 
     def reader(self, *, timeout: float | EllipsisType | None = ...) -> FrameReader:
-        """Begin to read; the device streams from now on.
+        """Return a new reader; the device streams from now on.
 
         Args:
-            timeout: seconds that an iteration waits for a frame; None: without limit; left out: the
+            timeout: seconds that an iteration waits for a frame; None: without limit; omitted: the
                 source's.
 
         Raises:
@@ -330,8 +328,8 @@ class FrameSource(FrameSink):
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
 
-        To ask often, keep a reader, or open the source with ``linger``: otherwise the device starts
-        to stream for each frame.
+        For frequent calls, keep a reader, or open the source with ``linger``: otherwise the device
+        starts its stream for each frame.
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")
@@ -358,29 +356,29 @@ class FrameSource(FrameSink):
     ) -> Frame:
         """Trigger the device once, and return the picture that this trigger caused.
 
-        It is never a picture that was exposed before, and never that of an earlier trigger, even if
-        that was cancelled or timed out: then the stream is restarted. :attr:`Frame.trigger` gives
-        the evidence. The device streams for the trigger; to trigger often, keep a reader, or open
+        The result is never an earlier picture, or the picture of an earlier trigger: after a
+        cancelled trigger or a timeout, the stream is restarted. :attr:`Frame.trigger` gives the
+        evidence. The device streams for the trigger; for frequent triggers, keep a reader, or open
         the source with ``linger``.
 
         Args:
-            timeout: seconds for the whole call: waiting for its turn, the start of the stream, the
-                trigger and its picture.
+            timeout: seconds for the whole call: waiting for earlier triggers, the start of the
+                stream, the trigger and its picture.
             when_busy: whether to wait for a pending trigger, or to raise.
             fire: coroutine function that sets the line of ``TriggerSource``; None: the device is
                 triggered by its command ``TriggerSoftware``.
 
         Raises:
             UnsupportedError: a source of this kind has no trigger.
-            NotRunningError: the device is not set for such triggers; the text says what to set.
+            NotRunningError: the device is not set for this trigger; the text names the settings.
             CameraBusyError: another trigger is pending, and ``when_busy`` is ``refuse``; or the
-                device accepts none now.
+                device accepts no trigger now.
             OvertriggeredError: the device reports that it missed the trigger.
-            FrameLostError: the picture, or one that may have been it, was lost on the way.
+            FrameLostError: the picture was certainly or possibly lost on the way.
             TriggerTimeoutError: no picture came within ``timeout``.
             FrameSourceError: the device does not stream, or is gone.
 
-        Cancellation: the source goes on; a picture that still comes goes only to readers.
+        Cancellation: the source goes on; a late picture goes only to readers.
         """
         seconds = check_seconds(timeout, "timeout", "trigger", above=True)
         check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
@@ -410,14 +408,14 @@ class FrameSource(FrameSink):
             self._changed.clear()
             await self._changed.wait()
 
-    # what the driver says
+    # called by the driver
 
     def trigger_failed(self, error: SmartCamError) -> None:
-        """Take the driver's report that the picture of the pending trigger will not come."""
+        """Fail the pending trigger, whose picture will not come."""
         self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame from the driver."""
+        """Pass a frame of the driver to the readers."""
         if frame.lost:
             self.lost(frame.lost)
         self._last_came = asyncio.get_running_loop().time()
@@ -427,7 +425,7 @@ class FrameSource(FrameSink):
         if frame.trigger is not None:
             self._triggers.came(frame)
         for reader in self._alive():
-            reader._offer(frame)  # noqa: SLF001 - the two are one
+            reader._offer(frame)  # noqa: SLF001 - its own reader
 
     def _timed(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on the host's clock, not later than now."""
@@ -441,7 +439,7 @@ class FrameSource(FrameSink):
                 _log.warning(
                     "%s: the camera's clock was set anew, at frame %d", self.name, frame.sequence
                 )
-        if captured > now:  # no camera sees what has not happened yet
+        if captured > now:  # a capture cannot be in the future
             self._ahead += 1
             captured = now
         if captured == frame.captured:
@@ -450,24 +448,24 @@ class FrameSource(FrameSink):
         return changed(frame, captured=captured, utc=frame.utc + shift)
 
     def lost(self, count: int) -> None:
-        """Take the driver's report of lost frames."""
+        """Count lost frames."""
         self._lost += count
         for reader in self._alive():
             reader._miss(count)  # noqa: SLF001
 
     def skipped(self, count: int) -> None:
-        """Take the driver's report of frames that were skipped earlier on the way."""
+        """Count frames that were skipped earlier on the way."""
         self._frames += count
         for reader in self._alive():
             reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
-        """Take the driver's report that no more frames come."""
+        """Record that no more frames come."""
         self._over = (error,)
         self._changed.set()
 
     async def taken(self) -> None:
-        """Wait until every reader has taken the last frame; meanwhile the device is not stuck."""
+        """Wait until every reader has taken the last frame; this time does not count as a stall."""
         self._held_up = True
         try:
             while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
@@ -491,7 +489,7 @@ class FrameSource(FrameSink):
         self._dropped(weakref.ref(reader))
 
     async def _run(self) -> None:
-        """Stream while somebody reads."""
+        """Stream while there are readers."""
         while self._readers:
             try:
                 await self._stream()
@@ -501,12 +499,12 @@ class FrameSource(FrameSink):
                 raise
             except ENDS_PROGRAM:
                 raise
-            except BaseException as error:  # noqa: BLE001 - a driver may be anybody's
+            except BaseException as error:  # noqa: BLE001 - a driver may be a plug-in
                 _log.exception("%s: its driver failed", self.name)
                 self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
     async def _stream(self) -> None:
-        """Stream until nobody reads, or the device ends."""
+        """Stream until there are no readers, or the device ends."""
         self._over = None
         self._newest = None
         self._again = False
@@ -529,7 +527,7 @@ class FrameSource(FrameSink):
             self._tell(over[0])
 
     async def _while_read(self) -> None:
-        """Wait until the driver ends or is stuck, or the time to linger after the last reader."""
+        """Wait until the driver ends or is stuck, or the linger after the last reader is over."""
         while self._over is None and not self._again:
             if not self._readers:
                 left = self._idle_since + self._linger - asyncio.get_running_loop().time()
@@ -550,11 +548,11 @@ class FrameSource(FrameSink):
                 await self._within(left, lambda: not self._readers)
 
     def _is_free_of(self, waits_for: str) -> bool:
-        """Return True if nobody reads, or the device no longer waits for the same."""
+        """Return True if there are no readers, or the device no longer waits for ``waits_for``."""
         return not self._readers or self._driver.waits_for != waits_for
 
     async def _within(self, seconds: float, reached: Callable[[], bool]) -> bool:
-        """Wait for a change; return whether it came in time."""
+        """Wait for a condition; return whether it was reached in time."""
         try:
             async with asyncio.timeout(seconds):
                 await self._until_changed(reached)
@@ -568,7 +566,7 @@ class FrameSource(FrameSink):
             await self._changed.wait()
 
     def _tell(self, error: FrameSourceError | None) -> None:
-        """End all readers; for a later reader the device is tried again."""
+        """End all readers; a later reader starts the device again."""
         if error is not None:
             self._triggers.failed(error)
         for reader in self._alive():

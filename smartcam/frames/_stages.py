@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class Undistorter:
-    """Pictures as a lens without distortion would show them; its maps are made once.
+    """Remove the distortion of a lens from pictures; the maps are computed once.
 
     Args:
         camera: the lens.
-        alpha: 0 if all pixels of the output must be valid, to 1 if all of the source must be kept.
+        alpha: part of the picture that is kept: 0: only valid pixels; 1: all source pixels.
 
     Attributes:
         camera: lens of the output, without distortion.
@@ -69,11 +69,11 @@ class Undistorter:
 
 
 class Rectifier:
-    """Rectifies pairs of pictures, so that rows show the same points, by a calibration's maps.
+    """Rectify pairs of pictures by a calibration's maps, so that rows show the same points.
 
     Args:
         rectification: result of :meth:`~smartcam.calibration.StereoCalibration.rectify`.
-        size: size of the sources, width and height in pixels.
+        size: width and height of the source pictures, pixels.
         left: name of the left camera in the sets.
         right: name of the right camera in the sets.
     """

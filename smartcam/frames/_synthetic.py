@@ -1,4 +1,4 @@
-"""Frames that nobody has to have a camera for, with number and time drawn into the picture."""
+"""Synthetic frames without a camera, with number and time drawn into the picture."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 STAMP_BITS: Final = 64
-"""Bits of each of the two numbers in a stamp."""
+"""Number of bits of each of the two numbers in a stamp."""
 
 BIT_SIDE_PX: Final = 4
-"""Pixels along a side of the square that shows a bit."""
+"""Side of the square that shows a bit, pixels."""
 
 MIN_SIZE_PX: Final = (STAMP_BITS * BIT_SIDE_PX, 4 * BIT_SIDE_PX)
 """Width and height, in pixels, of the smallest picture that has room for a stamp."""
@@ -38,29 +38,28 @@ class SyntheticDriver(TaskDriver):
 
     Formats are Mono8, YUYV, RGB8, Z16 (distances in millimetres) and MJPEG.
 
-    The stamp is two rows of cells in the upper left corner: the frame's number, and the nanoseconds
-    of ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it at the far end, also
-    behind a lossy codec.
+    The stamp is two rows of squares in the upper left corner: the frame's number, and
+    ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it, also after a lossy codec.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        said = address.parameters(["size", "fps", "name", "format"])
-        self._size = address.size(said.get("size", "640x480"))
+        given = address.parameters(["size", "fps", "name", "format"])
+        self._size = address.size(given.get("size", "640x480"))
         if self._size[0] < MIN_SIZE_PX[0] or self._size[1] < MIN_SIZE_PX[1]:
             raise address.wrong(
                 "size",
                 f"{MIN_SIZE_PX[0]}x{MIN_SIZE_PX[1]} or more, room for the stamp",
-                said["size"],
+                given["size"],
             )
-        self._format = _format(address, said.get("format", "Mono8"))
-        self._rate = address.number("fps", said.get("fps", "30"), 0.01, 10_000)
-        self._name = said.get("name", "synthetic")
+        self._format = _format(address, given.get("format", "Mono8"))
+        self._rate = address.number("fps", given.get("fps", "30"), 0.01, 10_000)
+        self._name = given.get("name", "synthetic")
         self._number = 0
 
     @property
     def name(self) -> str:
-        """As the URL says."""
+        """Name from the URL."""
         return self._name
 
     async def open(self) -> StreamFormat:
@@ -83,7 +82,7 @@ class SyntheticDriver(TaskDriver):
             drawn += 1
             await asyncio.sleep(began + drawn / self._rate - loop.time())
             self._number += 1
-            late = int((loop.time() - began) * self._rate) - drawn  # those nobody had time for
+            late = int((loop.time() - began) * self._rate) - drawn  # not drawn in time
             if late > 0:
                 drawn += late
                 self._number += late
@@ -124,7 +123,7 @@ _FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes | memoryview]]] = 
     "Coord3D_C16": lambda picture: (picture.astype("<u2") * 16).tobytes(),
     "MJPEG": _jpeg,
 }
-"""The function that makes a format's bytes of a grey picture."""
+"""Functions that convert a grey picture to a format's bytes."""
 
 
 def _format(address: FrameAddress, name: str) -> PixelFormat:
@@ -145,7 +144,7 @@ def stripes(width: int, height: int) -> NDArray[np.uint8]:
 def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> None:
     """Draw a stamp into the upper left corner of (H, W) or (H, W, C)."""
     for row, value in enumerate((number, nanoseconds)):
-        for half, shown in enumerate((value, ~value)):  # its complement tells a torn or damaged one
+        for half, shown in enumerate((value, ~value)):  # the complement reveals a torn stamp
             bits = (shown >> np.arange(STAMP_BITS, dtype=object)) & 1
             cells = np.repeat(np.array(bits, np.uint8) * 219 + 16, BIT_SIDE_PX)
             top = (2 * row + half) * BIT_SIDE_PX
@@ -157,7 +156,7 @@ def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
     """Return the number and the ``time.monotonic_ns()`` that a picture was stamped with.
 
     Args:
-        picture: (H, W) or (H, W, C), also after a lossy codec; of depth the distances.
+        picture: (H, W) or (H, W, C), also after a lossy codec; for depth the distances.
 
     Returns:
         None if there is no stamp, or it is damaged.

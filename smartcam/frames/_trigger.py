@@ -1,8 +1,7 @@
-"""Trigger a source, once at a time, each with the picture that it caused, or a typed error.
+"""Trigger a source, one trigger at a time; the result is its picture or a typed error.
 
-A trigger that was sent and whose picture was not seen leaves the stream unsettled: the picture may
-still come. So the stream is restarted before the next trigger, and pictures of the old one are
-dropped with it.
+If a trigger was sent and its picture has not come, the picture may still come. So the stream is
+restarted before the next trigger, which drops late pictures.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class AwaitedTrigger:
         self.fired = time.monotonic()
 
     def refused(self) -> None:
-        """Note that the device did not take the trigger, and so causes no picture."""
+        """Note that the device did not accept the trigger, so no picture will come."""
         self.fired = None
 
 
@@ -57,7 +56,7 @@ class TriggerQueue:
         source: source that is triggered.
 
     Attributes:
-        settled: whether no picture of an earlier trigger can still come.
+        settled: whether all pictures of earlier triggers have come or are dropped.
     """
 
     def __init__(self, source: FrameSource) -> None:
@@ -76,7 +75,7 @@ class TriggerQueue:
         if fire is None and (frame := await driver.trigger_elsewhere(seconds, refuse=refuse)):
             return frame
         if refuse and self._lock.locked():
-            raise CameraBusyError(f"{name}: a trigger is under way, and waiting was not wanted")
+            raise CameraBusyError(f"{name}: another trigger is pending, and when_busy is 'refuse'")
         doing = ["waiting for the triggers before it"]
         pending = AwaitedTrigger(0)
         try:
@@ -116,10 +115,10 @@ class TriggerQueue:
             driver.disarm()
             self.settled = self.settled and (pending.fired is None or _came(pending))
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
-                pending.outcome.exception()  # the caller has an outcome already
+                pending.outcome.exception()  # mark the error as retrieved
 
     def came(self, frame: Frame) -> None:
-        """Take the frame that the driver says a trigger caused."""
+        """Pass the frame of the pending trigger to its caller."""
         pending = self._pending
         if (
             pending is not None
@@ -130,7 +129,7 @@ class TriggerQueue:
             pending.outcome.set_result(frame)
 
     def failed(self, error: SmartCamError) -> None:
-        """Note that the pending trigger has no picture."""
+        """Pass an error to the caller of the pending trigger."""
         if self._pending is not None and not self._pending.outcome.done():
             self._pending.outcome.set_exception(error)
 

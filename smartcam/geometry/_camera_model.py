@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 DistortionModel: TypeAlias = Literal["plumb_bob", "rational_polynomial", "equidistant"]
-"""Names of ROS' ``camera_info``."""
+"""Distortion models, by their names in ROS' ``camera_info``."""
 
 COEFFICIENT_NAMES: dict[DistortionModel, tuple[str, ...]] = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
-"""In their order; those of ``equidistant`` are of the angle."""
+"""Names of each model's coefficients, in order; ``equidistant`` has powers of the angle."""
 
 COEFFICIENTS: dict[DistortionModel, int] = {
     model: len(names) for model, names in COEFFICIENT_NAMES.items()
@@ -37,13 +37,13 @@ COEFFICIENTS: dict[DistortionModel, int] = {
 
 
 def coefficient_names(model: DistortionModel) -> tuple[str, ...]:
-    """Return the names of a model's coefficients; ``SHAPE``: no such model."""
+    """Return the names of a model's coefficients; raise SHAPE if there is no such model."""
     check_choice(model, list(COEFFICIENT_NAMES), "distortion model")
     return COEFFICIENT_NAMES[model]
 
 
 def _column(values: ArrayLike) -> Array:
-    """Return coefficients as a copy (K,), from rows or columns of them; else SHAPE, NOT_FINITE."""
+    """Return a copy (K,) of a row or column of coefficients; raise SHAPE or NOT_FINITE."""
     try:
         column = np.reshape(values, (-1, 1))
     except (TypeError, ValueError, ArithmeticError) as exc:
@@ -95,7 +95,7 @@ class CameraModel(Stored):
 
     @property
     def field_of_view(self) -> tuple[float, float]:
-        """Angles that the image is wide and high without its distortion, radians."""
+        """Horizontal and vertical angle of view without distortion, radians."""
         width, height = self.size
         return (
             2 * math.atan(width / 2 / self.matrix[0, 0]),
@@ -106,10 +106,10 @@ class CameraModel(Stored):
         """Project points of the camera's frame into the image.
 
         Args:
-            points: (N, 3), metres, before the camera.
+            points: (N, 3), metres, in front of the camera.
 
         Returns:
-            (N, 2), pixels; NaN for what lies behind the camera.
+            (N, 2), pixels; NaN for points behind the camera.
 
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.
@@ -136,13 +136,13 @@ class CameraModel(Stored):
         return pixels
 
     def directions(self, pixels: ArrayLike) -> Array:
-        """Return the points of the plane z = 1 of the camera's frame on the rays through pixels.
+        """Return the points at which the rays through pixels meet the camera's plane z = 1.
 
         Args:
             pixels: (N, 2).
 
         Returns:
-            (N, 2), x and y there: without the lens' distortion.
+            (N, 2), x and y in this plane, without the lens' distortion.
 
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.

@@ -1,4 +1,4 @@
-"""Check the arguments that several of these types take: words, and sizes of images."""
+"""Check arguments of several types: words from a list, and sizes of images."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 def check_choice(value: object, among: Sequence[str], what: str) -> None:
-    """Raise SHAPE if an option is none of those that there are."""
-    word = plain(value)  # a class of somebody's may hash and compare as it likes
+    """Raise SHAPE if an option is not in the list of known ones."""
+    word = plain(value)  # a user's class may hash and compare in any way
     if not isinstance(word, str) or word not in among:
         known = list(among)
         text = f"{what}: expected one of {known}, got {shown(value)}"
@@ -23,7 +23,7 @@ def check_choice(value: object, among: Sequence[str], what: str) -> None:
 
 
 def check_size(values: Any, called: str) -> None:
-    """Raise SHAPE if something is no size of an image: width and height, pixels."""
+    """Raise SHAPE unless a value is an image's width and height, pixels."""
     whole = (int, np.integer)
     plain = isinstance(values, tuple | list) and len(values) == 2
     if not plain or not all(isinstance(one, whole) and one > 0 for one in values):

@@ -1,4 +1,4 @@
-"""One word for each thing that can be wrong with a calibration."""
+"""Codes of errors and remarks about calibrations."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ class Code(enum.StrEnum):
 
     # samples
     SHAPE = "SHAPE"
-    """The numbers do not come in the shape that is expected, or not as many of each."""
+    """An array has another shape than expected, or arrays differ in length."""
     NOT_FINITE = "NOT_FINITE"
     """NaN or infinity among the numbers."""
     TOO_FEW = "TOO_FEW"
-    """Fewer points than the model has need of."""
+    """Fewer points than the model needs."""
     COINCIDENT = "COINCIDENT"
-    """Points that should be apart are the same; or cameras, or views."""
+    """Points, cameras or views that should be apart are at the same place."""
     COLLINEAR = "COLLINEAR"
-    """The points lie on a line, or so nearly that the rest is not determined."""
+    """The points lie so nearly on a line that other directions are not determined."""
     SHORT_LEVER = "SHORT_LEVER"
-    """The points lie too close together for how well they are touched."""
+    """The points lie too close together for the error with which they were touched."""
     MIRRORED = "MIRRORED"
     """Left and right are exchanged: a camera's frame is left-handed as seen from the tool's side (y
     points the wrong way), a robot's base is, or pictures were flipped."""
     SIDE_UNKNOWN = "SIDE_UNKNOWN"
-    """From which side the plane is touched was not told: mirrored input could not be noticed."""
+    """The side from which the plane is touched is not given: mirrored input is not detected."""
     SCALE_MISMATCH = "SCALE_MISMATCH"
     """The scale of the points is not the nominal one: print, units or height differ."""
     SCALE_ASSUMED = "SCALE_ASSUMED"
     """The scale was taken from the user; no point measures it."""
     NOT_PLANAR = "NOT_PLANAR"
-    """The touched points lie further from a plane than touching explains."""
+    """The touched points lie farther from a plane than touching errors explain."""
     POOR_FIT = "POOR_FIT"
-    """The residuals are larger than touching explains."""
+    """The residuals are larger than touching errors explain."""
     OUTLIER = "OUTLIER"
     """A point that fits far worse than the others; as an error, half of the points or more."""
     WRONG_ORDER = "WRONG_ORDER"
-    """Touches that fit far better when they are taken for those of other points: exchanged ones."""
+    """Touches that fit far better when they are assigned to other points: they were exchanged."""
     REFUTED = "REFUTED"
-    """Touches after a calibration was made lie further off than is allowed."""
+    """Touches made to check a finished calibration are farther off than the limit."""
     NOT_SIMILAR = "NOT_SIMILAR"
-    """One scale for the whole field does not do: the camera is tilted, or its lens distorts."""
+    """One scale does not fit the whole field: the camera is tilted, or its lens distorts."""
     NOT_HELD_OUT = "NOT_HELD_OUT"
-    """Too few points to leave one out: nothing tells how good the calibration is."""
+    """Too few points to leave one out: the calibration's error cannot be estimated."""
     UNVERIFIED = "UNVERIFIED"
-    """Nothing tells how well the points were touched: no predicted error."""
+    """The touching error is unknown, so no error is predicted."""
     OUT_OF_FIELD = "OUT_OF_FIELD"
     """A point that the calibration cannot map: behind the horizon of the plane."""
     OUT_OF_PLANE = "OUT_OF_PLANE"
@@ -68,29 +68,29 @@ class Code(enum.StrEnum):
 
     # frames
     NOT_RIGID = "NOT_RIGID"
-    """No rotation: a reflection, a scale, a quaternion that is not valid."""
+    """A matrix or quaternion that is not a rotation: reflected, scaled or not valid."""
     BAD_TIME = "BAD_TIME"
-    """A time that is missing, or for which nothing is known."""
+    """A time is missing, or no pose is known for it."""
     NOT_SIMULTANEOUS = "NOT_SIMULTANEOUS"
-    """Two things that belong to different times."""
+    """Two values that belong to different times."""
 
     # images
     TARGET_NOT_FOUND = "TARGET_NOT_FOUND"
     """The image does not show the target, or not enough of it."""
     WRONG_TARGET = "WRONG_TARGET"
-    """The image shows a target that is not the one that was described."""
+    """The image shows another target than the described one."""
     AMBIGUOUS_ORIGIN = "AMBIGUOUS_ORIGIN"
-    """The target's origin cannot be told from its other corners with a margin."""
+    """The target's origin cannot be told clearly from its other corners."""
     WRONG_SIZE = "WRONG_SIZE"
     """An image of another size than the camera's, or than the other images."""
     DIFFERENT_TARGETS = "DIFFERENT_TARGETS"
     """Views of several targets where those of one are expected."""
     BAD_VIEW = "BAD_VIEW"
-    """A view that fits far worse than the others; it is left out."""
+    """A view that fits far worse than the others and is left out."""
     SWAPPED_SIDES = "SWAPPED_SIDES"
-    """The camera that is called right stands left of the one that is called left."""
+    """The camera named right stands to the left of the camera named left."""
     POOR_COVERAGE = "POOR_COVERAGE"
-    """The views show the target in too few places, sizes or tilts to tell the lens well."""
+    """The views show the target in too few places, sizes or tilts to determine the lens well."""
     SHEET_NOT_EXACT = "SHEET_NOT_EXACT"
     """The points of a printed target are not where they were meant to be."""
     PAGE_TOO_SMALL = "PAGE_TOO_SMALL"
@@ -98,9 +98,9 @@ class Code(enum.StrEnum):
     LENS_UNKNOWN = "LENS_UNKNOWN"
     """No lens was given: its distortion is not corrected."""
     NO_PICTURE = "NO_PICTURE"
-    """No picture came in time, or nowhere it could come from."""
+    """No picture came in time, or there is no source of pictures."""
     BAD_PICTURE = "BAD_PICTURE"
-    """A picture that cannot be read: damaged, too large, of no known format."""
+    """A picture that cannot be read: damaged, too large or of an unknown format."""
 
     # steps, files and services
     WRONG_ANSWERS = "WRONG_ANSWERS"
@@ -114,66 +114,65 @@ class Code(enum.StrEnum):
     NO_CALIBRATION = "NO_CALIBRATION"
     """No calibration was loaded."""
     WRONG_JOURNAL = "WRONG_JOURNAL"
-    """A journal that another wizard wrote, or another version of it."""
+    """A journal of another wizard, or of another version of this wizard."""
     IN_USE = "IN_USE"
-    """Another process, or another sequence of this one, writes the journal or in the folder."""
+    """Another process or sequence writes to the journal or the folder."""
     BAD_NAME = "BAD_NAME"
-    """A name that no file may have, or that leads out of the folder."""
+    """A name that is not allowed for a file, or that leads out of the folder."""
     NOT_FOUND = "NOT_FOUND"
     """No such file."""
     BROKEN_FILE = "BROKEN_FILE"
-    """A file that was damaged or changed, or is no file of smartcam."""
+    """A file that was damaged or changed, or was not written by smartcam."""
     WRONG_KIND = "WRONG_KIND"
-    """A file of smartcam with other contents."""
+    """A file of smartcam that holds another kind of value."""
     NEWER_VERSION = "NEWER_VERSION"
-    """A file of a newer smartcam, whose meaning this one does not know."""
+    """A file of a newer version of smartcam, which this version cannot interpret."""
     NOT_STORABLE = "NOT_STORABLE"
     """A value that JSON cannot hold exactly: NaN, infinity, an object."""
     NOT_WRITTEN = "NOT_WRITTEN"
-    """A file that could not be written: the disk is full, or nobody may write there."""
+    """A file that could not be written: the disk is full, or permission is missing."""
 
     # formats of other programs
     UNKNOWN_FORMAT = "UNKNOWN_FORMAT"
-    """No format, or no robot's convention, of this name."""
+    """There is no format or robot convention of this name."""
     UNIT_UNKNOWN = "UNIT_UNKNOWN"
-    """Nothing says in which unit lengths or angles are, or they are implausible in the one that is
-    said."""
+    """The unit of lengths or angles is not given, or the values are implausible in this unit."""
     MALFORMED = "MALFORMED"
-    """A file of another program that is not what its format says."""
+    """A file of another program that does not follow its format."""
 
-    # what belongs to something else
+    # covariances and known lenses
     NO_COVARIANCE = "NO_COVARIANCE"
-    """Matrices that are no covariances: not symmetric, or with a negative variance."""
+    """A matrix that is not a covariance: not symmetric, or with a negative variance."""
     SWAPPED_LENSES = "SWAPPED_LENSES"
-    """The known lens of each camera is the other one's."""
+    """The known lenses of the two cameras are exchanged."""
     WRONG_LENS = "WRONG_LENS"
-    """A known lens shows the views worse than one that is fitted to them."""
+    """A known lens reproduces the views worse than a lens that is fitted to them."""
 
     def refusal(self, text: str, expected: object = None, got: object = None) -> CalibrationError:
-        """Return the error for what is refused; ``text`` says what was expected and what came."""
+        """Return an error; ``text`` names the expected and the given value."""
         return CalibrationError(text, code=self, expected=expected, got=got)
 
     def unexpected(
         self, text: str, expected: object = None, got: object = None
     ) -> CalibrationError:
-        """Return the same error; ``text`` says what was expected, and ``got`` is said behind it."""
+        """Return an error; ``text`` names the expected value, and ``got`` is appended."""
         try:
             came = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
-        except Exception:  # noqa: BLE001 - whatever a class of somebody's raises there
+        except Exception:  # noqa: BLE001 - a foreign class may raise any
             came = shown(got)
         return self.refusal(f"{text}, got {came}", expected, got)
 
     def remark(self, text: str) -> Remark:
-        """Return the remark of this code."""
+        """Return a remark with this code."""
         return Remark(self, text)
 
 
 class Remark(NamedTuple):
-    """A remark on a calibration that could be made.
+    """A remark on a calibration that succeeded.
 
     Attributes:
-        code: what it is, in one word.
-        text: what was found and what was expected.
+        code: kind of the remark.
+        text: the found and the expected value.
     """
 
     code: Code

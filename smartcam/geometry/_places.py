@@ -46,7 +46,7 @@ class PlacePattern(Sequence[Transform]):
         pitch: distances to the next column, row and layer, metres.
 
     Raises:
-        ConfigurationError: a number of places or a distance that cannot be.
+        ConfigurationError: a number of places or a distance that is not possible.
         CalibrationError: ``SHAPE``: the frame is no transform.
     """
 
@@ -57,7 +57,7 @@ class PlacePattern(Sequence[Transform]):
     pitch: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the numbers, each as it has to be for its count."""
+        """Check the counts, and the pitch along each direction with more than one place."""
         who = "PlacePattern"
         as_motion(self.frame, f"{who}: frame", "robot", "place")
         for name in ("rows", "columns", "layers"):
@@ -85,9 +85,9 @@ class PlacePattern(Sequence[Transform]):
         height: float = 0.0,
         robot_frame: str = "robot",
     ) -> PlacePattern:
-        """Return the pattern whose three outer places of the lowest layer a robot touched.
+        """Return the pattern with three corner places of the lowest layer as a robot touched them.
 
-        Layers lie on the side from which the row turns left to the column.
+        Layers are stacked towards the side from which the turn from row to column is to the left.
 
         Args:
             first: (3,), the first place, metres.
@@ -100,9 +100,9 @@ class PlacePattern(Sequence[Transform]):
             robot_frame: name of the frame that the touches are given in.
 
         Raises:
-            ConfigurationError: a number of places or a distance that cannot be.
-            CalibrationError: ``SHAPE``, ``NOT_FINITE``; ``NOT_RIGID``: the three points are as
-                good as one, or on one line.
+            ConfigurationError: a number of places or a distance that is not possible.
+            CalibrationError: ``SHAPE``, ``NOT_FINITE``; ``NOT_RIGID``: the three points nearly
+                coincide, or lie on one line.
         """
         who = "PlacePattern.from_touches"
         rows = check_integer(rows, "rows", 2, MAX_PLACES, who)

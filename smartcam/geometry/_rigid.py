@@ -1,11 +1,11 @@
 """Compute with arrays of rigid motions: compose, invert, apply small steps, compare.
 
-A motion is ``p' = R p + t``. Rotations are matrices, since that is what points are multiplied with;
+A motion is ``p' = R p + t``. Rotations are matrices, since points are multiplied with them;
 their exponential and logarithm are those of SciPy's ``Rotation``.
 
 A small step ``(w, d)`` is a rotation vector and a shift. The shift is always added to ``t``, along
-the axes of the frame that the motion leads to. The turn is on either side of R: ``exp([w]x) R``
-turns in the frame that the motion leads to, ``R exp([w]x)`` in the one that it comes from.
+the axes of the target frame. The turn is on either side of R: ``exp([w]x) R`` turns about the
+target frame's axes, ``R exp([w]x)`` about those of the source frame.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     Index = NDArray[np.intp] | Sequence[int] | slice | int
 
 SMALL_ANGLE = 1e-4
-"""Below this angle, radians, the first term of a series replaces a factor, with an error of
-1e-9."""
+"""Angle, radians, below which the first term of a series is used; its error is 1e-9."""
 
 
 class Rigid(NamedTuple):
@@ -43,7 +42,7 @@ class Rigid(NamedTuple):
 
     @classmethod
     def stacked(cls, motions: Iterable[Rigid]) -> Rigid:
-        """Return single motions as one array of them."""
+        """Return single motions as one array."""
         rows = list(motions)
         rotations = np.array([one.rotation for one in rows], dtype=np.float64)
         translations = np.array([one.translation for one in rows], dtype=np.float64)
@@ -55,7 +54,7 @@ class Rigid(NamedTuple):
         return len(self.translation)
 
     def __matmul__(self, other: Rigid) -> Rigid:
-        """Return the motion of another one followed by this one."""
+        """Return the motion ``other`` followed by this motion."""
         # R1 (R2 p + t2) + t1 = (R1 R2) p + (R1 t2 + t1)
         turned = (self.rotation @ other.translation[..., None])[..., 0]
         return Rigid(self.rotation @ other.rotation, turned + self.translation)
@@ -67,12 +66,12 @@ class Rigid(NamedTuple):
         return Rigid(back, -(back @ self.translation[..., None])[..., 0])
 
     def apply(self, points: Array) -> Array:
-        """Return points (..., N, 3) moved."""
+        """Return the moved points (..., N, 3)."""
         moved: Array = points @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
         return moved
 
     def taken(self, index: Index) -> Rigid:
-        """Return some of the motions, or one."""
+        """Return the motions at an index."""
         return Rigid(self.rotation[index], self.translation[index])
 
     def scaled(self, scale: float) -> Rigid:

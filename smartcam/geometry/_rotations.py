@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 Array: TypeAlias = NDArray[np.float64]
-"""float64 of any shape; each function says which."""
+"""A float64 array; each function names its shape."""
 
 MIN_SINE = 0.17
 """Sine of the least angle between two axes that are to span a plane: 10 degrees.
@@ -27,17 +27,17 @@ At 5 degrees, 0.5 mm of height tilt the normal by 2.2 degrees, at 1 degree by 10
 """
 
 MAX_COORDINATE = 1e100
-"""Largest coordinate that is accepted; a product of three such ones is still a finite number."""
+"""Largest accepted coordinate; a product of three such coordinates is still finite."""
 
 
 def as_points(values: ArrayLike, columns: int, what: str) -> Array:
-    """Return ``values`` as float64 of shape (N, ``columns``); else SHAPE or NOT_FINITE.
+    """Return ``values`` as float64 of shape (N, ``columns``); raise SHAPE or NOT_FINITE.
 
     ``what`` names the points in the text.
     """
     try:
         if np.iscomplexobj(values):
-            raise TypeError("complex ones came")
+            raise TypeError("got complex numbers")
         points = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.refusal(
@@ -64,21 +64,21 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
 
 
 def as_vector(values: ArrayLike, length: int, what: str) -> Array:
-    """Return ``values`` as float64 of shape (``length``,); else SHAPE or NOT_FINITE."""
+    """Return ``values`` as float64 of shape (``length``,); raise SHAPE or NOT_FINITE."""
     one: Any = [values]
     vector: Array = as_points(one, length, what)[0]
     return vector
 
 
 def check_finite(values: Array, what: str) -> None:
-    """Raise NOT_FINITE if a calibration gives no number; ``what`` says what it was to give."""
+    """Raise NOT_FINITE if a calibration's result is not finite; ``what`` names the result."""
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
         raise not_finite(what, np.atleast_1d(values[row]).tolist())
 
 
 def not_finite(what: str, got: object) -> CalibrationError:
-    """Return the error that says that a calibration gives what is no number."""
+    """Return the error for a calibration's result that is not finite."""
     return Code.NOT_FINITE.refusal(
         f"{what}: expected finite numbers, the calibration gives {got}: it is damaged, or this is "
         "far outside of what it was made for",
@@ -131,7 +131,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
 def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     """Return the unit quaternions (..., 4) of rotation matrices (..., 3, 3).
 
-    Of the two signs it is the one whose largest element is positive.
+    The largest element of the quaternion is positive.
     """
     rows = np.moveaxis(np.asarray(matrix, dtype=np.float64), (-2, -1), (0, 1))
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rows
@@ -157,7 +157,7 @@ def frame_from_axes(x: ArrayLike, y: ArrayLike) -> Array:
     """Return the rotation (3, 3) with the columns x, n cross x, n, where n is along x cross y.
 
     ``x`` and ``y`` (3,) have any length; ``y`` is any direction on the side of the second axis.
-    Raises COINCIDENT: one has no length; COLLINEAR: less than 10 degrees apart.
+    Raises COINCIDENT: a vector has length 0; COLLINEAR: they are less than 10 degrees apart.
     """
     first, second = as_vector(x, 3, "first axis"), as_vector(y, 3, "second axis")
     lengths = np.linalg.norm(first), np.linalg.norm(second)

@@ -1,8 +1,8 @@
-"""Objects as plain data: each field stands once, where its class declares it.
+"""Objects as plain data: a class declares each field and its form in a file in one place.
 
-A :class:`Stored` class is a dataclass whose annotations say how its fields stand in a file: what
-pydantic checks there, how the value is made of that, and plain data of the value. A :class:`Form`
-is all three, such as nested lists of numbers for an array::
+The annotations of a :class:`Stored` dataclass say how pydantic checks a field's data, how the value
+is made of these data, and how it is written as plain data. A :class:`Form` holds all three, such as
+nested lists of numbers for an array::
 
     @dataclass(frozen=True, kw_only=True, eq=False)
     class CameraModel(Stored):
@@ -45,22 +45,22 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 Context: TypeAlias = MutableMapping[str, Any]
-"""The knowledge with which a value is read: how errors call the whole (``called``), and the values
-that a class shares with those behind them."""
+"""Context for reading: the object's name in errors (``called``), and values that later keys
+need."""
 
 Keys: TypeAlias = Mapping[str, str]
-"""Names in a file by those of fields; empty for a field that is made of other keys."""
+"""Keys in a file by the names of fields; empty for a field that is made of other keys."""
 
 Others: TypeAlias = Mapping[str, tuple[Any, Callable[[Any], Any]]]
-"""Keys that a file has beside the fields: the type of each, and how it is got from an object."""
+"""Additional keys of a file: the type of each, and the function that reads it from an object."""
 
 
 @dataclass(eq=False)
 class Form:
-    """The form in a file of the value that it annotates."""
+    """The form in a file of the annotated value."""
 
-    checked: Any  # the type that pydantic checks there
-    read: Callable[[Any, Context], Any]  # makes the value, of what was checked and the context
+    checked: Any  # type by which pydantic checks the data
+    read: Callable[[Any, Context], Any]  # makes the value from checked data and context
     write: Callable[[Any], Any]  # makes plain data of the value
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -73,7 +73,7 @@ class Form:
 
 @dataclass(eq=False)
 class AsList:
-    """A tuple of any length stands as a list, of ``least`` items at least."""
+    """Stores a tuple of any length as a list of at least ``least`` items."""
 
     least: int = 0
 
@@ -84,7 +84,7 @@ class AsList:
 
 
 class AsMapping:
-    """A NamedTuple stands as a mapping."""
+    """Stores a NamedTuple as a mapping."""
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         hints = get_type_hints(kind, include_extras=True)
@@ -121,31 +121,31 @@ class Stored:
     _keys: ClassVar[Keys] = {}
 
     _others: ClassVar[Others] = {}
-    """The entries that stand before the fields."""
+    """Entries that are written before the fields."""
 
     _shared: ClassVar[frozenset[str]] = frozenset({"target"})
-    """The keys whose values are known when the keys behind them are read."""
+    """Keys whose values are in the context when later keys are read."""
 
     _later: ClassVar[frozenset[str]] = frozenset()
-    """Keys that a file need not have: defaults take their place."""
+    """Keys that may be missing in a file, which then get defaults."""
 
     def to_data(self) -> dict[str, Any]:
-        """Return everything as JSON takes it, None for NaN; :meth:`from_data` gives it back."""
+        """Return the object as data for JSON, None for NaN; :meth:`from_data` reads these data."""
         kind: Any = type(self)
         data: dict[str, Any] = _adapter(kind).dump_python(self, warnings=False)
         return data
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], **known: Any) -> Self:
-        """Return the object of :meth:`to_data`, bit by bit; nothing is calculated anew.
+        """Return the object that :meth:`to_data` wrote, identical in every bit.
 
         Args:
-            data: what a file holds.
-            known: what does not stand there: the ``target`` of a view.
+            data: contents of a file.
+            known: values that the file does not have, such as the ``target`` of a view.
 
         Raises:
-            CalibrationError: SHAPE: it is something else; NOT_FINITE or NOT_RIGID: numbers that no
-                such calibration has.
+            CalibrationError: SHAPE: the data have another structure; NOT_FINITE or NOT_RIGID:
+                numbers that are not possible.
         """
         found: Self = _checked(cls, data, cls._called, **known)
         return found
@@ -178,7 +178,7 @@ class Stored:
 
     @classmethod
     def _read(cls, found: dict[str, Any], context: Context) -> Self:
-        """Return an object of what was found for its fields and ``_others``; check how it fits.
+        """Return an object made of the values found for its fields and ``_others``.
 
         Raises SHAPE: the fields do not fit together.
         """
@@ -187,7 +187,7 @@ class Stored:
         return made
 
     def _check(self, found: Mapping[str, Any], called: str) -> None:
-        """Raise if fields do not fit together, or to the others that were found."""
+        """Raise if fields do not fit together, or do not fit the values of ``_others``."""
 
 
 def _share(key: str) -> Callable[[Any, core_schema.ValidationInfo[Context]], Any]:
@@ -216,19 +216,19 @@ def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
 
 
 def refused(called: str, text: str, got: object) -> CalibrationError:
-    """Return the error that says why stored data are not valid."""
+    """Return the error for stored data that are not valid."""
     return Code.SHAPE.refusal(f"stored {called}: {text}", got=got)
 
 
 def check_counts(found: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
-    """Raise SHAPE if a field has not as many items as another one."""
+    """Raise SHAPE if a field does not have ``count`` items."""
     for name in names:
         if len(found[name]) != count:
             raise refused(called, f"{name}: expected {count}", len(found[name]))
 
 
 def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
-    """Raise SHAPE if a field has not as many values as others ask for."""
+    """Raise SHAPE if a field's array does not have the given shape."""
     if values.shape != shape:
         raise refused(called, f"{name}: expected shape {shape}", values.shape)
 
@@ -243,7 +243,7 @@ def _bounded(value: float) -> float:
 
 
 Number = Annotated[FiniteFloat, AfterValidator(_bounded)]
-"""A number that may stand in a file: what is calculated of a few of them is finite, too."""
+"""A number of a file, so bounded that products of a few are still finite."""
 
 NonNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -262,7 +262,7 @@ def _closed(value: float) -> float | None:
 
 
 Open = Annotated[float, Form(Number | None, lambda value, _: _opened(value), _closed)]
-"""A number that may be NaN; it stands as null."""
+"""A number that may be NaN, which is stored as null."""
 
 OpenPair = Annotated[
     tuple[float, float],
@@ -275,7 +275,7 @@ OpenPair = Annotated[
 
 
 def row(checked: Any, make: Callable[[Any], Any] = tuple) -> Form:
-    """Return the form of a tuple of fixed length, or of what ``make`` makes of it; a list."""
+    """Return the form of a tuple of fixed length, or of what ``make`` makes, stored as a list."""
     return Form(checked, read=lambda values, _: make(values), write=list)
 
 
@@ -286,7 +286,7 @@ Size = Annotated[tuple[int, int], row(tuple[int, int])]
 
 
 def as_array(values: Any, _: Context | None = None) -> Array:
-    """Return nested lists as an array, NaN for None; an empty one where rows differ in length."""
+    """Return nested lists as an array, NaN for None; an empty array if rows differ in length."""
     try:
         return np.array(values, dtype=np.float64)
     except ValueError:
@@ -311,16 +311,16 @@ Matrix43 = Annotated[Array, Form(tuple[Triple, Triple, Triple, Triple], as_array
 
 
 def matrix(count: int | None = None) -> Form:
-    """Return the form of a matrix of ``count`` rows; its class checks what is not said here."""
+    """Return the form of a matrix of ``count`` rows; its class checks the number of columns."""
     checked = Annotated[list[list[Number]], Field(min_length=count or 0, max_length=count)]
     return Form(checked, as_array, _tolist)
 
 
 def rows(checked: Any, *shape: int, least: int = 0, nulls: bool = False) -> Form:
-    """Return the form of an array (N, ``*shape``) that stands as a list.
+    """Return the form of an array (N, ``*shape``) that is stored as a list.
 
     ``checked``: the type of an item that pydantic checks. ``least``: how many there are at least.
-    ``nulls``: whether NaN may be among them; it stands as null.
+    ``nulls``: whether values may be NaN, which is stored as null.
     """
     return Form(
         Annotated[list[checked], Field(min_length=least)],
@@ -330,7 +330,7 @@ def rows(checked: Any, *shape: int, least: int = 0, nulls: bool = False) -> Form
 
 
 SheetOffsets = Annotated[Array, rows(Triple, 3)]
-"""Offsets of a target's points from where they were meant to be, metres."""
+"""Offsets of a target's points from their nominal places, metres."""
 
 # ---------------------------------------------------------------------- remarks and motions
 
@@ -357,11 +357,11 @@ def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
 
 
 def motion_to_data(transform: Transform) -> dict[str, Any]:
-    """Return a rigid motion as JSON takes it, without its frames."""
+    """Return a rigid motion as data for JSON, without its frames."""
     found = _Motion(transform.rotation, transform.translation)
     return {name: values.tolist() for name, values in found._asdict().items()}
 
 
 def motion_from_data(data: Mapping[str, Any], target: str, source: str) -> Transform:
-    """Return the motion that :func:`motion_to_data` was made of; else SHAPE or NOT_RIGID."""
+    """Return the motion that :func:`motion_to_data` wrote; raise SHAPE or NOT_RIGID."""
     return Transform(target, source, *_checked(Annotated[_Motion, AsMapping()], data, "motion"))

@@ -1,9 +1,9 @@
-"""Frames: how coordinate systems lie against each other, and when they did so.
+"""Transforms between coordinate frames, with the times at which they held.
 
-A :class:`Transform` knows which way it goes: from ``source`` coordinates into ``target``
-coordinates. Two of them can be put one behind the other only where the frame between them is the
-same, so one that is taken the wrong way round does not pass. A :class:`PoseHistory` keeps those of
-a frame that moves, and gives the one at a moment.
+A :class:`Transform` knows its direction: from ``source`` coordinates into ``target`` coordinates.
+Two transforms can be composed only if the frame between them is the same, so a transform of the
+wrong direction raises an error. A :class:`PoseHistory` keeps the transforms of a moving frame, and
+interpolates the pose at a moment.
 
 Right-handed, metres, Hamilton quaternions ``x, y, z, w``.
 """
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from smartcam.geometry._rotations import Array
 
 _MAX_ORTHONORMAL_DEVIATION: Final = 1e-6
-"""Largest difference of ``R R^T`` from one: at a metre this is a micrometre."""
+"""Largest deviation of ``R R^T`` from the identity: at a metre this is a micrometre."""
 
 _MAX_UNIT_DEVIATION: Final = 0.01
-"""Largest difference of a quaternion's length from one; it is made one. Robots print few digits;
-what is farther off is no quaternion, or is in another order."""
+"""Largest deviation of a quaternion's length from 1. Robots print few digits; a larger deviation
+means that the numbers are in another order, or are not a quaternion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,15 +48,15 @@ class Transform:
     """A rigid motion ``T_target_source``: ``p_target = rotation @ p_source + translation``.
 
     Attributes:
-        target: the frame that it leads to.
-        source: the frame that it comes from.
+        target: frame of the transformed coordinates.
+        source: frame of the given coordinates.
         rotation: (3, 3), determinant +1. Read-only.
         translation: (3,), metres: the source's origin in the target. Read-only.
-        at: moment at which the transform held; None for one that does not change.
+        at: moment at which the transform held; None if it does not change.
 
     Raises:
-        CalibrationError: no rotation (``NOT_RIGID``: a reflection and a scale, too), not finite,
-            or a time without a time zone (``BAD_TIME``).
+        CalibrationError: ``NOT_RIGID``: the matrix is not a rotation (also a reflection or a
+            scale), or numbers are not finite; ``BAD_TIME``: the time has no time zone.
     """
 
     target: str
@@ -66,7 +66,7 @@ class Transform:
     at: datetime | None = None
 
     def __post_init__(self) -> None:
-        """Take read-only copies, and check them."""
+        """Make read-only copies, and check them."""
         for name in (self.target, self.source):
             if not isinstance(name, str):
                 raise Code.SHAPE.refusal(
@@ -116,10 +116,10 @@ class Transform:
         """Return the transform of a position and an orientation.
 
         Args:
-            target: the frame in which both are given.
-            source: the frame whose pose they are.
+            target: frame in which position and orientation are given.
+            source: frame that has this pose.
             translation: (3,), metres.
-            quaternion: (4,), ``x, y, z, w``. Its length is made one.
+            quaternion: (4,), ``x, y, z, w``. It is normalised.
             at: moment at which the transform held.
 
         Raises:
@@ -154,7 +154,7 @@ class Transform:
 
     @property
     def label(self) -> str:
-        """Its name as it is written in formulas: ``T_target_source``."""
+        """Name of the transform as in formulas: ``T_target_source``."""
         return f"T_{self.target}_{self.source}"
 
     @property
@@ -164,14 +164,14 @@ class Transform:
 
     @property
     def quaternion(self) -> Array:
-        """(4,), ``x, y, z, w``, whose largest element is positive."""
+        """Rotation as a quaternion (4,), ``x, y, z, w``; its largest element is positive."""
         return quaternion_from_matrix(self.rotation)
 
     def pose(self, seq: int = 0) -> Pose:
-        """Return the source's pose in the target.
+        """Return the pose of the source frame in the target frame.
 
         Raises:
-            CalibrationError: ``BAD_TIME``: it has no time, and a pose must have one.
+            CalibrationError: ``BAD_TIME``: the transform has no time, which a pose needs.
         """
         if self.at is None:
             raise Code.BAD_TIME.refusal(
@@ -193,8 +193,8 @@ class Transform:
         """Return ``T_a_b @ T_b_c = T_a_c``.
 
         Raises:
-            CalibrationError: ``WRONG_FRAME``: the frames between them differ; ``NOT_SIMULTANEOUS``:
-                their times do.
+            CalibrationError: ``WRONG_FRAME``: the frames between the two differ;
+                ``NOT_SIMULTANEOUS``: their times differ.
         """
         as_motion(other, f"{self.label} @", self.source, "source")
         if self.source != other.target:
@@ -215,11 +215,11 @@ class Transform:
         return Transform(self.target, other.source, *(self.rigid @ other.rigid), at)
 
     def apply(self, points: ArrayLike) -> Array:
-        """Return points of the source, (..., 3) in metres, in the target; else SHAPE."""
+        """Return points (..., 3) of the source in the target, metres; raise SHAPE."""
         return _rows(points, 3, f"{self.label}: points") @ self.rotation.T + self.translation
 
     def turn(self, quaternions: ArrayLike) -> Array:
-        """Return orientations in the source, (..., 4), as those in the target; else SHAPE."""
+        """Return the orientations in the target of those in the source, (..., 4); raise SHAPE."""
         return quaternion_multiply(self.quaternion, _rows(quaternions, 4, "orientations"))
 
     def between(self, later: Transform, at: datetime) -> Transform:
@@ -251,20 +251,20 @@ class Transform:
 
 
 def _numbers(values: ArrayLike, what: str) -> Array:
-    """Return a copy as float64; else NOT_RIGID."""
+    """Return a copy as float64; raise NOT_RIGID if it holds no numbers."""
     try:
         if np.iscomplexobj(values):
-            raise TypeError("complex ones came")
+            raise TypeError("got complex numbers")
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.NOT_RIGID.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
 
 
 def _rows(values: ArrayLike, count: int, what: str) -> Array:
-    """Return numbers (..., ``count``); else SHAPE. NaN may be among them."""
+    """Return numbers (..., ``count``), NaN included; raise SHAPE."""
     try:
         if np.iscomplexobj(values):
-            raise TypeError("complex ones came")
+            raise TypeError("got complex numbers")
         rows = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
@@ -290,13 +290,13 @@ def as_motion(value: object, what: str, target: str, source: str) -> Transform:
 
 
 class PoseHistory:
-    """Poses of a frame that moves in another one, by their times.
+    """Poses of a moving frame by their times.
 
     Args:
-        size: how many moments are kept; the oldest goes first.
-        max_gap: seconds between two moments at most, to take one in between. A robot that
-            accelerates with ``a`` leaves the straight line between them by ``a * max_gap^2 / 8``:
-            a tenth of a second and 1 m/s^2 are 1.25 mm.
+        size: largest number of poses that are kept; the oldest is dropped first.
+        max_gap: longest time, seconds, between two poses that are interpolated. A robot that
+            accelerates with ``a`` leaves the straight line between them by ``a * max_gap^2 / 8``: a
+            tenth of a second and 1 m/s^2 are 1.25 mm.
     """
 
     @takes(max_gap=check_seconds)
@@ -307,13 +307,13 @@ class PoseHistory:
         self._max_gap = timedelta(seconds=max_gap)
 
     def add(self, transform: Transform) -> None:
-        """Put in where the frame was at a moment; one more of the same moment takes its place.
+        """Add the pose at a moment; it replaces an earlier pose of the same moment.
 
-        They may come in any order.
+        Poses may be added in any order.
 
         Raises:
-            CalibrationError: ``BAD_TIME``: without a time; ``WRONG_FRAME``: of other frames than
-                those before.
+            CalibrationError: ``BAD_TIME``: the transform has no time; ``WRONG_FRAME``: its frames
+                differ from those of the transforms before.
         """
         if transform.at is None:
             raise Code.BAD_TIME.refusal(f"{transform.label}: expected a time, got none", got=None)
@@ -329,7 +329,7 @@ class PoseHistory:
         del self._times[: -self._size], self._transforms[: -self._size]
 
     def at(self, moment: datetime) -> Transform:
-        """Return the pose at a moment, interpolated between those before and after.
+        """Return the pose at a moment, interpolated between the poses before and after.
 
         Raises:
             CalibrationError: ``BAD_TIME``: before the first or after the last known moment (nothing

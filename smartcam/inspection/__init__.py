@@ -1,20 +1,21 @@
-"""Programs that inspect the pictures of a plain camera: what makes a smart camera of it.
+"""Programs that inspect pictures, and so turn a plain camera into a smart camera.
 
 ::
 
     cell = smartcam.inspection.load_cell("cell.yaml")
     program = cell["line1/cam1"].program(12)
-    inspection = program.inspect(frame)            # blocks; in any thread, several at once
+    inspection = program.inspect(frame)   # blocks; any threads may call it at once
     inspection.ok, inspection.reason, inspection.value.text
-    payload = inspection.payload()                 # the bytes, which program.interpret_as reads
+    payload = inspection.payload()  # bytes in the layout program.interpret_as
 
-A *tool* looks at a picture: a plug-in, found by its name among the entry points of the group
-``smartcam.tools``. A *program* is the list of tools of an application, in order. A *finding* is
-what one tool says: values, a verdict with its reason, marks to draw, and a frame of reference that
-later tools may follow. An *inspection* is all of that for one picture. The layout of a result
-follows from the program.
+A *tool* inspects a picture; it is a plug-in, an entry point of the group ``smartcam.tools``. A
+*program* is the ordered list of tools of an application. A *finding* is the result of one tool:
+values, a verdict with its reason, marks to draw, and a frame of reference that later tools may
+follow. An *inspection* holds all findings of one picture. The program determines the layout of a
+result.
 
-Nothing here knows a socket or a clock of a camera. The extra ``inspection`` brings what it needs.
+Programs use no sockets and no clock of a camera. The extra ``inspection`` installs the
+dependencies.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Cell files: software cameras and their programs; read from YAML, alone or in a fleet file."""
+"""Read software cameras and their programs from a cell file or a fleet file (YAML)."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     from smartcam.calibration._inside import AnyCalibration
 
 MAX_APPLICATIONS: Final = 1000
-"""Applications of one camera."""
+"""Largest number of applications of one camera."""
 
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 class ApplicationEntry(BaseModel):
-    """An application of a software camera; every other key is a tool, in the order they run."""
+    """An application of a software camera; every other key is a tool, in running order."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="allow", frozen=True, hide_input_in_errors=True
     )
 
     name: str = Field(
-        "", max_length=60, description="name of the application; others may follow it"
+        "", max_length=60, description="name of the application, by which others may follow it"
     )
     sequence: bool = Field(False, description="put the sequence number in front of the result")
     rate: float | None = Field(
@@ -60,7 +60,7 @@ class ApplicationEntry(BaseModel):
 
     @property
     def tools(self) -> dict[str, Any]:
-        """Settings of its tools by their keys, as YAML gives them."""
+        """Settings of the tools by their keys, as in YAML."""
         return dict(self.model_extra or {})
 
 
@@ -71,26 +71,26 @@ def _folder(given: str) -> str:
 
 
 class Keep(BaseModel):
-    """Settings of keeping judged pictures in a folder."""
+    """Settings for keeping inspected pictures in a folder."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
     )
 
     folder: Annotated[str, AfterValidator(_folder)] = Field(
-        min_length=1, description="folder beside this file; made if need be"
+        min_length=1, description="folder beside this file, which is created if needed"
     )
-    which: Literal["bad", "all"] = Field("bad", description="those that are not ok, or all")
+    which: Literal["bad", "all"] = Field("bad", description="keep bad pictures only, or all")
     most: int = Field(
         1000,
         ge=1,
         le=1_000_000,
-        description="pictures of the camera in the folder; the oldest ones make room",
+        description="largest number of pictures in the folder; the oldest are deleted",
     )
 
 
 class Software(BaseModel):
-    """The camera that programs make of a source of pictures: ``software:`` in a file."""
+    """A software camera as described by ``software:`` in a file."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -98,48 +98,47 @@ class Software(BaseModel):
 
     frames: str = Field(
         min_length=1,
-        description="where its pictures come from: gige://HOST, v4l2:///dev/video0, "
+        description="source of the pictures: gige://HOST, v4l2:///dev/video0, "
         "rtsp://HOST/..., or a file or folder beside this file",
     )
     calibration: str | None = Field(
         None,
-        description="file with a calibration, beside this one: results are in the robot's metres",
+        description="file with a calibration, beside this file: results are in the robot's metres",
     )
     applications: dict[int, ApplicationEntry] = Field(
         min_length=1,
         max_length=MAX_APPLICATIONS,
-        description="by number: a name, and the tools in the order they run",
+        description="applications by number: a name, and the tools in running order",
     )
     keep: Keep | None = Field(
-        None, description="keep judged pictures in a folder, with what was said about them"
+        None, description="keep inspected pictures in a folder, with their findings"
     )
     drawn: bool = Field(
         True,
-        description="draw what the tools saw into the pictures that a fleet shows; false: as they "
-        "came",
+        description="draw the tools' marks into the pictures that a fleet shows",
     )
 
     def frames_address(self, folder: Path) -> str:
         """Return the address for :func:`smartcam.frames.open`.
 
         Args:
-            folder: folder that the file is in.
+            folder: folder of the file.
         """
         return self.frames if _URL.match(self.frames) else str(folder / self.frames)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellCamera:
-    """A software camera, as its file says: loaded, but with nothing open.
+    """A software camera loaded from its file, with no open source.
 
     Attributes:
         name: name of the camera.
         frames: address for :func:`smartcam.frames.open`.
-        calibration: calibration of the camera; None: it has none.
+        calibration: calibration of the camera; None: not calibrated.
         programs: programs by the numbers of their applications.
-        rates: runs per second of the applications that run freely, by their numbers.
-        keep: settings of keeping judged pictures; None: none is kept.
-        folder: folder that the file is in.
+        rates: runs per second of the free-running applications, by their numbers.
+        keep: settings for keeping inspected pictures; None: keep none.
+        folder: folder of the file.
     """
 
     name: str
@@ -151,7 +150,7 @@ class CellCamera:
     folder: Path = Path()
 
     def program(self, application: int | str) -> Program:
-        """Return the program of an application's number or name.
+        """Return the program of an application, by its number or name.
 
         Raises:
             ConfigurationError: there is no such application.
@@ -167,7 +166,7 @@ class CellCamera:
 
 
 class _CellEntry(BaseModel):
-    """A camera in a file; what else a fleet file says of it is the fleet's to read."""
+    """A camera in a file; the fleet reads the other keys of a fleet file."""
 
     software: Software | None = None
 
@@ -177,14 +176,14 @@ class _CellFile(BaseModel):
 
 
 def load_cell(path: str | Path) -> dict[str, CellCamera]:
-    """Return the software cameras of a file, by name: a cell file, or a fleet file with some.
+    """Return the software cameras of a cell file or a fleet file, by name.
 
-    Nothing is opened, but what the tools need is loaded: models, taught pictures, calibrations.
+    No source is opened, but the tools' models, taught pictures and calibrations are loaded.
 
     Raises:
-        ConfigurationError: the file cannot be read, or a part of it cannot work; the text names
-            file, line and field.
-        MissingExtraError: what it needs is not installed.
+        ConfigurationError: the file cannot be read, or a part of it is wrong; the text names file,
+            line and field.
+        MissingExtraError: an extra is not installed.
     """
     path = check_path(path, "path", "load_cell")
     found: dict[str, CellCamera] = {}
@@ -206,7 +205,7 @@ def load_cell(path: str | Path) -> dict[str, CellCamera]:
 def software_mistakes(
     name: str, software: Software, folder: Path
 ) -> Iterator[tuple[tuple[int | str, ...], str]]:
-    """Yield the place and text of what cannot work in ``software:`` of a fleet file."""
+    """Yield the place and text of each mistake in ``software:`` of a fleet file."""
     try:
         make_camera(name, software, folder)
     except ProgramError as exc:
@@ -214,17 +213,17 @@ def software_mistakes(
 
 
 def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
-    """Return the camera that ``software:`` says.
+    """Return the camera that ``software:`` describes.
 
     Args:
         name: name of the camera.
-        software: what the file says of it.
-        folder: folder that the file is in.
+        software: entry of the camera in the file.
+        folder: folder of the file.
 
     Raises:
-        ConfigurationError: something cannot work. Where it is a place in the file, the error has
-            ``place``: the keys that lead there.
-        MissingExtraError: what it needs is not installed.
+        ConfigurationError: the entry has a mistake. If the mistake has a place in the file, the
+            error's ``place`` has the keys that lead to it.
+        MissingExtraError: an extra is not installed.
     """
     check_kind(software, Software, "software", "a Software", "make_camera")
     folder = check_path(folder, "folder", "make_camera")
@@ -268,7 +267,7 @@ def _calibration(software: Software, folder: Path) -> AnyCalibration | None:
 
 
 def _names(software: Software) -> dict[str, int]:
-    """Return the numbers of the applications that have a name."""
+    """Return the numbers of named applications by name."""
     names: dict[str, int] = {}
     for number, entry in software.applications.items():
         if not 0 <= number <= 0xFFFFFFFF:
@@ -289,7 +288,7 @@ def _steps(
     made: dict[int, list[ProgramStep]],
     waiting: tuple[int, ...],
 ) -> list[ProgramStep]:
-    """Return the steps of an application: before its own, those of applications that it follows."""
+    """Return the steps of an application, after the steps of followed applications."""
     if number in made:
         return made[number]
     place = ("applications", number)
@@ -321,7 +320,7 @@ def _steps(
             steps[follow] = ProgramStep(follow, FollowedApplication(followed, setup), own=False)
         if step.name in steps:
             raise ProgramError(
-                f"there is a tool {step.name!r} already: expected a name behind the tool's, such "
+                f"there is a tool {step.name!r} already: expected a name after the tool's, such "
                 f"as '{key.split()[0]} left:'",
                 (*place, key),
             )

@@ -1,4 +1,4 @@
-"""The tool `compare`: where a region differs from a taught picture."""
+"""The tool `compare`: differences between a region and a taught picture."""
 
 from __future__ import annotations
 
@@ -21,68 +21,65 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_AREA_PX: Final = 1_000_000_000
-"""Largest area that can be asked for, in pixels."""
+"""Largest area that a setting may have, in pixels."""
 
 MAX_SHIFT_PX: Final = 50
-"""Largest distance of a part from its place, in pixels; the search takes the square of it."""
+"""Largest shift of a part that is searched, in pixels; the time grows with its square."""
 
-MAX_DRAWN: Final = 100
-"""Differences that are drawn."""
+MAX_DRAWN_DIFFERENCES: Final = 100
+"""Largest number of differences that are drawn."""
 
 MAX_GAIN: Final = 2.0
-"""Largest factor by which the contrast may have risen or fallen."""
+"""Largest factor by which the contrast may rise or fall."""
 
-MAX_TURN: Final = math.radians(3.0)
-"""Largest turn of the part in its place, in radians."""
+MAX_ROTATION: Final = math.radians(3.0)
+"""Largest rotation of the part, in radians."""
 
 EDGE_TOLERANCE_PX: Final = 0.75
-"""Distance that an edge may be beside its taught place, in pixels."""
+"""Largest distance of an edge from its taught place, in pixels."""
 
 MAX_ITERATIONS: Final = 30
 """Largest number of steps of the alignment."""
 
-MIN_CORRELATION: Final = 0.5
-"""Correlation of taught and seen levels from which on they are the same thing in another light."""
+MIN_LIGHT_CORRELATION: Final = 0.5
+"""Least correlation of taught and current levels at which a change of light is assumed."""
 
-FIT_ROUNDS: Final = 4
-"""Fits of the light, each without the pixels that the last one did not explain."""
+LIGHT_FIT_ROUNDS: Final = 4
+"""Number of fits of the light; each leaves out the outliers of the one before."""
 
-LIGHT_PIXELS: Final = 50_000
-"""Pixels that the light is fitted to; of a larger region every nth."""
+MAX_LIGHT_PIXELS: Final = 50_000
+"""Largest number of pixels in the fit of the light; a larger region is sampled."""
 
 SURROUNDINGS_PX: Final = 31
-"""Side of the square around a pixel that it has to differ from, in pixels."""
+"""Side of the square of surroundings from which a pixel must differ, in pixels."""
 
 OUTLIER_SIGMAS: Final = 2.5
-"""Deviation, in standard deviations, from which on a pixel is not explained by the light."""
+"""Residual, in standard deviations, from which a pixel is an outlier of the light's fit."""
 
 
 class CompareSettings(ToolSettings):
-    """The taught picture, and how much may differ from it."""
+    """The taught picture, and the allowed differences."""
 
     taught: str = Field(
         min_length=1,
-        description="file with the taught picture, beside this one: a whole picture, or the region "
-        "alone",
+        description="file with the taught picture, beside this file: a whole picture or the region",
     )
-    level: int = Field(40, ge=1, le=255, description="grey levels from which on a pixel differs")
+    level: int = Field(40, ge=1, le=255, description="least difference of a pixel, grey levels")
     area: int = Field(
         20,
         ge=1,
         le=MAX_AREA_PX,
-        description="pixels of a difference at least; smaller do not count",
+        description="least area of a difference, pixels; smaller ones are ignored",
     )
     allowed: int = Field(
-        0, ge=0, le=MAX_AREA_PX, description="pixels that may differ, all differences together"
+        0, ge=0, le=MAX_AREA_PX, description="largest number of differing pixels in all"
     )
-    shift: int = Field(
-        3, ge=0, le=MAX_SHIFT_PX, description="pixels that the part may lie beside its place"
-    )
-    light: bool = Field(True, description="allow for a change of the light: brightness, contrast")
+    shift: int = Field(3, ge=0, le=MAX_SHIFT_PX, description="largest shift of the part, pixels")
+    light: bool = Field(True, description="allow for changes of brightness and contrast")
 
 
 class Compare(Tool[CompareSettings]):
-    """The difference to a taught picture in a region."""
+    """Compare a region with a taught picture."""
 
     settings_model = CompareSettings
 
@@ -118,11 +115,11 @@ class Compare(Tool[CompareSettings]):
 
     @property
     def fields(self) -> str:
-        """Return the layout of how much differs, and by how much the part lies beside its place."""
+        """Return the layout of the differences and the part's shift."""
         return "differing: uint32, count: uint16, shift_x: real32 px, shift_y: real32 px"
 
     def inspect(self, view: View) -> Finding:
-        """Return the number of pixels that differ, and their places."""
+        """Return the number and places of differing pixels."""
         cv2 = load("cv2", "inspection needs")
         if self.settings.region is None and view.picture.size != self._size:
             return Finding(
@@ -144,9 +141,9 @@ class Compare(Tool[CompareSettings]):
             lit = (gain * taught + offset).astype(np.float32)
             taught = np.clip(np.rint(lit), 0, 255).astype(np.uint8)
             level *= min(gain, 1.0)
-            hidden = _hidden(lit, level) & there
+            hidden = _saturated(lit, level) & there
             too_light = lit[hidden].mean() > 127 if hidden.any() else True
-        # what remains of a shift is no difference: at an edge it is as large as the edge is steep
+        # a residual shift is no difference: it changes levels at edges in proportion to their slope
         steep = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
         over = cv2.absdiff(taught, seen) - EDGE_TOLERANCE_PX * steep
         differs = (over >= level) & there
@@ -172,19 +169,19 @@ class Compare(Tool[CompareSettings]):
                 Drawing(
                     "polygon", tuple((float(x), float(y)) for x, y in view.region.corners), "region"
                 ),
-                *(self._drawn(one, motion, view) for one in kept[:MAX_DRAWN]),
+                *(self._drawn(one, motion, view) for one in kept[:MAX_DRAWN_DIFFERENCES]),
             ],
         )
 
     def _large(self, mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return the statistics of the connected areas that are large enough to count."""
+        """Return the statistics of the connected areas of at least the set size."""
         cv2 = load("cv2", "inspection needs")
         _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         large: NDArray[Any] = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= self.settings.area]
         return large
 
     def _patch(self, view: View) -> NDArray[np.uint8]:
-        """Return the region upright, as large as the taught picture."""
+        """Return the upright region in the size of the taught picture."""
         width, height = self._size
         if not view.follows:
             x, y = (round(one) for one in self._corner)
@@ -199,22 +196,22 @@ class Compare(Tool[CompareSettings]):
         return patch
 
     def _to_picture(self, points: NDArray[Any], view: View) -> NDArray[Any]:
-        """Return pixels of the region, upright, in the picture."""
+        """Return points of the upright region in the picture's pixels."""
         if not view.follows:
             return points + np.rint(self._corner)
         return view.reference.to_picture(points + self._corner + 0.5)
 
     def _motion(self, patch: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the small motion of the part from the taught picture to this one, (2, 3)."""
+        """Return the small motion (2, 3) of the part between the taught and the current picture."""
         shift = self.settings.shift
         motion = np.eye(2, 3, dtype=np.float32)
         cv2 = load("cv2", "inspection needs")
         inner = self._taught[shift : self._size[1] - shift, shift : self._size[0] - shift]
-        if shift == 0 or inner.std() < 1.0:  # nothing that could be matched
+        if shift == 0 or inner.std() < 1.0:  # no texture to match
             return motion
         score = np.nan_to_num(cv2.matchTemplate(patch, inner, cv2.TM_CCOEFF_NORMED), nan=-1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
-        if score[row, column] < MIN_CORRELATION:
+        if score[row, column] < MIN_LIGHT_CORRELATION:
             return motion
         motion[:, 2] = column - shift, row - shift
         end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MAX_ITERATIONS, 1e-4)
@@ -226,11 +223,11 @@ class Compare(Tool[CompareSettings]):
         turn = abs(math.atan2(fine[1, 0], fine[0, 0]))
         middle = np.array(self._size) / 2
         moved = np.abs(fine[:, :2] @ middle + fine[:, 2] - middle)
-        good = np.isfinite(fine).all() and turn <= MAX_TURN and (moved <= shift + 0.5).all()
+        good = np.isfinite(fine).all() and turn <= MAX_ROTATION and (moved <= shift + 0.5).all()
         return fine if good else motion
 
     def _moved(self, motion: NDArray[np.float32]) -> dict[str, float]:
-        """Return by how much the middle of the region moved."""
+        """Return the shift of the region's middle."""
         middle = (np.array(self._size) - 1) / 2
         x, y = motion[:, :2] @ middle + motion[:, 2] - middle
         return {"shift_x": float(x), "shift_y": float(y)}
@@ -245,12 +242,12 @@ class Compare(Tool[CompareSettings]):
         )
 
 
-def _hidden(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
-    """Return a mask of the pixels whose difference to their surroundings is cut off.
+def _saturated(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
+    """Return a mask of the pixels whose difference to their surroundings is lost by saturation.
 
     Args:
-        lit: taught levels in the light that is there, (H, W), also below 0 and above 255.
-        level: grey levels from which on a pixel differs.
+        lit: taught levels in the current light, (H, W), also below 0 and above 255.
+        level: least difference, grey levels, of a differing pixel.
     """
     if lit.min() >= 0 and lit.max() <= 255:
         return np.zeros(lit.shape, bool)
@@ -267,7 +264,7 @@ def _hidden(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
 
     shown = np.clip(lit, 0, 255)
     (darker, lighter), (seen_darker, seen_lighter) = differs(lit), differs(shown)
-    # beside an edge that can be seen, a pixel is between the levels of its two sides
+    # beside a visible edge, a pixel is between the levels of both sides
     edge = cv2.morphologyEx(shown, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
     plain = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
     mask: NDArray[np.bool_] = ((darker & ~seen_darker) | (lighter & ~seen_lighter)) & plain
@@ -275,20 +272,20 @@ def _hidden(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
 
 
 def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, float]:
-    """Return the gain and the offset that the light has beside the taught one.
+    """Return gain and offset of the current light relative to the taught light.
 
-    It is the taught light where what is seen is not like what was taught: nothing at all would
-    otherwise look like a thing in bad light.
+    They are 1 and 0 if the pictures do not correlate: otherwise a missing part could pass as a part
+    in bad light.
     """
-    step = max(taught.size // LIGHT_PIXELS, 1) | 1  # an odd one takes all columns
+    step = max(taught.size // MAX_LIGHT_PIXELS, 1) | 1  # an odd step samples all columns
     x, y = (one.ravel()[::step].astype(np.float64) for one in (taught, seen))
     kept = np.ones(x.shape, bool)
     gain, offset = 1.0, 0.0
-    for _ in range(FIT_ROUNDS):
+    for _ in range(LIGHT_FIT_ROUNDS):
         a, b = x[kept], y[kept]
         da, db = a - a.mean(), b - b.mean()
         both, one, other = float(da @ db), float(da @ da), float(db @ db)
-        alike = both > MIN_CORRELATION * math.sqrt(one * other) and one > len(a)
+        alike = both > MIN_LIGHT_CORRELATION * math.sqrt(one * other) and one > len(a)
         if not alike:
             return 1.0, 0.0
         gain = min(max(both / one, 1 / MAX_GAIN), MAX_GAIN)

@@ -1,4 +1,4 @@
-"""Draw the findings of a program's tools into their picture."""
+"""Draw the marks of a program's tools into the picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import Drawing
     from smartcam.inspection._finding import Inspection
 
-_SHIFT: Final = 4  # OpenCV draws at sixteenths of a pixel
+_SHIFT: Final = 4  # OpenCV's coordinates in 1/16 pixel
 
 
 def draw(inspection: Inspection) -> NDArray[Any]:
@@ -32,7 +32,7 @@ def _draw(canvas: NDArray[Any], mark: Drawing, thick: int) -> None:
     colour = COLOURS[mark.role]
     if not mark.points or not np.isfinite(mark.points).all():
         return
-    limit = 4.0 * max(canvas.shape)  # OpenCV's coordinates are integers of 32 bits
+    limit = 4.0 * max(canvas.shape)  # keeps OpenCV's coordinates within 32 bits
     places = np.clip(np.asarray(mark.points, np.float64), -limit, limit)
     fixed = np.rint(places * (1 << _SHIFT)).astype(np.int32)
     if mark.kind in ("line", "polygon"):

@@ -1,4 +1,4 @@
-"""Values: a tool's finding in a picture, and the inspection that holds all of them."""
+"""Findings of tools, and the inspection that holds the findings of one picture."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """The answer of one tool about one picture.
+    """The result of one tool for one picture.
 
     Attributes:
         ok: the tool's verdict.
-        reason: why the verdict is not ok, in one sentence for people; "" if it is.
-        values: what was found, by the names of the tool's fields, in SI units (metres, radians,
-            pixels). A field that is left out has no value: 0, False, "" or NaN on the wire.
-        records: values of each thing found, by the names of the tool's records.
-        drawings: marks for people.
-        reference: frame of reference that later tools may follow; None: there is none.
-        details: what the tool knows beyond its fields, for programs; of the tool's own type.
+        reason: why the verdict is not ok, in one sentence; "" if it is ok.
+        values: values by the names of the tool's fields, in SI units (metres, radians, pixels). A
+            missing field is sent as 0, False, "" or NaN.
+        records: values of each found object, by the names of the tool's records.
+        drawings: marks to draw.
+        reference: frame of reference that later tools may follow; None: no frame.
+        details: more results for Python programs, in the tool's own type.
     """
 
     ok: bool
@@ -46,18 +46,18 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspection:
-    """The answer of a program about one picture.
+    """The results of a program for one picture.
 
     Attributes:
         application: number of the application.
         name: name of the application.
-        ok: True if every tool's verdict is.
-        reason: why the verdict is not ok: the first tool's reason that is not; "" if all are.
-        values: the values of the layout, by field, as :meth:`Layout.build` takes them.
-        findings: what each tool found, by its name, in the order they ran.
-        seconds: how long each tool took, by its name.
+        ok: True if the verdict of every tool is ok.
+        reason: reason of the first tool that is not ok; "" if all are ok.
+        values: values by the fields of the layout, for :meth:`Layout.build`.
+        findings: finding of each tool by its name, in running order.
+        seconds: duration of each tool by its name.
         layout: the layout of the values.
-        picture: the picture that was judged.
+        picture: the inspected picture.
     """
 
     application: int
@@ -83,8 +83,8 @@ class Inspection:
         """Return the bytes of the result container.
 
         Args:
-            byte_order: order of the bytes of a number.
-            sequence: value of the ``@sequence`` field; None: 0 where the layout has one.
+            byte_order: byte order of numbers.
+            sequence: value of the ``@sequence`` field; None: 0 if the layout has the field.
 
         Raises:
             ConfigurationError: an argument is wrong, or the sequence number does not fit its field.
@@ -98,7 +98,7 @@ class Inspection:
 
     @cached_property
     def value(self) -> Record:
-        """The values as a client of the camera gets them."""
+        """Values as a client of the camera receives them."""
         value: Record = self.layout.parse(self.payload())
         return value
 

@@ -1,4 +1,4 @@
-"""Learning tolerances from pictures of good parts, and saying in words what was learned."""
+"""Learn tolerances from pictures of good parts, and describe them in sentences."""
 
 from __future__ import annotations
 
@@ -19,41 +19,40 @@ if TYPE_CHECKING:
     from smartcam.inspection._finding import Finding, Inspection
 
 AREA_MARGIN: Final = 0.2
-"""Share by which a spot may be smaller or larger than those of the good pictures."""
+"""Share by which a spot may be smaller or larger than the spots of the good pictures."""
 
 DIFFERENCE_MARGIN: Final = 1.5
-"""Times as many pixels may differ as in the good pictures."""
+"""Ratio of the allowed number of differing pixels to the largest of the good pictures."""
 
 MIN_VALUES: Final = 5
-"""Good pictures with a value that a tolerance is learned from at least: fewer do not tell a wrong
-one among them."""
+"""Least number of good pictures with a value to learn a tolerance: fewer do not show outliers."""
 
-GOOD_SHARE: Final = 0.997
-"""Share of all good parts that a learned tolerance has in it."""
+TOLERANCE_COVERAGE: Final = 0.997
+"""Share of all good parts that a learned tolerance contains."""
 
 CONFIDENCE: Final = 0.95
-"""Probability that so many of them are in it, whichever parts the pictures show."""
+"""Probability that a learned tolerance contains this share, over samples of good parts."""
 
-FAR_SPREADS: Final = 5.0
-"""Spreads from the median from which on one of many values is another part's."""
+OUTLIER_SPREADS: Final = 5.0
+"""Distance from the median, in standard deviations, of an outlier in a large sample."""
 
-FEW: Final = 8.0
-"""Pictures at which that distance is twice as long: the spread of a few values is less sure. Of
-5 to 200 pictures of good parts, 2 % at most then have one that is left out (simulated)."""
+SMALL_SAMPLE: Final = 8.0
+"""Sample size at which this distance doubles, since the spread of few values is less certain. In
+simulations with 5 to 200 good parts, at most 2 % of the samples lose a good value."""
 
-MAX_NAMED: Final = 5
-"""Largest number of pictures that a remark names; it counts the others."""
+MAX_PICTURES_IN_REMARK: Final = 5
+"""Largest number of pictures that a remark names; others are counted."""
 
 MAX_DIGITS: Final = 9
-"""Decimals of a learned tolerance."""
+"""Largest number of decimals of a learned tolerance."""
 
 
 class Lesson(NamedTuple):
-    """The tolerances that good pictures taught.
+    """Tolerances that were learned from good pictures.
 
     Attributes:
-        tools: settings of the tools by their keys, with the tolerances that were learned.
-        remarks: what was learned from what, in words, a sentence or two for each tool.
+        tools: settings of the tools by their keys, with the learned tolerances.
+        remarks: sentences for each tool that explain its new tolerance.
     """
 
     tools: dict[str, dict[str, Any]]
@@ -61,7 +60,7 @@ class Lesson(NamedTuple):
 
 
 class _Learned(NamedTuple):
-    """Settings that a tool gets, and what is said of them."""
+    """New settings of a tool, and their explanation."""
 
     settings: dict[str, Any]
     remark: str
@@ -71,13 +70,13 @@ _NOTHING: Final = _Learned({}, "no picture has a value: all stays as it is.")
 
 
 def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspection]) -> Lesson:
-    """Return the tools with tolerances by which the good pictures are good.
+    """Return the tools with tolerances that accept the good pictures.
 
-    A measured value that is far from the others is left out, and the remarks name its picture.
+    Outliers among measured values are left out, and the remarks name their pictures.
 
     Args:
         tools: settings of the tools by their keys.
-        good: inspections of good pictures by these tools, by the pictures' names.
+        good: inspections of good pictures by these tools, with the pictures' names as keys.
     """
     found = {key: dict(given) for key, given in tools.items()}
     remarks = []
@@ -110,7 +109,7 @@ def _of_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
             f", of {min(areas):.0f} to {max(areas):.0f} pixels; area has {AREA_MARGIN:.0%} more "
             "to both sides"
         )
-    elif any(counts):  # of spots that are not in the result nobody knows the area
+    elif any(counts):  # the area of spots outside of the result is unknown
         remark += "; area stays as it is, as the result does not have all of them (most)"
     return _Learned(found, f"{remark}.")
 
@@ -139,7 +138,7 @@ def _of_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Lear
 
 
 def _of_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
-    """Return the tolerance that measured values tell, in the form and unit of the one before."""
+    """Return the tolerance of measured values, in the form and unit of the old tolerance."""
     measured = {name: one.details for name, one in seen.items() if _is_number(one.details)}
     left_out = {
         name: one.reason.partition(":")[0] for name, one in seen.items() if name not in measured
@@ -150,8 +149,8 @@ def _of_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Le
     values = np.array([one.value for one in measured.values()]) / factor
     sigmas = np.array([one.sigma for one in measured.values()]) / factor
     if unit == "deg":
-        values = _on_one_turn(values)
-    far = _far(values, sigmas)
+        values = _unwrapped(values)
+    far = _outliers(values, sigmas)
     names = np.array([*measured], dtype=object)
     left_out |= {
         name: f"{value:.6g} {unit} is far from the others"
@@ -171,7 +170,7 @@ def _of_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Le
     remark = (
         f"tolerance {text}, from {_pictures(len(values))}: mean {mean:.6g} {unit}, standard "
         f"deviation {spread:.2g} {unit}, of which measuring makes "
-        f"{noise:.2g} {unit}. It has {GOOD_SHARE:.1%} of all such "
+        f"{noise:.2g} {unit}. It has {TOLERANCE_COVERAGE:.1%} of all such "
         f"parts in it, as far as so few pictures tell.{_left_out(left_out)}"
     )
     return _Learned({"tolerance": text}, remark)
@@ -182,14 +181,14 @@ def _is_number(details: Any) -> bool:
 
 
 def _unit(old: Tolerance | None, measured: str) -> tuple[str, float]:
-    """Return the unit to write, and how much of the measured one it is."""
+    """Return the unit to write, and its ratio to the measured unit."""
     written = measured if old is None else old.written_unit
     name, factor = UNITS[written]
     return (written, factor) if name == measured else (measured, 1.0)
 
 
-def _on_one_turn(values: Array) -> Array:
-    """Return directions in degrees without turns between them."""
+def _unwrapped(values: Array) -> Array:
+    """Return directions in degrees without jumps of 360."""
     if not len(values):
         return values
     turns = np.array([math.remainder(one - values[0], 360.0) for one in values.tolist()])
@@ -198,23 +197,23 @@ def _on_one_turn(values: Array) -> Array:
     return near
 
 
-def _far(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return a mask of the values (N,) that are too far from the others to be of the same part."""
+def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return a mask of the outliers among values (N,)."""
     if not len(values):
         return np.zeros(0, dtype=bool)
     away = np.abs(values - np.median(values))
-    # of normal values the median distance is 0.6745 standard deviations
+    # for normal values the median distance is 0.6745 standard deviations
     spread = max(float(np.median(away)) / 0.6745, float(np.median(sigmas)))
     found: np.ndarray[Any, np.dtype[np.bool_]] = (
-        away > FAR_SPREADS * (1 + FEW / len(values)) * spread
+        away > OUTLIER_SPREADS * (1 + SMALL_SAMPLE / len(values)) * spread
     )
     return found
 
 
 def _text(values: Array, spread: float, guard: float, old: Tolerance | None, unit: str) -> str:
-    """Return the tolerance of values (N,), to one side where the one before was."""
+    """Return the tolerance of values (N,), one-sided if the old tolerance was."""
     mean, sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
-    wide = _spreads(len(values), sided=sided) * spread
+    wide = _tolerance_factor(len(values), sided=sided) * spread
     half = max(wide, float(np.abs(values - mean).max())) + guard
     digits = min(max(1 - math.floor(math.log10(half)), 0), MAX_DIGITS) if half > 0 else 3
     step = 10.0**-digits
@@ -230,28 +229,32 @@ def _text(values: Array, spread: float, guard: float, old: Tolerance | None, uni
     return f"{middle:.{digits}f} +- {out(half + abs(middle - mean)):.{digits}f} {unit}"
 
 
-def _spreads(number: int, *, sided: bool) -> float:
-    """Return the standard deviations of so many normal values that have most parts in them.
+def _tolerance_factor(number: int, *, sided: bool) -> float:
+    """Return the tolerance factor of ``number`` normal values, in standard deviations.
 
-    By Howe to both sides, which is Natrella's approximation to one side.
+    The formulas are Howe's for two sides, and Natrella's approximation for one side.
     """
     special = load("scipy.special", "teaching measure needs")
     degrees = number - 1
     if sided:
-        share, sure = (float(special.ndtri(one)) for one in (GOOD_SHARE, CONFIDENCE))
+        share, sure = (float(special.ndtri(one)) for one in (TOLERANCE_COVERAGE, CONFIDENCE))
         a, b = 1 - sure**2 / (2 * degrees), share**2 - sure**2 / number
         return (share + math.sqrt(share**2 - a * b)) / a
-    share = float(special.ndtri((1 + GOOD_SHARE) / 2))
-    least = float(special.chdtri(degrees, CONFIDENCE))  # chi squared that is seldom below it
+    share = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
+    least = float(special.chdtri(degrees, CONFIDENCE))  # lower quantile of chi squared
     return share * math.sqrt(degrees * (1 + 1 / number) / least)
 
 
 def _left_out(left_out: Mapping[str, str]) -> str:
-    """Return the sentence about pictures that nothing was learned from; "" if there are none."""
+    """Return the sentence about pictures that were left out; "" if there are none."""
     if not left_out:
         return ""
-    named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_NAMED]
-    more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
+    named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
+    more = (
+        f" and {len(left_out) - MAX_PICTURES_IN_REMARK} more"
+        if len(left_out) > MAX_PICTURES_IN_REMARK
+        else ""
+    )
     return f" Not learned from: {', '.join(named)}{more}."
 
 

@@ -1,4 +1,4 @@
-"""A picture as tools take it: grey levels and colours, each made once, whoever asks."""
+"""A picture for tools, with grey levels and colours that are computed only once."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_SIDE_PX: Final = 20_000
-"""Width and height that a picture may have, in pixels."""
+"""Largest width and height of a picture, in pixels."""
 
 MAX_FILE_BYTES: Final = 1 << 28
-"""Largest number of bytes that a picture's file may have."""
+"""Largest size of a picture's file, bytes."""
 
 LIMITED_BLACK: Final = 16
 LIMITED_WHITE: Final = 235
-"""Levels of black and white of video's limited range, of 8 bits (ITU-R BT.601)."""
+"""Level of white in video's limited range of 8 bits (ITU-R BT.601)."""
 
 
 class Picture:
@@ -33,15 +33,15 @@ class Picture:
 
     Args:
         pixels: uint8 or uint16, (H, W) grey or (H, W, 3) with red first. They must not change.
-        depth: bits of a sample that mean something; None: all of them.
-        frame: the frame that the pixels are of.
+        depth: number of significant bits of a sample; None: all bits.
+        frame: frame of the pixels.
 
     Raises:
-        FrameFormatError: the value has no pixels, or too many, or is of another type or shape.
+        FrameFormatError: there are no pixels or too many, or type or shape are wrong.
 
     Attributes:
-        frame: the frame that it is of; None: pixels alone.
-        depth: bits of a sample that mean something.
+        frame: frame of the pixels; None: not from a frame.
+        depth: number of significant bits of a sample.
         size: width and height, pixels.
     """
 
@@ -74,7 +74,7 @@ class Picture:
 
     @classmethod
     def of(cls, source: Frame | Picture | NDArray[Any]) -> Picture:
-        """Return the picture of a frame, or of pixels as :class:`Picture` takes them.
+        """Return the picture of a frame or an array of pixels.
 
         Raises:
             FrameFormatError: the frame's bytes are wrong, or no picture.
@@ -96,7 +96,7 @@ class Picture:
 
     @classmethod
     def read(cls, path: str | Path) -> Picture:
-        """Return the picture in a file: PNG, JPEG, BMP, TIFF, or what else OpenCV reads.
+        """Read a picture from a file: PNG, JPEG, BMP, TIFF or another format of OpenCV.
 
         Raises:
             FrameFormatError: the file cannot be read, is too large, or is no picture.
@@ -114,7 +114,7 @@ class Picture:
         how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
-        except cv2.error:  # of no bytes, and of more pixels than OpenCV takes
+        except cv2.error:  # empty files, and more pixels than OpenCV's limit
             pixels = None
         if pixels is None:
             raise FrameFormatError(
@@ -135,7 +135,7 @@ class Picture:
 
     @cached_property
     def levels(self) -> NDArray[Any]:
-        """Brightness as the camera sent it, (H, W), uint8 or uint16 of :attr:`depth` bits."""
+        """Brightness without conversion, (H, W), uint8 or uint16 of :attr:`depth` bits."""
         if self._pixels.ndim == 2:
             return self._pixels
         cv2 = load("cv2", "inspection needs")
@@ -144,27 +144,27 @@ class Picture:
 
     @cached_property
     def ends(self) -> tuple[int, int]:
-        """The levels of :attr:`levels` at which black and white are cut off.
+        """Saturation levels of black and white in :attr:`levels`.
 
-        They are the least and the largest that there can be; or those of video's limited range, 16
-        and 235 of 8 bits, where the picture has many bright or dark levels and none beyond these.
+        They are the least and the largest possible level; or video's limits, 16 and 235 of 8 bits,
+        if the picture has many bright or dark levels and none beyond these limits.
         """
         return _ends(self.levels, self.depth)
 
     @cached_property
     def clipped(self) -> NDArray[np.bool_] | None:
-        """Mask of pixels with a colour that is cut off, (H, W); None if there are no colours.
+        """Mask of pixels with a saturated colour, (H, W); None if there are no colours.
 
-        A colour is cut off at its top, and at its bottom where another one is bright: there a
-        camera that mixes its colours would have less than nothing. Where the dark is black in all
-        of its colours, :attr:`levels` tell it.
+        A colour is saturated at the largest level, and at 0 if another colour is bright, since a
+        camera's colour correction gives negative values there. Pixels that are black in all colours
+        show in :attr:`levels`.
         """
         if not self.has_colours:
             return None
         sent = self._pixels.ndim == 3
         colours = self._pixels if sent or self.frame is None else self.frame.rgb()
         depth = min(self.depth, 8 * colours.dtype.itemsize)
-        made = 0 if sent else 1  # what a camera made of its colours is a level off
+        made = 0 if sent else 1  # converted colours may be off by one level
         bright = colours.max(axis=2) > 2**depth // 4
         mask = np.zeros(bright.shape, dtype=bool)
         for one in range(3):
@@ -175,12 +175,12 @@ class Picture:
 
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
-        """Brightness, (H, W), uint8: of 16 bits the upper eight of those that mean something."""
+        """Brightness, (H, W), uint8: of more bits, the upper eight significant bits."""
         return _eight_bits(self.levels, self.depth)
 
     @cached_property
     def rgb(self) -> NDArray[np.uint8]:
-        """Colours, (H, W, 3), uint8, red first; a grey picture's level three times."""
+        """Colours, (H, W, 3), uint8, red first; for a grey picture three equal levels."""
         if self._pixels.ndim == 3:
             return _eight_bits(self._pixels, self.depth)
         if self.frame is not None and self.has_colours:
@@ -190,7 +190,7 @@ class Picture:
 
 
 def _ends(levels: NDArray[Any], depth: int) -> tuple[int, int]:
-    """Return the levels at which samples of so many bits are cut off."""
+    """Return the saturation levels of samples of ``depth`` bits."""
     top, step = 2**depth - 1, 2 ** (depth - 8) if depth >= 8 else 0
     black, white = LIMITED_BLACK * step, LIMITED_WHITE * step
     least, most = int(levels.min()), int(levels.max())

@@ -1,8 +1,8 @@
-"""Places in a picture: frames of reference, and regions that a tool looks at.
+"""Frames of reference and regions of tools in a picture.
 
 Pixel coordinates have x to the right and y down; the centre of the upper left pixel is (0, 0), as
-in all of smartcam. Angles are in radians from x towards y, so a positive one turns clockwise as
-people see it.
+in all of smartcam. Angles are in radians from x towards y, so positive angles are clockwise in the
+displayed picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 MAX_CORNERS: Final = 200
-"""Corners that a region may have."""
+"""Largest number of corners of a region."""
 
 MAX_COORDINATE_PX: Final = 100_000.0
 """Largest coordinate of a region, in pixels; no picture is larger."""
@@ -31,13 +31,13 @@ MAX_FIXED_PLACES: Final = 256
 
 
 class PixelPose(NamedTuple):
-    """A frame of reference in a picture: what a tool found, and later tools may follow.
+    """A frame of reference in a picture, which a tool found and later tools may follow.
 
     Attributes:
-        x: place of its origin, pixels.
-        y: place of its origin, pixels.
-        angle: direction of its x axis, radians from the picture's x towards the picture's y.
-        scale: pixels of the picture for one unit of the frame.
+        x: x of the origin, pixels.
+        y: y of the origin, pixels.
+        angle: direction of the x axis, radians from the picture's x towards the picture's y.
+        scale: pixels of the picture per unit of the frame.
     """
 
     x: float = 0.0
@@ -46,14 +46,14 @@ class PixelPose(NamedTuple):
     scale: float = 1.0
 
     def to_picture(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return points of this frame in the picture's pixels, (..., 2)."""
+        """Convert points (..., 2) of this frame to the picture's pixels."""
         cos, sin = self.scale * math.cos(self.angle), self.scale * math.sin(self.angle)
         turn = np.array([[cos, sin], [-sin, cos]])
         moved: NDArray[np.float64] = np.asarray(points, np.float64) @ turn + (self.x, self.y)
         return moved
 
     def from_picture(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return points of the picture in this frame, (..., 2)."""
+        """Convert points (..., 2) of the picture to this frame."""
         cos, sin = math.cos(self.angle) / self.scale, math.sin(self.angle) / self.scale
         turn = np.array([[cos, -sin], [sin, cos]])
         moved: NDArray[np.float64] = (np.asarray(points, np.float64) - (self.x, self.y)) @ turn
@@ -65,11 +65,11 @@ IDENTITY: Final = PixelPose()
 
 
 class Region(tuple[tuple[float, float], ...]):
-    """The corners of what a tool looks at, in order; in a program file ``[x, y, width, height]``.
+    """The corners of a tool's region, in order; in a program file ``[x, y, width, height]``.
 
-    The numbers count pixels: ``[0, 0, 640, 480]`` are the first 640 columns of the first 480 rows.
-    A polygon is a list of three corners or more, ``[[x, y], ...]``. The coordinates are pixels of
-    the picture, or of the frame of reference that the tool follows.
+    ``[0, 0, 640, 480]`` is the first 640 columns of the first 480 rows. A polygon is a list of
+    three corners or more, ``[[x, y], ...]``. The coordinates are pixels of the picture, or units of
+    the frame of reference that the tool follows.
     """
 
     __slots__ = ()
@@ -117,20 +117,20 @@ RegionSetting = Annotated[
         }
     ),
 ]
-"""A region as a field of a tool's settings."""
+"""Type of a region in a tool's settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedRegion:
-    """A region where it lies in one picture.
+    """A region placed in one picture.
 
     Attributes:
         corners: corners in the picture's pixels, (N, 2).
-        left: first column of the pixels that it touches, within the picture.
+        left: first column that the region touches, within the picture.
         top: first row.
-        right: column behind the last one.
-        below: row behind the last one.
-        outside: how far it reaches out of the picture, pixels; 0: not at all.
+        right: column after the last.
+        below: row after the last.
+        outside: distance by which the region reaches out of the picture, pixels.
     """
 
     corners: NDArray[np.float64]
@@ -142,22 +142,22 @@ class PlacedRegion:
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing of the region is in the picture."""
+        """True if the region is outside of the picture."""
         return self.right <= self.left or self.below <= self.top
 
     @property
     def rows_columns(self) -> tuple[slice, slice]:
-        """The pixels around the region, to index a picture with."""
+        """Slices of rows and columns that contain the region."""
         return slice(self.top, self.below), slice(self.left, self.right)
 
     def contains(self, point: tuple[float, float]) -> bool:
-        """Return True if a point of the picture is in the region, or on its border."""
+        """Return True if a point of the picture is in the region or on its border."""
         cv2 = load("cv2", "inspection needs")
         corners = self.corners.astype(np.float32)[:, np.newaxis]
         return bool(cv2.pointPolygonTest(corners, point, measureDist=False) >= 0)
 
     def mask(self) -> NDArray[np.uint8]:
-        """Return 255 where a pixel around the region belongs to it, else 0; (H, W)."""
+        """Return a mask (H, W) of the region's rows and columns: 255 in the region, else 0."""
         found = np.zeros((self.below - self.top, self.right - self.left), np.uint8)
         corners = np.rint(self.corners - (self.left, self.top)).astype(np.int32)
         load("cv2", "inspection needs").fillPoly(found, [corners], 255)
@@ -165,12 +165,12 @@ class PlacedRegion:
 
 
 def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) -> PlacedRegion:
-    """Return a region's place in a picture.
+    """Place a region in a picture.
 
     Args:
         region: the region; None: the whole picture.
-        pose: frame of reference that its corners are in. None: they count the picture's pixels, so
-            that ``[0, 0, width, height]`` is all of it, from half a pixel before the first centre.
+        pose: frame of reference of the corners. None: ``[0, 0, width, height]`` is the whole
+            picture, from half a pixel before the first centre.
         size: width and height of the picture, pixels.
     """
     if region is None or pose is None:

@@ -1,4 +1,4 @@
-"""The tool `present`: spots of a colour or a grey level, counted, with their places."""
+"""The tool `present`: count spots of a colour or a grey level, with their places."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_SPOTS: Final = 1000
 """Largest number of spots in one result."""
 
 MAX_AREA_PX: Final = 1_000_000_000
-"""Largest area of a spot that can be asked for, in pixels."""
+"""Largest area of a spot in the settings, in pixels."""
 
 
 def _rising(given: tuple[int, int]) -> tuple[int, int]:
@@ -41,7 +41,7 @@ Number = Annotated[int, Field(ge=0, le=MAX_SPOTS)]
 
 
 class PresentSettings(ToolSettings):
-    """The spots that are looked for, and the number that there has to be."""
+    """Colours and sizes of the wanted spots, and the expected number."""
 
     grey: Annotated[tuple[Level, Level], AfterValidator(_rising)] | None = Field(
         None, description="grey levels of a spot, from and to, 0 to 255"
@@ -52,14 +52,12 @@ class PresentSettings(ToolSettings):
         "to]}, as the page of smartcam frames colours finds them",
     )
     area: Annotated[tuple[Area, Area], AfterValidator(_rising)] = Field(
-        (20, MAX_AREA_PX), description="pixels of a spot, from and to; others do not count"
+        (20, MAX_AREA_PX), description="least and largest area of a spot, pixels"
     )
     count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number = Field(
-        (1, MAX_SPOTS), description="how many there have to be: a number, or from and to"
+        (1, MAX_SPOTS), description="expected number of spots: a number, or from and to"
     )
-    most: int = Field(
-        1, ge=1, le=MAX_SPOTS, description="spots in the result at most, the largest first"
-    )
+    most: int = Field(1, ge=1, le=MAX_SPOTS, description="largest number of spots in the result")
 
     @model_validator(mode="after")
     def _one_of(self) -> PresentSettings:
@@ -75,8 +73,8 @@ class Spot(NamedTuple):
     Attributes:
         x: centre of gravity, pixels of the picture.
         y: centre of gravity.
-        angle: direction of its long axis, radians from x towards y, more than -pi/2, at most pi/2;
-            NaN where it is as wide as long.
+        angle: direction of the long axis, radians from x towards y, above -pi/2, up to pi/2; NaN if
+            the spot is as wide as long.
         area: pixels.
         box: left, top, width, height.
     """
@@ -94,11 +92,11 @@ class Spot(NamedTuple):
 
 _FIELDS: Final = "x: real32 px, y: real32 px, angle: real32 deg, area: uint32"
 MIN_ELONGATION: Final = 1.05
-"""Length over width from which on a spot has a direction."""
+"""Least ratio of length to width of a spot that has a direction."""
 
 
 class Present(Tool[PresentSettings]):
-    """Spots of a colour or a grey level."""
+    """Count spots of a colour or a grey level."""
 
     settings_model = PresentSettings
 
@@ -109,12 +107,12 @@ class Present(Tool[PresentSettings]):
 
     @property
     def fields(self) -> str:
-        """The number of spots, and the largest one."""
+        """Fields of the number of spots and of the largest spot."""
         return f"count: uint16, {_FIELDS}" if self.settings.most == 1 else "count: uint16"
 
     @property
     def records(self) -> str:
-        """Each spot."""
+        """Fields of each spot."""
         return "" if self.settings.most == 1 else _FIELDS
 
     def inspect(self, view: View) -> Finding:
@@ -145,7 +143,7 @@ class Present(Tool[PresentSettings]):
         if self.settings.colour is not None:
             mask = self.settings.colour.mask(view.rgb).view(np.uint8)
         else:
-            assert self.settings.grey is not None  # noqa: S101 - the settings say so
+            assert self.settings.grey is not None  # noqa: S101 - checked by the settings
             low, high = self.settings.grey
             mask = cv2.inRange(view.grey, low, high)
         mask = cv2.bitwise_and(mask, view.region.mask())

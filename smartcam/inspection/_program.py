@@ -1,4 +1,4 @@
-"""Programs: the tools of an application, in order, over one picture."""
+"""Programs: the ordered tools of an application, run on one picture."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ MAX_TOOLS: Final = 50
 """Largest number of tools of one program."""
 
 MAX_REASON_BYTES: Final = 80
-"""Largest number of bytes of the reason in a result container; a longer one is cut there."""
+"""Largest number of bytes of the reason in a result container; longer reasons are cut."""
 
 OWN_FIELDS: Final = ("ok", "reason")
-"""Fields of the program's own, which no tool may have."""
+"""Fields of the program, which no tool may have."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,29}")
 
@@ -45,7 +45,7 @@ class ProgramError(ConfigurationError):
     """A mistake in a program's settings.
 
     Attributes:
-        place: keys that lead to it, from the application's own mapping.
+        place: keys that lead to the mistake, from the application's mapping.
     """
 
     def __init__(self, message: str, place: Place = ()) -> None:
@@ -60,10 +60,10 @@ class ProgramStep:
     Attributes:
         name: name of the tool in its program, unique there.
         tool: the tool.
-        own: False for a tool of another application that a tool of this one follows: it runs, but
-            its values are not in the result.
-        fields: the fields of its values, with the names that they have in the result.
-        records: the fields of what it finds several of.
+        own: False for a tool of a followed application: it runs, but its values are not in the
+            result.
+        fields: fields of the values, with their names in the result.
+        records: fields of each record.
     """
 
     name: str
@@ -74,24 +74,24 @@ class ProgramStep:
 
 
 class Program:
-    """The tools of an application, in the order in which they look at a picture.
+    """The tools of an application in running order.
 
     Args:
         application: number of the application.
         name: name of the application.
         steps: tools of the application.
-        sequence: True: the result has the sequence number in front.
+        sequence: whether the result begins with the sequence number.
 
     Raises:
-        ConfigurationError: two tools find several things each, or the fields do not go together.
+        ConfigurationError: two tools have records, or fields do not fit together.
 
     Attributes:
         application: number of the application.
         name: name of the application.
         steps: tools of the application.
-        layout: layout of a result, which follows from the tools: ``ok: bool, reason: string[80]``,
-            and their fields. With several tools, the name of each is in front of its fields, and
-            each has an ``ok`` of its own.
+        layout: layout of a result: ``ok: bool, reason: string[80]``, and the tools' fields. With
+            several tools, each tool's fields have its name as a prefix, and each has its own
+            ``ok``.
     """
 
     def __init__(
@@ -120,20 +120,20 @@ class Program:
 
     @property
     def interpret_as(self) -> str:
-        """The layout's text: what a client interprets results as."""
+        """Text of the layout, for a client's ``interpret_as``."""
         return self.layout.text
 
     def inspect(self, source: Frame | Picture | NDArray[Any], *, input: bytes = b"") -> Inspection:
-        """Return the answers of the tools about a picture. Blocks; runs in any thread.
+        """Return the tools' findings on a picture. Blocks; runs in any thread.
 
         Args:
-            source: a frame, or pixels as :class:`Picture` takes them.
+            source: a frame, or pixels as for :class:`Picture`.
             input: input data of the trigger.
 
         Raises:
-            FrameFormatError: the value is no picture.
+            FrameFormatError: the source is no picture.
             InspectionError: a tool failed.
-            MissingExtraError: what a tool needs is not installed.
+            MissingExtraError: an extra that a tool needs is not installed.
         """
         input = check_bytes(input, "input", "Program.inspect")
         picture = Picture.of(source)
@@ -166,7 +166,7 @@ class Program:
         for step in self.steps:
             started = time.perf_counter()
             try:
-                findings[step.name] = _ask(step.tool, picture, input, findings)
+                findings[step.name] = _finding_of(step.tool, picture, input, findings)
             except SmartCamError:
                 raise
             except Exception as exc:
@@ -181,9 +181,9 @@ class Program:
 
 
 class FollowedApplication(Tool[ToolSettings]):
-    """The tools of another application that a tool follows, as one tool.
+    """The tools of a followed application as one tool.
 
-    Its frame of reference is that of the last one of them which has one.
+    Its frame of reference is the last that one of these tools found.
     """
 
     settings_model = ToolSettings
@@ -193,10 +193,10 @@ class FollowedApplication(Tool[ToolSettings]):
         self._steps = tuple(steps)
 
     def inspect(self, view: View) -> Finding:
-        """Return the verdict of all of them, and the last frame of reference."""
+        """Return the common verdict, and the last frame of reference."""
         findings: dict[str, Finding] = {}
         for step in self._steps:
-            findings[step.name] = _ask(step.tool, view.picture, view.input, findings)
+            findings[step.name] = _finding_of(step.tool, view.picture, view.input, findings)
         references = [one.reference for one in findings.values() if one.reference is not None]
         return Finding(
             ok=all(one.ok for one in findings.values()),
@@ -215,8 +215,10 @@ def _reason(findings: Mapping[str, Finding]) -> str:
     return ""
 
 
-def _ask(tool: AnyTool, picture: Picture, input: bytes, earlier: Mapping[str, Finding]) -> Finding:
-    """Return the finding of a tool, or the reason that it cannot be asked."""
+def _finding_of(
+    tool: AnyTool, picture: Picture, input: bytes, earlier: Mapping[str, Finding]
+) -> Finding:
+    """Return the finding of a tool, or a finding with the reason why it cannot run."""
     settings: ToolSettings = tool.settings
     reference = None
     if settings.follow is not None:
@@ -258,25 +260,25 @@ def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
 
 
 def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, Any]:
-    """Return a finding's values by the names in the result; what is missing has no value."""
+    """Return a finding's values by their names in the result; missing values are left empty."""
     if not step.own:
         return {}
     prefix = f"{step.name}_" if several else ""
     given = {**found.values, "ok": found.ok} if several else found.values
     values = {
-        field.name: given.get(field.name.removeprefix(prefix), _nothing(field))
+        field.name: given.get(field.name.removeprefix(prefix), _empty_value(field))
         for field in step.fields
     }
     if step.records:
         values[step.name] = [
-            {field.name: one.get(field.name, _nothing(field)) for field in step.records}
+            {field.name: one.get(field.name, _empty_value(field)) for field in step.records}
             for one in found.records
         ]
     return values
 
 
-def _nothing(field: Field) -> Any:
-    """Return the value of a field that has none."""
+def _empty_value(field: Field) -> Any:
+    """Return the value of an empty field."""
     if field.type == "bool":
         return False
     if field.type == "string":
@@ -293,23 +295,23 @@ def _cut(reason: str) -> str:
     return data[: MAX_REASON_BYTES - 3].decode(errors="ignore") + "..."
 
 
-# ---------------------------------------------------------------------- making one
+# ---------------------------------------------------------------------- making programs
 
 
 def split_name(key: str) -> tuple[str, str]:
-    """Return the tool of a key in an application, and its name: ``read`` or ``read left``."""
+    """Split a key of an application, ``read`` or ``read left``, into the tool and its name."""
     kind, _, name = key.partition(" ")
     return kind, name.strip() or kind
 
 
 def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] = ()) -> ProgramStep:
-    """Return the step that an application's entry says.
+    """Return the step of an application's entry.
 
     Args:
-        key: ``TOOL``, or ``TOOL NAME`` where a program has several of one kind.
-        given: settings of the tool, as YAML gives them.
-        setup: what the tool may use.
-        others: names of settings that stand beside tools, for the hint at what was meant.
+        key: ``TOOL``, or ``TOOL NAME`` if a program has several of one kind.
+        given: settings of the tool, as in YAML.
+        setup: folder and calibration for the tool.
+        others: other keys of the entry, for hints at misspelled names.
 
     Raises:
         ProgramError: the tool is unknown, or a setting is wrong.
@@ -338,9 +340,11 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
     try:
         settings = model.model_validate({} if given is None else given)
     except ValidationError as exc:
-        errors = exc.errors(include_url=False)  # what is missing may be what is written wrong
+        errors = exc.errors(include_url=False)  # a missing key may be a misspelled one
         first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
-        text = first["msg"].removeprefix("Value error, ") + hint(first, _known(model, first["loc"]))
+        text = first["msg"].removeprefix("Value error, ") + hint(
+            first, _known_settings(model, first["loc"])
+        )
         raise ProgramError(text, (key, *first["loc"])) from exc
     try:
         return ProgramStep(name, tool_class(settings, setup), own=True)
@@ -350,8 +354,8 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
         raise ProgramError(str(exc), (key,)) from exc
 
 
-def _known(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
-    """Return the settings that there are where an error is."""
+def _known_settings(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
+    """Return the names of the settings at an error's place."""
     for key in place[:-1]:
         field = getattr(model, "model_fields", {}).get(key)
         inner = () if field is None else (field.annotation, *get_args(field.annotation))
@@ -360,11 +364,11 @@ def _known(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
 
 
 def register_tool(name: str, tool: type[AnyTool]) -> None:
-    """Have a tool in this process, without a package that brings it.
+    """Register a tool in this process, without an entry point.
 
     Raises:
-        ConfigurationError: the class is no tool, or the name cannot be one.
-        PluginError: the name is taken by another one.
+        ConfigurationError: the class is no tool, or the name is not valid.
+        PluginError: another tool has the name.
     """
     if not (isinstance(tool, type) and issubclass(tool, Tool)):
         raise wrong_argument("tool", "a subclass of smartcam.inspection.Tool", tool)

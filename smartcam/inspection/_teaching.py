@@ -1,7 +1,6 @@
-"""Teaching an application: its tools are tried on pictures, changed, and written into the file.
+"""Teach an application: try its tools on pictures, change them, and save them in the file.
 
-The YAML stays as people wrote it: comments, order and quotes are kept, and only what differs is
-written.
+Only changed values are written: comments, order and quotes of the YAML are kept.
 """
 
 from __future__ import annotations
@@ -37,23 +36,22 @@ if TYPE_CHECKING:
     from smartcam.inspection._program import Program
 
 MAX_FILE_BYTES: Final = 1 << 22
-"""Largest number of bytes of a cell file that is taught."""
+"""Largest size of a cell file, bytes."""
 
 LINE_WIDTH: Final = 4096
-"""Characters after which a written line is wrapped: none is."""
+"""Width of written lines, in characters, which is large enough to wrap none."""
 
 OWN_KEYS: Final = ("name", "sequence", "rate")
-"""Keys of an application that are no tools."""
+"""Keys of an application that do not name tools."""
 
 
 class Teaching:
-    """An application of a cell file, while it is taught.
+    """Teach an application of a cell file.
 
     Args:
         path: the cell file, or a fleet file.
-        camera: name of the software camera in it.
-        application: number of the application, or its name; a number that is not there is added
-            when it is saved.
+        camera: name of the software camera in the file.
+        application: number or name of the application; saving adds a new number.
 
     Raises:
         ConfigurationError: the file cannot be read, or has no such software camera; the camera has
@@ -79,19 +77,19 @@ class Teaching:
 
     @property
     def name(self) -> str:
-        """Name of the application, its number where it has none."""
+        """Name of the application; its number if it has no name."""
         return str(self._entry.get("name") or self.application)
 
     @property
     def tools(self) -> dict[str, dict[str, Any]]:
-        """Settings of the application's tools by their keys, as the file has them."""
+        """Settings of the application's tools by their keys, as in the file."""
         return {key: dict(given or {}) for key, given in self._entry.items() if key not in OWN_KEYS}
 
     def program(self, tools: Mapping[str, Mapping[str, Any]]) -> Program:
-        """Return the program that these tools make, among the file's other applications.
+        """Return the program of these tools, which may follow the file's other applications.
 
         Raises:
-            ConfigurationError: a tool or a setting is wrong; the text says which.
+            ConfigurationError: a tool or a setting is wrong; the text names it.
         """
         if not isinstance(tools, Mapping):
             raise wrong_argument("tools", "a mapping from tools to their settings", tools)
@@ -111,16 +109,16 @@ class Teaching:
         return made.programs[self.application]
 
     def _changed(self, tools: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """Return the application's entry with other tools."""
+        """Return the application's entry with the given tools."""
         own = {key: one for key, one in self._entry.items() if key in OWN_KEYS}
         return {**own, **{key: dict(given) for key, given in tools.items()}}
 
     def save(self, tools: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write the tools into the file, which otherwise stays as it is, comments and all.
+        """Write the tools into the file, and leave the rest, comments included, unchanged.
 
         Raises:
-            ConfigurationError: a tool or setting is wrong, or the file cannot be written; it is as
-                it was.
+            ConfigurationError: a tool or setting is wrong, or the file cannot be written; the file
+                is unchanged.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
         self.program(tools)
@@ -147,7 +145,7 @@ class Teaching:
         self._entry = entry
 
     def _check_written(self, text: str, entry: dict[str, Any]) -> None:
-        """Refuse to write what another reader would not read as it is meant."""
+        """Raise if another YAML reader would read other settings from the text."""
         wanted = self._read()
         self._software(wanted)["applications"][self.application] = entry
         if _plain(load_yaml(text, what=str(self.path))) != _plain(wanted):
@@ -192,7 +190,7 @@ class Teaching:
         return names[application]
 
     def _software(self, whole: Any) -> dict[str, Any]:
-        """Return the mapping of the camera's ``software:`` in a file."""
+        """Return the mapping ``software:`` of the camera in a file."""
         cameras = whole.get("cameras") if isinstance(whole, dict) else None
         entry = cameras.get(self.camera) if isinstance(cameras, dict) else None
         software = entry.get("software") if isinstance(entry, dict) else None
@@ -206,7 +204,7 @@ class Teaching:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that equals what another reader of YAML gives: tuples as lists."""
+    """Return a value as a YAML reader returns it: tuples become lists."""
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
@@ -215,7 +213,7 @@ def _plain(value: Any) -> Any:
 
 
 def _update(old: Any, new: Mapping[str, Any]) -> None:
-    """Change a mapping of a file where it differs; what is the same stays as it was written."""
+    """Change the differing values of a file's mapping; equal values keep their notation."""
     for key in [key for key in old if key not in new]:
         del old[key]
     for key, value in new.items():
@@ -226,7 +224,7 @@ def _update(old: Any, new: Mapping[str, Any]) -> None:
 
 
 def _flow(value: Any) -> Any:
-    """Return a value that is written in one line."""
+    """Return a value that YAML writes on one line."""
     kinds = load("ruamel.yaml.comments", "teaching needs")
     if isinstance(value, dict):
         made = kinds.CommentedMap({key: _flow(one) for key, one in value.items()})
@@ -242,7 +240,7 @@ def _flow(value: Any) -> Any:
 
 
 def tool_settings() -> dict[str, dict[str, str]]:
-    """Return descriptions of settings by their names, by the kinds of tools."""
+    """Return the descriptions of settings by kind of tool and name."""
     found: dict[str, dict[str, str]] = {}
     for info in TOOLS.available():
         kind: Any = TOOLS.load(info.name)
@@ -252,7 +250,7 @@ def tool_settings() -> dict[str, dict[str, str]]:
 
 
 def read_settings(given: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Any]]:
-    """Return the settings of tools whose values are texts in YAML; an empty one is left out.
+    """Parse settings of tools from YAML texts; empty texts are left out.
 
     Raises:
         ConfigurationError: a text is no YAML.
@@ -270,7 +268,7 @@ def read_settings(given: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str,
 
 
 def setting_text(value: Any) -> str:
-    """Return a setting's value as YAML in one line."""
+    """Return a setting's value as one line of YAML."""
     yaml: Any = load("yaml")
     text: str = yaml.safe_dump(value, default_flow_style=True, width=LINE_WIDTH)
     return text.removesuffix("\n").removesuffix("\n...").strip()

@@ -1,4 +1,4 @@
-"""The contract of tools: settings, fields, and a function from a view to a finding."""
+"""The interface of tools: settings, fields, and a function from a view to a finding."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class ToolSettings(BaseModel):
-    """The settings that every tool has in a program; a tool's own ones derive from them."""
+    """Common settings of all tools; a tool's settings derive from this class."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -37,13 +37,12 @@ class ToolSettings(BaseModel):
 
     region: RegionSetting | None = Field(
         None,
-        description="where it looks: [x, y, width, height] or corners, in pixels; default: "
-        "everywhere",
+        description="region: [x, y, width, height] or corners, in pixels; default: whole picture",
     )
     follow: str | None = Field(
         None,
-        description="name of a tool before this one, or of an application: coordinates are in the "
-        "frame of reference that it found",
+        description="name of an earlier tool or an application: coordinates are in the frame of "
+        "reference that it found",
     )
 
 
@@ -52,11 +51,11 @@ S = TypeVar("S", bound=ToolSettings)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ToolSetup:
-    """The surroundings that a tool is made in.
+    """Folder and calibration with which a tool is made.
 
     Attributes:
-        folder: folder that the paths in its settings are relative to.
-        calibration: calibration of the camera; None: it has none.
+        folder: folder of the file, to which paths in the settings are relative.
+        calibration: calibration of the camera; None: not calibrated.
     """
 
     folder: Path
@@ -65,16 +64,15 @@ class ToolSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """All that a tool may see of one trigger.
+    """Input of a tool for one trigger.
 
     Attributes:
         picture: the whole picture.
-        region: the region of the settings, where it lies in this picture.
-        reference: the frame of reference that the tool follows; the picture's own if it follows
-            none.
-        follows: True if the tool follows another one.
+        region: the region of the settings, placed in this picture.
+        reference: frame of reference that the tool follows; the picture's if it follows none.
+        follows: True if the tool follows another tool.
         input: input data of the trigger.
-        earlier: what the tools before it found, by their names.
+        earlier: findings of the tools before, by their names.
     """
 
     picture: Picture
@@ -101,31 +99,31 @@ class View:
 
 
 class Tool(ABC, Generic[S]):
-    """A tool: made once for a program, then asked about each picture.
+    """A tool, which is made once for a program and then inspects each picture.
 
-    A class with a settings model, its fields, and :meth:`inspect`. Packages offer theirs as entry
-    points of the group ``smartcam.tools``; :func:`register_tool` does it for this process.
+    A subclass has a settings model, fields, and :meth:`inspect`. Packages offer tools as entry
+    points of the group ``smartcam.tools``; :func:`register_tool` adds a tool in this process.
 
-    ``inspect`` is a pure function of the view: it keeps nothing between pictures, and may run in
-    any thread, several at once.
+    ``inspect`` is a pure function of the view: it keeps no state between pictures, and several
+    threads may call it at once.
 
     Args:
         settings: the tool's settings in the program.
-        setup: what it may use besides.
+        setup: folder and calibration.
 
     Raises:
-        ConfigurationError: the settings cannot work.
+        ConfigurationError: the settings are wrong.
 
     Attributes:
         settings: the settings as given.
-        setup: what it may use besides.
+        setup: folder and calibration.
     """
 
     settings_model: ClassVar[type[ToolSettings]]
-    """The pydantic model of its settings in a program file."""
+    """Pydantic model of the tool's settings in a program file."""
 
     needs_whole_region: ClassVar[bool] = True
-    """Not ok where the region reaches out of the picture; the tool is not asked then."""
+    """If True and the region reaches out of the picture, the tool is not called and not ok."""
 
     def __init__(self, settings: S, setup: ToolSetup) -> None:
         self.settings = settings
@@ -138,21 +136,21 @@ class Tool(ABC, Generic[S]):
 
     @property
     def records(self) -> str:
-        """Layout text of one thing found, for tools that find several; "" if there is none."""
+        """Layout text of one record, for tools that find several objects; "": no records."""
         return ""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences for those who teach it: what it was taught, and how good that is."""
+        """Sentences about the tool's taught data and their quality, for the teaching page."""
         return ()
 
     @abstractmethod
     def inspect(self, view: View) -> Finding:
         """Return the finding in a picture.
 
-        What is missing in the picture, too dark or too blurred is a finding that is not ok, with
-        its reason. An exception is a fault of the tool; a camera gives a result then that is not
-        ok and says so.
+        A picture that is too dark or blurred, or lacks the part, gives a finding that is not ok,
+        with its reason. An exception is a fault of the tool; the camera's result is then not ok,
+        with the error as the reason.
         """
 
 

@@ -1,4 +1,4 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.intrinsics import ViewFit
 from smartcam.calibration._lens.poses import half_turned
 from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
-from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, choose_shape
+from smartcam.calibration._lens.sheet_shape import adjust_shape, choose_shape, moved_to_nominal
 from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration._plane.fitting import (
     MODELS,

@@ -1,4 +1,4 @@
-"""Cameras whose lenses are known, and what they see of a target."""
+"""Cameras with known lenses, and their views of a target."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ RIG = Transform(
 def poses(
     count: int, *, seed: int = 0, tilt: float = 0.6, distance: float = 0.35, name: str = "camera"
 ) -> list[Transform]:
-    """Return poses of a target before a camera."""
+    """Return poses of a target in front of a camera."""
     around = scenes.around(
         BOARD, count, tilt=tilt, distance=distance, random=np.random.default_rng(seed)
     )
@@ -73,7 +73,7 @@ def seen(
     target: Target = BOARD,
     points: Array | None = None,
 ) -> list[TargetView]:
-    """Return views with noise, of a sheet whose points are elsewhere where ``points`` says so."""
+    """Return views with noise; ``points``: places of the sheet's points, if not nominal."""
     random = np.random.default_rng(seed)
     views = []
     for number, transform in enumerate(transforms):
@@ -96,7 +96,7 @@ def seen(
 def pairs(
     count: int, *, sigma: float = 0.05, seed: int = 0, points: Array | None = None
 ) -> tuple[list[TargetView], list[TargetView]]:
-    """Return what both cameras of the rig see."""
+    """Return the views of both cameras of the rig."""
     lefts = poses(count, seed=seed, name="left")
     rights = [RIG @ one for one in lefts]
     return (

@@ -1,4 +1,4 @@
-"""A camera, a sheet and robots that carry them; images of targets whose points are known."""
+"""A camera, a sheet and robots that carry them; images of targets with known points."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CAMERA = CameraModel(
 )
 SHEET = Checkerboard(columns=5, rows=4, square=0.03)
 PAIRS_BOARD = Checkerboard(columns=9, rows=6, square=0.025)
-"""In OpenCV's pairs."""
+"""Target of OpenCV's pairs."""
 
 
 def scene(setup: Setup, *, poses: int = 9, tilt: float = 30.0, seed: int = 5) -> HandEyeScene:
@@ -54,7 +54,7 @@ def off_plane(view: TargetView) -> float:
 
 
 def check_pair(left_image: NDArray[np.uint8], right_image: NDArray[np.uint8], name: str) -> None:
-    """See that one of OpenCV's pairs has the same origin in both images."""
+    """Check that one of OpenCV's pairs has the same origin in both images."""
     left, right = (find_target(image, PAIRS_BOARD) for image in (left_image, right_image))
     apart = left.points - right.points
     # the cameras stand side by side: rows agree, columns differ alike
@@ -76,7 +76,7 @@ BENT = CameraModel(
     distortion=np.array([-0.2, 0.08, 0.001, -0.0005, 0.0]),
 )
 FACING = np.diag([1.0, -1.0, -1.0])
-"""The rotation of a sheet that stands upright before the camera."""
+"""The rotation of a sheet that is upright in front of the camera."""
 
 
 class Drawn(NamedTuple):
@@ -84,8 +84,8 @@ class Drawn(NamedTuple):
 
     Attributes:
         image: (H, W).
-        target: what it shows.
-        pixels: (N, 2), where its points are.
+        target: the target in the image.
+        pixels: (N, 2), places of the target's points.
     """
 
     image: NDArray[np.uint8]
@@ -93,13 +93,13 @@ class Drawn(NamedTuple):
     pixels: Array
 
     def off(self, view: TargetView) -> Array:
-        """Return (N,): how far from the truth a view has its points, pixels."""
+        """Return the errors (N,) of a view's points, pixels."""
         off: Array = np.linalg.norm(view.points - self.pixels[view.ids], axis=1)
         return off
 
 
 def facing(target: Target, tilt: float = 0.0, roll: float = 0.0, away: float = 0.45) -> Transform:
-    """Return a pose, its middle before the camera; tilted to the left and back, then rolled."""
+    """Return a pose in front of the camera; tilted to the left and back, then rolled."""
     turn = Rotation.from_euler("z", roll, degrees=True).as_matrix()
     turn = turn @ Rotation.from_rotvec([0.6 * tilt, 0.8 * tilt, 0], degrees=True).as_matrix()
     middle = turn @ FACING @ target.points.mean(axis=0)

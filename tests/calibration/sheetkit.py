@@ -34,7 +34,7 @@ _TURN = Rotation.from_euler("xyz", [192, 8, 10], degrees=True).as_matrix()
 SEEN = Transform(
     "camera", "target", _TURN, np.array([0, 0, 0.5]) - _TURN @ TARGET.points.mean(axis=0)
 )
-"""The sheet before the camera, which is tilted by 14 degrees."""
+"""The sheet in the frame of the camera, which is tilted by 14 degrees."""
 
 LIES = Transform.from_quaternion(
     "robot",
@@ -42,11 +42,11 @@ LIES = Transform.from_quaternion(
     (0.5, 0.1, 0.03),
     Rotation.from_euler("xyz", [3, -2, 130], degrees=True).as_quat(),
 )
-"""The sheet before the robot."""
+"""The sheet in the robot's frame."""
 
 TOOL_Z = -LIES.rotation[:, 2]
 SIGMA = 2e-4
-"""Of a touch, metres."""
+"""Standard deviation of a touch, metres."""
 
 
 def field(count: int = 7, border: float = 60.0) -> Array:
@@ -59,7 +59,7 @@ def field(count: int = 7, border: float = 60.0) -> Array:
 
 
 def truth(pixels: Array, camera: CameraModel = CAMERA) -> Array:
-    """Return where the plane's points that pixels show lie before the robot, (N, 3)."""
+    """Return the robot's coordinates (N, 3) of the plane's points that pixels show."""
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     normal = SEEN.rotation[:, 2]
     depths = (normal @ SEEN.translation) / (rays @ normal)
@@ -67,7 +67,7 @@ def truth(pixels: Array, camera: CameraModel = CAMERA) -> Array:
 
 
 def localized(u: float, v: float, theta: float = 0.0, frame: str = "camera") -> Localization:
-    """Return what a camera says of a part whose y axis was turned up."""
+    """Return a camera's result for a part, with the y axis turned up."""
     pose = Pose(
         Header(1, datetime(2026, 1, 1, tzinfo=UTC), frame),
         Position(u, -v),
@@ -78,7 +78,7 @@ def localized(u: float, v: float, theta: float = 0.0, frame: str = "camera") -> 
 
 @functools.cache
 def picture(number: int, *, straight: bool = False) -> Any:
-    """Return what the camera sees of the sheet; each picture has its own noise."""
+    """Return the camera's view of the sheet; each picture has its own noise."""
     random = np.random.default_rng([5, number])
     return render(TARGET, STRAIGHT if straight else CAMERA, SEEN, noise=2.0, random=random)
 
@@ -103,7 +103,7 @@ class Cell:
         return picture(self.taken, straight=self.camera is STRAIGHT)
 
     def touched(self, points: Sequence[Sequence[float]]) -> Array:
-        """Return where the robot touches points (N, 2) of the sheet, metres."""
+        """Return the robot's touches of points (N, 2) of the sheet, metres."""
         flat = np.column_stack([np.array(points), np.zeros(len(points))])
         return LIES.apply(self.scale * flat) + self._random.normal(0.0, self.sigma, (len(flat), 3))
 
@@ -152,7 +152,7 @@ async def next_answer(view: dict[str, Any], cell: Cell) -> dict[str, Any]:
 
 
 async def _main(folder: Path) -> None:
-    """Resume the wizard; at each line of stdin a step is answered, stdout says what comes then."""
+    """Resume the wizard; each line of stdin answers a step, stdout shows the next one."""
     cell = Cell(sigma=0.0)
     session = begin(folder, cell, journal=folder / "table.journal")
     view = session.current

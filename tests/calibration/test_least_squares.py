@@ -63,8 +63,8 @@ def test_covariance_is_the_blocks_of_the_whole_inverse() -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_minimize_takes_back_what_does_not_gain(*, fails: bool) -> None:
-    """Of x^2 + 1000 (y - x^2)^2, whose valley is bent; steps beyond a wall lead nowhere."""
+def test_minimize_takes_back_a_step_without_gain(*, fails: bool) -> None:
+    """The cost x^2 + 1000 (y - x^2)^2 has a bent valley; beyond a wall there is no cost."""
 
     def evaluate(at: np.ndarray) -> Normal:
         x, y = at
@@ -87,7 +87,7 @@ def test_minimize_takes_back_what_does_not_gain(*, fails: bool) -> None:
     assert last.cost < 1e-12
 
 
-def test_minimize_of_what_has_no_cost_gives_it_back() -> None:
+def test_minimize_without_a_finite_cost_returns_the_start() -> None:
     nothing = Normal.nothing(2, 1, 6)._replace(cost=np.inf)
     found, last = minimize(7, lambda _: nothing, lambda at, _shared, _own: at, gain=1e-9)
     assert (found, last.cost) == (7, np.inf)
@@ -102,7 +102,7 @@ def test_scaled_equations_of_many_units_are_solved() -> None:
     np.testing.assert_allclose(inverse_scaled(matrix), inverse, rtol=1e-9)
 
 
-def test_many_scaled_equations_are_solved_even_where_some_are_missing() -> None:
+def test_many_scaled_equations_are_solved_even_if_some_are_missing() -> None:
     rows = RANDOM.normal(size=(90, MAX_UNKNOWNS_BY_SVD + 10))
     expected = RANDOM.normal(size=MAX_UNKNOWNS_BY_SVD + 10)
     np.testing.assert_allclose(solve_scaled(rows.T @ rows, rows.T @ rows @ expected), expected)
@@ -114,7 +114,7 @@ def test_many_scaled_equations_are_solved_even_where_some_are_missing() -> None:
 # ------------------------------------------------------------------ BLAS has one thread
 
 PATIENCE = 30.0
-"""Seconds; only what hangs takes as long."""
+"""Seconds after which a test fails."""
 
 
 def threads() -> list[int]:
@@ -126,7 +126,7 @@ def threads() -> list[int]:
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """Have two, also where the machine has one core."""
+    """Set two threads, even on a machine with one core."""
     if np.lib.NumpyVersion(np.__version__) < "2.0.0":
         pytest.skip("the BLAS of this NumPy has one number for all threads")
     with load("threadpoolctl").threadpool_limits(2, "blas"):
@@ -170,7 +170,7 @@ def test_each_of_two_threads_gives_them_back() -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_within_itself_it_stays_one() -> None:
+def test_nested_limit_stays_at_one_thread() -> None:
     one = OneBlasThread()
     with one:
         with one:
@@ -186,7 +186,7 @@ def test_a_copy_in_a_fork_begins_anew() -> None:
         one.forked()
         with one:
             assert set(threads()) == {1}
-    assert not one._inside  # who was inside in front of the fork leaves without a trace
+    assert not one._inside  # a thread that was inside before the fork has no effect in the child
 
 
 @pytest.mark.usefixtures("two_threads")

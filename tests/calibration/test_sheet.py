@@ -1,4 +1,4 @@
-"""From pixels to the robot by a picture of a sheet: errors against their prediction, refusals."""
+"""Map pixels to the robot by a picture of a sheet: errors as predicted, and refusals."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_sigma_in_pixels_becomes_metres_of_the_robot() -> None:
     assert 0.009 < seen_half.theta < 0.012
 
 
-def test_sheet_with_y_as_it_is_is_refused_instead_of_mirrored() -> None:
+def test_sheet_with_a_wrong_y_axis_is_refused_instead_of_mirrored() -> None:
     found = calibrate_sheet(seen(), touched(), camera=CAMERA)
     with pytest.raises(ConfigurationError, match="y_down=True, so with y_down=False"):
         smartcam.connect("bvs://127.0.0.1", interpret_as="localizations", calibration=found)
@@ -166,7 +166,7 @@ def test_sheet_refuses_poses_of_another_frame_or_out_of_the_image_plane() -> Non
         found.transform([[np.nan, 1.0]])
 
 
-def test_sheet_without_a_lens_says_what_is_lost() -> None:
+def test_sheet_without_a_lens_has_a_remark() -> None:
     found = calibrate_sheet(seen(sigma=0.05), touched())
     assert [one.code for one in found.remarks] == ["LENS_UNKNOWN", "POOR_FIT"]
     assert "the distortion of its lens is not" in found.remarks[0].text
@@ -202,7 +202,7 @@ def test_sheet_with_four_points_needs_a_lens() -> None:
     assert np.abs(error).max() < 1e-6
 
 
-def test_corners_of_a_wrong_print_are_told_and_followed() -> None:
+def test_corners_of_a_wrong_print_have_a_remark_and_are_followed() -> None:
     plane = touched(SIGMA, scale=0.97)
     assert plane.model == "similarity"
     assert plane.scale == pytest.approx(0.97, abs=0.005)
@@ -249,7 +249,7 @@ def test_sheet_saved_and_loaded_is_the_same(tmp_path: Path) -> None:
         ("plane", {}, "stored plane calibration"),
     ],
 )
-def test_sheet_from_data_that_are_none_is_refused(name: str, value: object, text: str) -> None:
+def test_sheet_from_invalid_data_is_refused(name: str, value: object, text: str) -> None:
     data = json.loads(json.dumps(calibrate_sheet(seen(), touched(), camera=CAMERA).to_data()))
     with refused("SHAPE", text):
         SheetCalibration.from_data({**data, name: value})

@@ -1,4 +1,4 @@
-"""Cameras on robots and images of targets, whose truth is known."""
+"""Simulated cameras on robots and images of targets, with known truth."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def before(distance: float) -> Transform:
     return Transform("camera", "target", np.diag([1.0, -1.0, -1.0]), np.array([0, 0, distance]))
 
 
-def test_view_without_noise_shows_points_where_they_are() -> None:
+def test_view_without_noise_has_points_at_their_true_places() -> None:
     seen = view(SHEET, CAMERA, before(0.5), sigma=0.0, random=np.random.default_rng(1), name="one")
     np.testing.assert_array_equal(seen.points, CAMERA.project(before(0.5).apply(SHEET.points)))
     assert seen.ids.tolist() == list(range(len(SHEET.points)))
     assert (seen.name, seen.size) == ("one", CAMERA.size)
 
 
-def test_view_noise_has_the_sigma_that_its_covariance_says() -> None:
+def test_view_noise_has_the_sigma_of_its_covariance() -> None:
     random = np.random.default_rng(2)
     views = [view(SHEET, CAMERA, before(0.5), sigma=0.2, random=random) for _ in range(60)]
     off = np.concatenate(
@@ -73,7 +73,7 @@ def test_around_looks_at_the_centre_from_within_the_cone() -> None:
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-def test_scene_without_noise_says_what_is_so(setup: Setup) -> None:
+def test_scene_without_noise_gives_the_truth(setup: Setup) -> None:
     truth = scene(setup)
     poses, views = truth.measured(
         pixel_sigma=0.0, robot_sigmas=EXACT, random=np.random.default_rng(1)
@@ -129,7 +129,7 @@ def test_errors_of_a_pose_are_its_turn_and_shift() -> None:
 
 
 # ----------------------------------------------------------------------
-# Images of targets against what follows from their geometry alone.
+# Compare images of targets with their geometry.
 
 
 UNIT = CameraModel(size=(60, 50), matrix=np.array([[1000, 0, 0], [0, 1000, 0], [0, 0, 1.0]]))
@@ -137,7 +137,7 @@ UNIT = CameraModel(size=(60, 50), matrix=np.array([[1000, 0, 0], [0, 1000, 0], [
 
 
 def upright(left: float, down: float) -> Transform:
-    """Return a sheet a metre away; where its origin is, pixels of ``UNIT``."""
+    """Return a sheet a metre away, and the pixel of its origin in ``UNIT``."""
     return Transform("camera", "target", FACING, np.array([left, down, 1e3]) / 1e3)
 
 
@@ -149,7 +149,7 @@ def test_render_edge_covers_its_share_of_a_pixel() -> None:
     assert image[34, 17:24].tolist() == [0, 0, 0, 50, 200, 200, 200]
 
 
-def test_render_outline_and_paper_lie_where_they_should() -> None:
+def test_render_outline_and_paper_are_at_their_true_places() -> None:
     board = Checkerboard(columns=3, rows=3, square=0.01)
     image = render(board, UNIT, upright(20.5, 29.5), blur=0, black=0, white=200, background=90)
     # the outermost square is black, then comes paper as wide as a square
@@ -224,7 +224,7 @@ def test_render_edges_are_where_the_camera_projects_them(camera: CameraModel) ->
         assert left - 0.5 + share == pytest.approx(expected, abs=0.01)
 
 
-def test_render_noise_is_as_large_as_asked_and_the_same_each_time() -> None:
+def test_render_noise_has_the_given_sigma_and_is_reproducible() -> None:
     board = Checkerboard(columns=3, rows=3, square=0.001)
     first = render(board, UNIT, upright(20, 30), noise=5)
     assert first[:20].std() == pytest.approx(5, rel=0.1)

@@ -1,6 +1,6 @@
 """Solvers: each part of the way from the camera to the robot, and the chain of them.
 
-The figures are those of the traps in the thesis' text: what its sentences, taken literally, give.
+The figures are those of the traps in the thesis' text, whose sentences are applied literally.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def heading(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where the x axis of an orientation points, by its textbook matrix."""
+    """Return the direction of an orientation's x axis, by its textbook matrix."""
     x, y, z, w = quaternion
     return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
 
@@ -95,7 +95,7 @@ def test_real_world_position_is_the_rigid_motion(
 
 
 def test_real_world_position_of_a_turned_sheet_keeps_its_turn() -> None:
-    """Point and normal alone leave it open: 103.5 mm at 200 mm for 30 degrees."""
+    """Point and normal alone leave the turn open: 103.5 mm at 200 mm for 30 degrees."""
     rotation = yaw(math.radians(30))
     o = np.array([0.4, 0.1, 0.02])
     solver = RealWorldPosition.from_touches(o, o + rotation[:, 0] * 0.2, o + rotation[:, 1] * 0.1)
@@ -142,7 +142,7 @@ def test_height_is_exact_in_any_frame(
 ) -> None:
     tops = np.column_stack([np.array(places), np.full(len(places), height)])
     camera = np.array([0.1, -0.2, above])
-    seen = tops + (tops - camera) * height / (above - height)  # where the rays meet the plane
+    seen = tops + (tops - camera) * height / (above - height)  # rays meet the plane
     in_plane = Height(height, viewpoint=camera)
     in_robot = Height(height, 3 * truth.rotation[:, 2], truth.apply(camera))
     real = RealWorldPosition(truth.translation, truth.rotation)
@@ -204,7 +204,7 @@ def test_chain_is_a_solver_and_the_empty_one_changes_nothing() -> None:
     assert not isinstance(object(), Solver)
 
 
-def test_chain_applies_in_order_and_then_adds_behind() -> None:
+def test_chain_applies_in_order_and_then_appends() -> None:
     first, second = CameraPosition2D((1, 0)), CameraPosition2D((0, 0), math.pi / 2)
     chain = Chain([first], frame="table").then(second)
     np.testing.assert_allclose(chain.transform([(2, 0)]), [[0, -1, 0]], atol=1e-16)
@@ -222,7 +222,7 @@ def test_chain_of_many_is_that_of_each_alone(
     np.testing.assert_allclose(chain.transform(places), alone, rtol=0, atol=1e-15)
 
 
-def test_chain_to_robot_keeps_what_is_not_the_pose() -> None:
+def test_chain_to_robot_keeps_all_fields_but_the_pose() -> None:
     rotation = rotation_about(UP, 0.0)
     chain = Chain([RealWorldPosition((1, 2, 3), rotation)], frame="base")
     part = localization(0.1, 0.2, 0.3, "square")
@@ -250,14 +250,12 @@ GRID = np.array([(x, y) for x in (0.0, 0.1, 0.2, 0.3) for y in (0.0, 0.1, 0.2)])
 
 
 def tilted(places: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
-    """Return where a camera with some tilt sees points of its plane."""
+    """Return a tilted camera's pixels of points of its plane."""
     return places / (1 + places @ [[tilt], [-0.3 * tilt]])
 
 
 @given(transforms(), st.sampled_from(["rigid", "similarity", "affine", "homography"]))
-def test_chain_of_a_calibration_says_what_the_calibration_says(
-    truth: Transform, model: Any
-) -> None:
+def test_chain_of_a_calibration_maps_like_the_calibration(truth: Transform, model: Any) -> None:
     noise = np.random.default_rng(5).normal(0, 1e-4, (len(GRID), 3))
     touched = truth.apply(np.column_stack([GRID, np.zeros(len(GRID))])) + noise
     seen = GRID if model == "rigid" else tilted(GRID, 0.5)
@@ -295,7 +293,7 @@ def test_chain_of_a_calibration_knows_its_y_down(model: PlaneModel, y_down: bool
     assert (chain.y_down, chain.then(ToolOffset.facing()).y_down) == (y_down, y_down)
 
 
-def test_chain_with_a_height_says_what_a_raised_calibration_says() -> None:
+def test_chain_with_a_height_maps_like_a_raised_calibration() -> None:
     rotation = rotation_about(np.array([0.2, -0.1, 1]), 0.7)
     touched = GRID @ rotation[:, :2].T + [0.5, -0.4, 0.1]
     calibration = fit_plane(GRID, touched, model="similarity")
@@ -332,7 +330,7 @@ def test_projection_of_another_shape_is_refused() -> None:
         PlaneProjection(np.eye(3))
 
 
-def test_transform_of_points_in_space_is_refused_and_not_read_as_others() -> None:
+def test_transform_of_points_in_space_is_refused() -> None:
     with refused("SHAPE", r"expected points of shape (2, 2), got (2, 3)"):
         Chain([]).transform([(0.1, 0.2, 0.0), (0.3, 0.4, 0.0)])
 

@@ -97,7 +97,7 @@ def test_comparison_is_drawn(files: Path) -> None:
     run(*compare("lens1.json", "lens2.json", "--svg", "one.svg")).done()
     drawn = (files / "one.svg").read_text()
     assert drawn.startswith("<svg ")
-    assert ">what noise leads to<" in drawn
+    assert ">expected from noise<" in drawn
     run(*compare("pair.json", "pair.json", "--svg", "two.svg")).done()
     assert (files / "two-left.svg").exists()
     assert (files / "two-right.svg").exists()

@@ -148,7 +148,7 @@ def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
     assert f"the next file that comes into {tmp_path / 'ftp'} counts" in asked["description"]
     assert asked["notes"] == ["picture 1 of 1; to end without it, abort"]
     assert asked["waiting"].startswith("Waiting: the next file that comes into ")
-    assert "what is there already does not. It is waited for 0.3 s" in asked["waiting"]
+    assert "earlier files do not count. It is waited for 0.3 s" in asked["waiting"]
 
 
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(

@@ -1,4 +1,4 @@
-"""Two pictures of scenes whose depth is known, drawn without interpolation."""
+"""Draw picture pairs of scenes with known depth, without interpolation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIZE = (256, 160)
 
 
 class Scene(NamedTuple):
-    """Two rectified pictures and what is true of them."""
+    """Two rectified pictures with their true disparity."""
 
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
@@ -22,7 +22,7 @@ class Scene(NamedTuple):
 
 
 class Texture:
-    """A sum of waves in the plane: known at every place, so that it is drawn and never warped."""
+    """A sum of waves in the plane, which can be drawn exactly at every place."""
 
     def __init__(self, seed: int, contrast: float = 30.0, finest: float = 4.0) -> None:
         rng = np.random.default_rng(seed)
@@ -68,7 +68,7 @@ def plane(
 def step(
     far: float, near: float, *, noise: float, seed: int = 1, size: tuple[int, int] = SIZE
 ) -> Scene:
-    """Return a far wall and, before its middle, a near square."""
+    """Return a far wall with a near square in front of its middle."""
     rng = np.random.default_rng(seed + 1000)
     back, front = Texture(seed), Texture(seed + 1)
     v, u = np.mgrid[: size[1], : size[0]].astype(float)
@@ -92,7 +92,7 @@ def _seen(
 
 
 class Room(NamedTuple):
-    """A wall and a board before it, in the left camera's frame, with a texture each."""
+    """A textured wall and a textured board in front, in the left camera's frame."""
 
     wall: tuple[float, float, float]  # Z = z0 + zx X + zy Y of the wall, metres
     board: float | None  # distance of the board, metres, parallel to the picture
@@ -103,7 +103,7 @@ class Room(NamedTuple):
     def rays(
         self, origin: NDArray[np.float64], rays: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where rays (N, 3) from a point meet the room, (N, 3), and its brightness (N,)."""
+        """Return the ends of rays (N, 3) from a point, (N, 3), and the brightness there (N,)."""
         z0, zx, zy = self.wall
         along = (z0 + zx * origin[0] + zy * origin[1] - origin[2]) / (
             rays[:, 2] - zx * rays[:, 0] - zy * rays[:, 1]
@@ -122,7 +122,7 @@ class Room(NamedTuple):
     def picture(
         self, camera: CameraModel, pose: Transform | None = None, *, noise: float = 0, seed: int = 1
     ) -> NDArray[np.uint8]:
-        """Return what a camera sees; ``pose`` is T_camera_left, None: the left one."""
+        """Return the picture of a camera at the pose T_camera_left; None: the left camera."""
         width, height = camera.size
         v, u = np.mgrid[:height, :width]
         flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
@@ -135,8 +135,7 @@ class Room(NamedTuple):
         return _seen(brightness, noise, np.random.default_rng(seed))
 
     def depth(self, camera: CameraModel, turn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the true depth of a camera without distortion whose frame is turned from the left
-        one's."""
+        """Return the true depth for a camera without distortion, rotated from the left camera."""
         width, height = camera.size
         v, u = np.mgrid[:height, :width]
         flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))

@@ -1,4 +1,4 @@
-"""Depth maps made cleaner: against plain loops, and against scenes whose depth is known."""
+"""Cleaned depth maps, compared with plain loops and with scenes of known depth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from smartcam.depth import SpatialFilter, TemporalFilter, fill_holes
 from smartcam.depth._cleaning import _widened, as_metres
 from smartcam.depth._inside import FOCAL, TowerTable, WoodenBlock
-from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA, FINE, _jumps, _TableRays
+from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA, RAYS_PER_SIDE, _jumps, _TableRays
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 NEAR, FAR, SIGMA = 0.45, 0.50, 0.002
@@ -21,7 +21,7 @@ Map = NDArray[Any]
 
 
 def step(shape: tuple[int, int] = (60, 80)) -> Map:
-    """Return a wall with a box before it."""
+    """Return a wall with a box in front."""
     depth = np.full(shape, FAR, np.float32)
     depth[15:45, 20:60] = NEAR
     return depth
@@ -48,7 +48,7 @@ def test_millimetres_become_metres() -> None:
     np.testing.assert_allclose(as_metres(depth, 1e-4)[0, 1], 0.15, rtol=1e-6)
 
 
-def test_what_is_no_depth_is_a_hole_and_the_given_map_stays() -> None:
+def test_invalid_depths_are_holes_and_the_given_map_is_unchanged() -> None:
     given = np.array([[math.nan, math.inf, -math.inf], [-1.0, 0.0, 2.5]])
     before = given.copy()
     depth = as_metres(given)
@@ -61,14 +61,14 @@ def test_what_is_no_depth_is_a_hole_and_the_given_map_stays() -> None:
     "wrong",
     [np.zeros((2, 2), np.int32), np.zeros(4, np.uint16), np.zeros((2, 2, 1)), np.zeros((0, 4))],
 )
-def test_what_is_no_map_is_told(wrong: Map) -> None:
+def test_wrong_map_is_refused(wrong: Map) -> None:
     for stage in (SpatialFilter(), TemporalFilter(), fill_holes):
         with pytest.raises(FrameFormatError, match=r"expected \(H, W\) of uint16 or float, got"):
             stage(wrong)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1e-3, math.nan, math.inf])
-def test_scale_that_is_none_is_told(scale: float) -> None:
+def test_invalid_scale_is_refused(scale: float) -> None:
     with pytest.raises(ConfigurationError, match="scale: expected"):
         SpatialFilter()(np.ones((2, 2), np.uint16), scale)
 
@@ -77,7 +77,7 @@ def test_scale_that_is_none_is_told(scale: float) -> None:
 
 
 def plain_pass(line: list[float], alpha: float, delta: float) -> None:
-    """Smooth a line forth and back, one number after the other."""
+    """Smooth a line forwards and backwards, one number after the other."""
     for places in (range(1, len(line)), range(len(line) - 2, -1, -1)):
         way = 1 if places.step > 0 else -1
         for place in places:
@@ -105,7 +105,7 @@ def test_spatial_filter_is_that_of_plain_loops(alpha: float, delta: float, itera
     np.testing.assert_allclose(smooth, plain_spatial(depth, alpha, delta, iterations), atol=2e-6)
 
 
-def test_spatial_filter_takes_noise_out_and_leaves_edges_where_they_are() -> None:
+def test_spatial_filter_reduces_noise_and_keeps_edges() -> None:
     truth = step()
     depth = noisy(truth, 2)
     smooth = SpatialFilter(0.5, 0.02)(depth)
@@ -139,7 +139,7 @@ def test_holes_stay_holes_and_have_no_part() -> None:
     np.testing.assert_allclose(SpatialFilter(0.3, 0.02, 4)(near)[~holes], 0.01, atol=1e-7)
 
 
-def test_slope_stays_a_slope_and_given_map_as_it_is() -> None:
+def test_slope_stays_a_slope_and_given_map_is_unchanged() -> None:
     slope = np.tile(np.linspace(0.4, 0.6, 200, dtype=np.float32), (50, 1))
     before = slope.copy()
     smooth = SpatialFilter(0.5, 0.02)(slope)
@@ -161,7 +161,7 @@ def test_disparities_are_smoothed_in_pixels() -> None:
 
 
 @pytest.mark.parametrize("iterations", [1, 2])
-def test_pixels_that_share_their_noise_are_told(iterations: int) -> None:
+def test_shared_counts_pixels_with_common_noise(iterations: int) -> None:
     smooth = SpatialFilter(0.4, 1.0, iterations)
     depth = 5 + np.random.default_rng(6).normal(0, 1e-2, (400, 400))
     found = (1e-2 / np.std(smooth(depth)[30:-30, 30:-30])) ** 2
@@ -172,13 +172,13 @@ def test_pixels_that_share_their_noise_are_told(iterations: int) -> None:
 @pytest.mark.parametrize(
     "wrong", [{"alpha": 0}, {"alpha": 1.1}, {"alpha": math.nan}, {"delta": 0}, {"delta": math.inf}]
 )
-def test_average_that_is_none_is_told(wrong: dict[str, float]) -> None:
+def test_invalid_average_is_refused(wrong: dict[str, float]) -> None:
     for kind in (SpatialFilter, TemporalFilter):
         with pytest.raises(ConfigurationError, match=f"{kind.__name__}: (alpha|delta): expected"):
             kind(**wrong)  # type: ignore[arg-type]
 
 
-def test_numbers_out_of_range_are_told() -> None:
+def test_numbers_out_of_range_are_refused() -> None:
     for iterations in (0, 17):
         with pytest.raises(ConfigurationError, match="iterations: expected 1 to 16"):
             SpatialFilter(iterations=iterations)
@@ -191,7 +191,7 @@ def test_numbers_out_of_range_are_told() -> None:
 
 
 def crossings(depth: Map, level: float) -> Map:
-    """Return in which column each row goes below a level, from the left, nan where a hole does."""
+    """Return the column where each row first goes below a level; NaN at a hole."""
     below = (depth > 0) & (depth < level)
     first = below.argmax(axis=1)
     before = depth[np.arange(len(depth)), first - 1]
@@ -205,7 +205,7 @@ def test_rendered_scene_gets_nearer_to_its_truth_and_keeps_its_edges() -> None:
     camera = (0.4, 0.0, 0.5)
     rays = _TableRays(camera)
     rays.draw(table.blocks[0])
-    truth = rays.depth[FINE // 2 :: FINE, FINE // 2 :: FINE]
+    truth = rays.depth[RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE, RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE]
     average, smooth = TemporalFilter(delta=0.008), SpatialFilter(delta=0.008)
     maps = table.look(camera, 5).depth
     for one in maps:
@@ -233,7 +233,7 @@ def test_rendered_scene_gets_nearer_to_its_truth_and_keeps_its_edges() -> None:
 
 
 class PlainTemporal:
-    """A pixel after the other, as the documentation of the filter says it."""
+    """Filter one pixel after the other, as the filter's documentation says."""
 
     def __init__(self, alpha: float, delta: float, persistence: int) -> None:
         self.alpha, self.delta, self.persistence = alpha, delta, persistence
@@ -288,7 +288,7 @@ def test_temporal_filter_takes_noise_out() -> None:
     assert rms(first, truth) > 2.5 * rms(shown, truth)
 
 
-def test_what_moves_is_shown_where_it_is_now() -> None:
+def test_moving_object_is_shown_at_its_new_place() -> None:
     average = TemporalFilter()
     truth = step()
     for _ in range(5):
@@ -297,7 +297,7 @@ def test_what_moves_is_shown_where_it_is_now() -> None:
     np.testing.assert_array_equal(average(moved), moved)
 
 
-def test_hole_shows_what_was_there_for_so_many_maps() -> None:
+def test_hole_keeps_earlier_average_for_persistence_maps() -> None:
     average = TemporalFilter(persistence=2)
     truth = step()
     average(truth)
@@ -310,7 +310,7 @@ def test_hole_shows_what_was_there_for_so_many_maps() -> None:
     np.testing.assert_array_equal(average(truth), truth)
 
 
-def test_hole_beside_what_moved_shows_nothing_of_before() -> None:
+def test_hole_beside_a_moved_object_is_cleared() -> None:
     average = TemporalFilter(persistence=5)
     truth = step()
     average(truth)
@@ -332,7 +332,7 @@ def test_other_scene_or_size_begins_anew() -> None:
     np.testing.assert_array_equal(average(holes), holes)
 
 
-def test_average_is_nobody_elses() -> None:
+def test_returned_average_is_a_copy() -> None:
     average = TemporalFilter()
     shown = average(step())
     shown[:] = 9
@@ -380,7 +380,7 @@ def test_nothing_to_fill_from_stays_empty() -> None:
     assert not fill_holes(np.zeros((4, 4), np.uint16), "nearest").any()
 
 
-def test_wrong_way_of_filling_is_told() -> None:
+def test_unknown_way_of_filling_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"how: expected one of \('left', 'nearest'"):
         fill_holes(step(), "right")  # type: ignore[arg-type]
     for reach in (0, 17):
@@ -388,7 +388,7 @@ def test_wrong_way_of_filling_is_told() -> None:
             fill_holes(step(), reach=reach)
 
 
-def test_simulated_depth_has_the_noise_and_holes_that_it_says() -> None:
+def test_simulated_depth_has_documented_noise_and_holes() -> None:
     table = TowerTable(4)
     table.blocks.append(WoodenBlock(0.4, 0.0, math.pi / 2, size=(0.2, 0.1, 0.06)))
     (depth,) = table.look((0.4, 0.0, 0.6)).depth

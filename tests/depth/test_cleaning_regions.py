@@ -1,4 +1,4 @@
-"""A region's median with its sigma, and its equalized picture."""
+"""Median and sigma of a region, and its equalized picture."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def test_region_may_be_a_polygon_a_mask_or_all_of_it() -> None:
     assert region_depth(depth, mask, scale=1e-4).median == pytest.approx(0.04)
 
 
-def test_what_lies_outside_of_the_map_is_no_part_of_a_region() -> None:
+def test_region_is_clipped_to_the_map() -> None:
     depth = np.full((10, 10), 2.0)
     assert region_depth(depth, (-5, -5, 10, 10)).pixels == 25
     assert region_depth(depth, [(-9, -9), (4.5, -9), (4.5, 4.5), (-9, 4.5)]).pixels == 25
 
 
-def test_polygon_has_the_pixels_whose_middles_are_inside() -> None:
+def test_polygon_has_the_pixels_with_centres_inside() -> None:
     random = np.random.default_rng(1)
     for _ in range(6):
         corners = random.uniform(-3, 23, (int(random.integers(3, 8)), 2))
@@ -63,7 +63,7 @@ def test_polygon_has_the_pixels_whose_middles_are_inside() -> None:
 @pytest.mark.parametrize(
     ("smoothed", "holes", "most"), [(0, 0.05, 0.1), (1, 0, 0.1), (2, 0.05, 0.3)]
 )
-def test_sigma_is_what_the_median_scatters_by(smoothed: int, holes: float, most: float) -> None:
+def test_sigma_equals_the_scatter_of_the_median(smoothed: int, holes: float, most: float) -> None:
     random = np.random.default_rng(2)
     smooth = SpatialFilter(0.5, 1.0, max(1, smoothed))
     medians, sigmas = [], []
@@ -88,7 +88,7 @@ def test_spread_is_that_of_a_pixel_and_sigma_that_of_a_median() -> None:
     assert region_depth(depth, shared=1e9).sigma == told.spread
 
 
-def test_region_without_a_depth_is_an_error_that_says_where() -> None:
+def test_region_without_a_depth_is_refused_with_its_place() -> None:
     depth = np.full((20, 30), 1.0)
     depth[5:10, 4:14] = 0
     with pytest.raises(FrameFormatError, match=r"the box \[4, 5, 10, 5\], got none in 50 pixels"):
@@ -110,13 +110,13 @@ def test_region_without_a_depth_is_an_error_that_says_where() -> None:
         "left",
     ],
 )
-def test_what_is_no_region_is_told(wrong: Any) -> None:
+def test_wrong_region_is_refused(wrong: Any) -> None:
     for take in (region_depth, equalize_depth):
         with pytest.raises(ConfigurationError, match=r"region: expected a box"):
             take(np.ones((20, 20)), wrong)
 
 
-def test_shared_below_one_is_told() -> None:
+def test_shared_below_one_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="shared: expected 1 or more"):
         region_depth(np.ones((4, 4)), shared=0.5)
 

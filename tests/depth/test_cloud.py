@@ -1,4 +1,4 @@
-"""Clouds: what they are made of, what is refused, where they are moved to."""
+"""Clouds: making, refusing and moving them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds as files: bytes by hand, what others write, and what is no cloud at all."""
+"""Clouds as files: bytes by hand, files of other programs, and files that are no clouds."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def loaded(folder: Path, name: str, data: bytes) -> Cloud:
 
 
 @pytest.mark.parametrize(("name", "text", "data"), GOLDEN)
-def test_files_are_those_of_the_documents(
+def test_files_match_the_formats_documents(
     tmp_path: Path, name: str, text: bool, data: bytes
 ) -> None:
     save_cloud(tmp_path / name, CLOUD, text=text)
@@ -297,9 +297,7 @@ def test_files_that_cannot_be_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         loaded(tmp_path, "a.ply", PLY_BYTES)
 
 
-def test_file_that_is_not_written_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(b"old")
 

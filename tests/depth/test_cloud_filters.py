@@ -1,4 +1,4 @@
-"""Filters of clouds, beside small-gicp's and what SciPy makes of all pairs."""
+"""Filters of clouds, compared with small-gicp's and with SciPy over all pairs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ spatial = pytest.importorskip("scipy.spatial", reason="needs the extra depth")
 
 
 def scattered(count: int = 2000, seed: int = 1, colours: bool = True) -> Cloud:
-    """Return a wavy surface, with a few points far off it."""
+    """Return a wavy surface with a few outliers."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.5, 0.5, (count, 3))
     points[:, 2] = 1 + 0.05 * np.sin(9 * points[:, 0]) + rng.normal(0, 0.002, count)
@@ -32,7 +32,7 @@ def scattered(count: int = 2000, seed: int = 1, colours: bool = True) -> Cloud:
 
 
 def kept(cloud: Cloud, part: Cloud) -> list[int]:
-    """Return which points are left, by all that a point has."""
+    """Return the set of remaining points with all their values."""
     assert cloud.sigma is not None
     assert part.sigma is not None
     place = {value: index for index, value in enumerate(cloud.sigma.tolist())}
@@ -71,8 +71,8 @@ def test_wrong_ranges_are_refused() -> None:
             crop_box(cloud, low_corner, high_corner)
 
 
-def test_statistical_outliers_are_those_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filters_module, "ROWS", 300)  # several parts, the last not full
+def test_statistical_outliers_equal_those_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters_module, "POINTS_AT_A_TIME", 300)  # several parts, the last not full
     cloud = scattered(1000)
     pairs = np.sort(spatial.distance.cdist(cloud.points, cloud.points), axis=1)
     means = pairs[:, 1:13].mean(axis=1)
@@ -83,8 +83,8 @@ def test_statistical_outliers_are_those_of_all_pairs(monkeypatch: pytest.MonkeyP
     assert left.points[:, 2].max() < 1.2  # all that stood off is gone
 
 
-def test_radius_outliers_are_those_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filters_module, "ROWS", 300)
+def test_radius_outliers_equal_those_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters_module, "POINTS_AT_A_TIME", 300)
     cloud = scattered(1000)
     near = spatial.distance.cdist(cloud.points, cloud.points) <= 0.06
     wanted = np.flatnonzero(near.sum(axis=1) - 1 >= 4)
@@ -132,7 +132,7 @@ def test_voxels_are_means_in_their_order() -> None:
         assert thin.sigma[place] == pytest.approx(rms, rel=1e-5)
 
 
-def test_voxels_are_those_of_small_gicp() -> None:
+def test_voxels_equal_those_of_small_gicp() -> None:
     gicp: Any = pytest.importorskip("small_gicp", reason="needs the extra depth")
     cloud = scattered(20000)
     theirs = gicp.voxelgrid_sampling(cloud.points.astype(np.float64), 0.02).points()[:, :3]

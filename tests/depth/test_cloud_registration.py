@@ -1,4 +1,4 @@
-"""Registration, judged by known motions: the pose, what is told of it, and what is refused."""
+"""Registration, judged by known motions: pose, uncertainty and refused arguments."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def plane(rng: np.random.Generator, count: int) -> Array:
 
 
 def room(rng: np.random.Generator, count: int) -> Array:
-    """Return three walls, a hand's breadth from their corner, away from the origin."""
+    """Return three walls near their corner, away from the origin."""
     points = 0.1 + 0.9 * rng.random((count, 3))
     points[np.arange(count), rng.integers(0, 3, count)] = 0
     points += [1, 0, 2]
@@ -63,7 +63,7 @@ def ball(rng: np.random.Generator, count: int) -> Array:
 
 
 def pair(shape: Shape, seed: int, noise: float = NOISE, count: int = 3000) -> tuple[Cloud, Cloud]:
-    """Return a source, seen from elsewhere, and a target: other points of the same shape."""
+    """Return a moved source and a target with other points of the same shape."""
     rng = np.random.default_rng(seed)
     target = shape(rng, count)
     source = MOTION.inverse().apply(shape(rng, count))
@@ -71,7 +71,7 @@ def pair(shape: Shape, seed: int, noise: float = NOISE, count: int = 3000) -> tu
 
 
 def error(found: Any) -> Array:
-    """Return turn and shift (6,) from the truth to what was found, as the covariance has them."""
+    """Return turn and shift (6,) from the true to the found pose, in the covariance's order."""
     return MOTION.rigid.after(found.pose.rigid)
 
 
@@ -122,7 +122,7 @@ def test_voxels_thin_both() -> None:
     assert np.abs(error(found)[:3]).max() < 0.002
 
 
-def test_too_little_overlap_is_said() -> None:
+def test_too_little_overlap_is_reported() -> None:
     source, target = pair(room, 3)
     part = source.taken(source.points[:, 1] < 0.4)
     beside = Cloud.joined([part, Cloud(part.points + np.float32(5)), Cloud(part.points + 9)])
@@ -150,7 +150,7 @@ def span_of(steps: Array) -> Array:
         (cylinder, [[0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 1]], "turn about (0.0"),
     ],
 )
-def test_what_surfaces_leave_open_is_said(
+def test_undetermined_directions_are_reported(
     shape: Shape, open_steps: list[list[float]], said: str, method: Method, noise: float
 ) -> None:
     rng = np.random.default_rng(4)
@@ -205,14 +205,14 @@ def test_information_is_that_of_small_steps() -> None:
         ({"source": Cloud(np.zeros((19, 3)))}, "source: expected 20 points or more, got 19"),
     ],
 )
-def test_what_cannot_be_registered_is_refused(given: dict[str, object], said: str) -> None:
+def test_wrong_arguments_are_refused(given: dict[str, object], said: str) -> None:
     _, target = pair(room, 7, count=100)
     wanted = {"source": Cloud(np.random.default_rng(0).random((100, 3)) * 99), "target": target}
     with pytest.raises(ConfigurationError, match=said):
         register(**(wanted | given))  # type: ignore[arg-type]
 
 
-def test_points_all_at_one_place_are_no_pose() -> None:
+def test_points_at_one_place_give_no_pose() -> None:
     same = Cloud(np.ones((50, 3)))
     found = register(same, same)
     assert not found.converged
@@ -224,7 +224,7 @@ def test_points_all_at_one_place_are_no_pose() -> None:
     ("method", "noise"),
     [("plane", (0.0005, 0.002)), ("plane", (0.002, 0.002)), ("gicp", (0.002, 0.002))],
 )
-def test_uncertainty_told_is_the_one_found(method: Method, noise: tuple[float, float]) -> None:
+def test_covariance_equals_the_scatter(method: Method, noise: tuple[float, float]) -> None:
     rng = np.random.default_rng(8)
     off, told = [], []
     for _ in range(70):

@@ -1,4 +1,4 @@
-"""Colours: which pixels a range has, and the regions that look like a block."""
+"""Colours: the pixels of a range, and regions in the shape of a block."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def flat(colour: tuple[int, int, int], shape: tuple[int, int] = (40, 60)) -> NDA
 def rectangle(
     centre: tuple[float, float], sides: tuple[float, float], degrees: float, size: int = 300
 ) -> NDArray[np.bool_]:
-    """Return the pixels whose middles lie in a rectangle."""
+    """Return the pixels with centres in a rectangle."""
     y, x = np.mgrid[:size, :size].astype(float)
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     along, across = (
@@ -126,7 +126,7 @@ def test_frames_of_any_format_have_a_mask() -> None:
         frame(data=b"xy"),
     ],
 )
-def test_what_is_no_picture_is_told(wrong: Any) -> None:
+def test_wrong_picture_is_refused(wrong: Any) -> None:
     with pytest.raises(FrameFormatError, match="expected"):
         ColourRange().mask(wrong)
 
@@ -144,13 +144,13 @@ def test_what_is_no_picture_is_told(wrong: Any) -> None:
         {"hue": (True, 5)},
     ],
 )
-def test_range_that_is_none_is_told(wrong: dict[str, Any]) -> None:
+def test_invalid_range_is_refused(wrong: dict[str, Any]) -> None:
     (name,) = wrong
     with pytest.raises(ConfigurationError, match=rf"ColourRange: {name}: expected .* got"):
         ColourRange(**wrong)
 
 
-def test_range_is_the_same_by_way_of_json_and_python() -> None:
+def test_range_survives_json_and_python() -> None:
     given = ColourRange(hue=(170, 10), saturation=(5, 6), value=(7, 8))
     assert ColourRange(**json.loads(given.as_json())) == given
     assert repr(given) == "ColourRange(hue=(170, 10), saturation=(5, 6), value=(7, 8))"
@@ -211,7 +211,7 @@ def test_region_of_a_block_has_its_pose_and_size(degrees: float) -> None:
     np.testing.assert_array_equal(found.mask, rectangle(centre, sides, degrees))
 
 
-def test_what_is_no_block_is_left_out() -> None:
+def test_other_shapes_are_left_out() -> None:
     mask = rectangle((60, 60), (75, 25), 20)
     mask |= rectangle((200, 60), (45, 45), 10)  # as large, but a square
     mask |= rectangle((60, 150), (90, 10), 80)  # too long
@@ -240,7 +240,7 @@ def test_smallest_regions_have_sides() -> None:
     assert find_regions(np.zeros((3, 3), bool)) == []
 
 
-def test_wrong_limits_and_masks_are_told() -> None:
+def test_wrong_limits_and_masks_are_refused() -> None:
     mask = np.ones((4, 4), bool)
     for wrong in ({"area": (5, 2)}, {"ratio": (-1, 2)}, {"fullness": 1.5}):
         with pytest.raises(ConfigurationError, match=r"expected \(from, to\)"):

@@ -1,4 +1,4 @@
-"""Two cameras as one that sees depth: from frames to metres."""
+"""Depth from two cameras: from frames to metres."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smartcam.calibration import CameraModel, StereoCalibration, Transform, cali
 from smartcam.calibration._inside import rectify
 from smartcam.calibration.formats import CameraChain, write_camera_info
 from smartcam.depth import StereoDepth, StereoMatcher, read_camera_infos
-from smartcam.depth._pair import CalibratedPair, _spread, scaled
+from smartcam.depth._pair import CalibratedPair, _covariance_root, scaled
 from smartcam.depth._stereo import _bytes
 from smartcam.depth._subpixel import MIN_COARSE_SIGMA_PX
 from smartcam.exceptions import (
@@ -83,7 +83,7 @@ async def streaming(cameras: StereoDepth, *found: ScriptedDriver) -> asyncio.Tas
 def give(
     pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], number: int, *found: ScriptedDriver
 ) -> None:
-    """Have the left and the right one give pictures of the same moment."""
+    """Make both cameras deliver pictures of the same moment."""
     now = time.monotonic()
     for one, picture in zip(found, pictures, strict=True):
         one.give(shown(picture, number, captured=now))
@@ -103,7 +103,7 @@ def truth(camera_info: CameraModel) -> NDArray[np.float64]:
 
 
 @pytest.mark.real_time
-async def test_two_cameras_see_the_depth_that_is_there_and_how_sure_it_is() -> None:
+async def test_two_cameras_measure_depth_and_sigma() -> None:
     left, right, cameras = drivers()
     pictures = drawn((360, 240))  # the right one is larger than it was calibrated
     async with cameras:
@@ -135,7 +135,7 @@ async def test_two_cameras_see_the_depth_that_is_there_and_how_sure_it_is() -> N
 
 
 @pytest.mark.real_time
-async def test_what_comes_while_it_matches_is_skipped_and_the_newest_is_next() -> None:
+async def test_pairs_during_matching_are_skipped_except_the_newest() -> None:
     left, right, cameras = drivers()
     pictures = drawn()
     async with cameras:
@@ -157,7 +157,7 @@ async def test_what_comes_while_it_matches_is_skipped_and_the_newest_is_next() -
 
 
 @pytest.mark.real_time
-async def test_cancelling_while_it_matches_leaves_it_working() -> None:
+async def test_cancelling_during_matching_leaves_the_pair_working() -> None:
     left, right, cameras = drivers()
     pictures = drawn()
     async with cameras:
@@ -189,7 +189,7 @@ async def test_a_cut_picture_is_refused_and_the_next_pair_is_matched() -> None:
         assert (await anext(cameras)).left.shape == (160, 240)
 
 
-async def test_it_ends_with_its_cameras_and_opens_once() -> None:
+async def test_pair_ends_with_its_cameras_and_opens_once() -> None:
     left, right, cameras = drivers(timeout=1)
     with pytest.raises(LocalProtocolError, match="not open"):
         await anext(cameras)
@@ -226,7 +226,7 @@ async def test_nothing_stays_open_when_a_camera_is_not_there() -> None:
 
 @pytest.mark.real_time
 async def test_readers_of_frames_are_paired_as_sources_are() -> None:
-    """Readers that ``camera.frames()`` gives in an ``async with`` are paired as sources are."""
+    """Readers from ``camera.frames()`` are paired like sources."""
     found = ScriptedDriver(), ScriptedDriver()
     pictures = drawn()
     closed: list[str] = []
@@ -259,7 +259,7 @@ async def test_readers_of_frames_are_paired_as_sources_are() -> None:
 
 
 async def test_the_drift_of_the_clocks_is_found() -> None:
-    """Neither camera has a clock of its own: their numbers tell."""
+    """Without clocks of the cameras, frame numbers give the drift."""
     left, right, cameras = drivers()
     async with cameras:
         start = 1000.0
@@ -302,7 +302,7 @@ async def test_clocks_that_tell_the_time_tell_the_drift() -> None:
 
 
 def test_the_sigma_of_the_calibration_is_in_that_of_the_depth() -> None:
-    """A pair is rectified by transforms as wrong as its covariance says."""
+    """Rectify a pair by transforms with errors drawn from its covariance."""
     rng = np.random.default_rng(5)
     factor = rng.normal(size=(6, 6)) * np.array([5e-4] * 3 + [3e-4] * 3)[:, None]
     covariance = factor @ factor.T
@@ -345,7 +345,9 @@ def made(
     given: dict[str, Any] = {"size": None, "alpha": 0.0, "focal_sigma": 0.0}
     pair = CalibratedPair(calibration, **(given | options))
     if covariance is not None:
-        pair._spread = _spread(rectify(LEFT, RIGHT, RIGHT_LEFT).rotations[1], covariance)
+        pair._covariance_root = _covariance_root(
+            rectify(LEFT, RIGHT, RIGHT_LEFT).rotations[1], covariance
+        )
     return pair
 
 
@@ -442,7 +444,7 @@ async def test_one_camera_is_no_pair() -> None:
         await cameras.__aenter__()
 
 
-def test_what_has_no_source_has_no_disparity() -> None:
+def test_pixels_without_source_have_no_disparity() -> None:
     pair = made(CHAIN, alpha=1.0)
     disparity = np.full((SIZE[1], SIZE[0]), 5, np.float32)
     pair.drop_outside(disparity)

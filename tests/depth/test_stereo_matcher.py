@@ -1,4 +1,4 @@
-"""Disparity: against scenes that are known, and OpenCV's own pair."""
+"""Disparity, compared with known scenes and OpenCV's own pair."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def matcher(**other: Any) -> StereoMatcher:
 
 
 class Compared(NamedTuple):
-    """A disparity and the truth."""
+    """A disparity with its true value."""
 
     coverage: float  # of what both cameras see
     refined: float  # part of that
@@ -70,7 +70,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_noise_that_is_told_is_the_noise_that_is_found(name: str) -> None:
+def test_sigma_equals_the_noise(name: str) -> None:
     scene = SCENES[name]()
     seen = compared(matcher()(scene.left, scene.right), scene)
     assert seen.coverage > 0.98
@@ -103,7 +103,7 @@ def test_refined_disparities_are_four_times_as_good_as_opencv_s() -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["sgbm", "bm"])
-def test_what_one_camera_alone_sees_has_no_disparity(algorithm: str) -> None:
+def test_point_seen_by_one_camera_has_no_disparity(algorithm: str) -> None:
     scene = step(12.4, 30.7, noise=1)
     alone = {"algorithm": algorithm, "uniqueness_ratio": 0, "speckle_window_size": 0}
     with_check = matcher(**alone)(scene.left, scene.right).pixels
@@ -142,7 +142,7 @@ def test_colours_are_made_grey() -> None:
     np.testing.assert_array_equal(np.isnan(grey.pixels), np.isnan(grey.sigma))
 
 
-def test_the_same_pictures_have_the_same_disparity_again() -> None:
+def test_same_pictures_have_same_disparity() -> None:
     scene, one = plane((20.3, 0.05, 0), noise=2), matcher()
     first = one(scene.left, scene.right)
     one(scene.right, scene.left)

@@ -18,7 +18,7 @@ from tests.budgets.inputs import UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
 from tests.frames.inside import (
     MAX_ACCESS_UNIT_BYTES,
-    ROOM,
+    MAX_MESSAGE_BYTES,
     Assembler,
     Depacketizer,
     H265Units,
@@ -67,7 +67,7 @@ def _rtsp(pieces: list[bytes]) -> None:
 
 
 class _Pieces(socket.socket):
-    """A socket on which the pieces of an answer come, one at a time, and then the end."""
+    """A socket that gives the pieces of an answer one at a time, and then the end."""
 
     def __init__(self, pieces: list[bytes]) -> None:
         super().__init__()
@@ -605,8 +605,8 @@ PARSERS: tuple[Parser, ...] = (
         "RTSP: requests",
         _rtsp,
         streamed(_RTSP),
-        ROOM,
-        "frames._streaming.rtsp.messages.ROOM",
+        MAX_MESSAGE_BYTES,
+        "frames._streaming.rtsp.messages.MAX_MESSAGE_BYTES",
         size=1000,
         refuses=(RtspError,),
     ),

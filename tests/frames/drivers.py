@@ -1,4 +1,4 @@
-"""A driver whose device does what a test says."""
+"""Frame drivers that a test controls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GREY = find_format("Mono8")
 
 
 def frame(number: int = 1, **other: Any) -> Frame:
-    """Return a frame of 4 x 2 pixels, each of which is its number."""
+    """Return a frame of 4 x 2 pixels, whose values are all its number."""
     now = time.monotonic()
     about: dict[str, Any] = {
         "data": bytes([number % 256]) * 8,
@@ -42,13 +42,13 @@ def frame(number: int = 1, **other: Any) -> Frame:
 
 
 class ShowingDriver(FrameDriver):
-    """Shows what :meth:`show` says from each start to the next stop."""
+    """Runs :meth:`show` from each start to the next stop."""
 
     _task: asyncio.Task[None] | None = None
 
     @abc.abstractmethod
     async def show(self, sink: FrameSink) -> None:
-        """Give frames until it is cancelled, or there are no more."""
+        """Give frames until the task is cancelled, or there are no more."""
 
     async def start(self, sink: FrameSink) -> None:
         self._task = asyncio.create_task(self.show(sink))
@@ -64,7 +64,7 @@ class ShowingDriver(FrameDriver):
 
 
 class ScriptedDriver(FrameDriver):
-    """Says of itself what is called; the test gives frames by :meth:`give`."""
+    """Records its calls; the test gives frames by :meth:`give`."""
 
     def __init__(self, url: str = "synthetic://?size=300x300") -> None:
         super().__init__(FrameAddress.parse(url))
@@ -101,17 +101,17 @@ class ScriptedDriver(FrameDriver):
         await self._call("close")
 
     def give(self, *frames: Frame) -> None:
-        """Have the device give frames; it streams."""
-        assert self.sink is not None, "it does not stream"
+        """Give frames from the streaming device."""
+        assert self.sink is not None, "the device does not stream"
         for one in frames:
             self.sink.frame(one)
 
     async def streams(self) -> None:
-        """Wait until it streams."""
+        """Wait until the device streams."""
         await until(lambda: self.sink is not None)
 
     async def rests(self) -> None:
-        """Wait until it was stopped."""
+        """Wait until the device was stopped."""
         await until(lambda: self.calls[-1] == "stop")
 
 

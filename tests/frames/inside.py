@@ -1,4 +1,4 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
@@ -56,12 +56,22 @@ from smartcam.frames._streaming.rtsp.authentication import (
     _parts,
 )
 from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, _ControlPort, port_pair
-from smartcam.frames._streaming.rtsp.messages import ROOM, RequestParser, RtspError, RtspRequest
+from smartcam.frames._streaming.rtsp.messages import (
+    MAX_MESSAGE_BYTES,
+    RequestParser,
+    RtspError,
+    RtspRequest,
+)
 from smartcam.frames._streaming.rtsp_client import answers
 from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
+from smartcam.frames._streaming.rtsp_client.channels import options_of
 from smartcam.frames._streaming.rtsp_client.description import described, url_of
-from smartcam.frames._streaming.rtsp_client.ways import options_of
-from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
+from smartcam.frames._streaming.shared_stream import (
+    KEY_FRAME_INTERVAL,
+    LINGER,
+    MAX_FAILURES,
+    SharedH264,
+)
 from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.frames._v4l2 import abi, discovery, system
 from smartcam.frames._v4l2.abi import Ioctl

@@ -30,14 +30,14 @@ WIDTH, HEIGHT = 320, 64
 
 
 def stamped(number: int, width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.uint8]:
-    """Return a picture that moves with its number, which is stamped into it."""
+    """Return a picture with a stamped number, which also moves the picture."""
     picture = np.roll(stripes(width, height), number, axis=1)
     write_stamp(picture, number, number * 1000)
     return picture
 
 
 def frame_of(pixels: NDArray[Any], name: str, number: int = 1) -> Frame:
-    """Return a frame of pixels that lie as the format has them, (H, W) or (H, W, C)."""
+    """Return a frame of pixels in the format's layout, (H, W) or (H, W, C)."""
     height, width = pixels.shape[:2]
     return Frame(
         data=pixels.tobytes(),
@@ -57,14 +57,14 @@ def frame_of(pixels: NDArray[Any], name: str, number: int = 1) -> Frame:
 
 
 def fill(planes: tuple[NDArray[np.uint8], ...], values: tuple[Any, ...]) -> None:
-    """Give the planes of a frame under way their values."""
+    """Fill the planes of a frame with values."""
     for plane, value in zip(planes, values, strict=True):
         plane.flags.writeable = True
         plane[...] = value
 
 
 def known_of(frame: Frame) -> tuple[object, ...]:
-    """Return what must stay when a picture is encoded."""
+    """Return the fields that must stay when a picture is encoded."""
     return (
         frame.width,
         frame.height,
@@ -103,7 +103,7 @@ def write_video(path: Path, codec: str, pixels: str, count: int = 10, rate: int 
 
 @asynccontextmanager
 async def served(serve: Callable[[Any, Any], Awaitable[None]]) -> AsyncIterator[int]:
-    """Run a server that serves each client so; give its port."""
+    """Run a server with a function that serves each client; give its port."""
     at_work: set[asyncio.Task[None]] = set()
 
     async def client(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -138,7 +138,7 @@ def part(data: bytes) -> bytes:
 
 
 def length(data: bytes, more: int = 0) -> bytes:
-    """Return the head of a part, with a length that may be wrong."""
+    """Return the head of a part; ``more`` makes its length wrong."""
     return b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (len(data) + more)
 
 
@@ -186,7 +186,7 @@ def rtp_packets(data: bytes, sequence: int, stamp: int) -> list[bytes]:
 async def rtsp_answers(
     reader: asyncio.StreamReader, writer: asyncio.StreamWriter, seen: list[str]
 ) -> None:
-    """Answer as a camera does until it is to play: RTSP, interleaved over TCP."""
+    """Answer requests as a camera does, up to PLAY: RTSP, interleaved over TCP."""
     description = (
         "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
         "a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:track1\r\n"

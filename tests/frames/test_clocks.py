@@ -1,4 +1,4 @@
-"""A camera's clock on ours."""
+"""Convert times of a camera's clock to the local clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from smartcam.frames._clocks import DeviceClock
     st.integers(0, 1000),
     st.sampled_from([5.0, 30.0, 120.0]),
 )
-def test_drift_and_moment_are_found_whatever_the_way_takes(
+def test_drift_and_moment_are_found_with_any_delay(
     drift: float, ahead: float, seed: int, rate: float
 ) -> None:
     chance, clock = random.Random(seed), DeviceClock()  # noqa: S311
@@ -28,13 +28,13 @@ def test_drift_and_moment_are_found_whatever_the_way_takes(
         assert found <= taken + way
         if number > 20 * rate:
             assert found - taken == pytest.approx(0.002, abs=0.0015)
-    said = clock.statistics()
-    assert said.jumps == 0
-    assert said.drift == pytest.approx(drift, abs=1e-4)
+    statistics = clock.statistics()
+    assert statistics.jumps == 0
+    assert statistics.drift == pytest.approx(drift, abs=1e-4)
 
 
 @pytest.mark.parametrize("by", [-100.0, -0.03, 0.2, 3600.0, -3600.0])
-def test_clock_that_is_set_anew_is_seen_and_followed(by: float) -> None:
+def test_reset_clock_is_noticed_and_followed(by: float) -> None:
     clock, jumped = DeviceClock(), 0.0
     for number in range(400):
         taken = number * 0.02
@@ -57,19 +57,19 @@ def test_frames_that_come_late_for_a_while_are_no_jump() -> None:
 
 @pytest.mark.parametrize("queue", [1.5, 4.0, 20.0])
 @pytest.mark.parametrize("seconds", [2, 15, 60])
-def test_a_queue_on_the_way_is_no_clock_set_anew(queue: float, seconds: float) -> None:
+def test_queue_on_the_way_is_no_reset_clock(queue: float, seconds: float) -> None:
     clock = DeviceClock()
     for number in range(int(10 * (seconds + 40))):
         taken = number * 0.1
         held = 0.0 if not 20 < taken < 20 + seconds else min(queue, taken - 20)
         found = clock.captured(taken, taken + 0.001 + held)
-        assert found <= taken + 0.001 + 0.01 * seconds  # never much fresher than it is
+        assert found <= taken + 0.001 + 0.01 * seconds  # never much later than the truth
         if taken > 21 + seconds:
             assert found == pytest.approx(taken + 0.001, abs=1e-3)
     assert clock.statistics().jumps == 0
 
 
-def test_drift_is_not_told_before_there_is_enough() -> None:
+def test_drift_is_unknown_before_there_are_enough_frames() -> None:
     clock = DeviceClock()
     for number in range(7):
         clock.captured(number * 0.5, number * 0.5)

@@ -1,4 +1,4 @@
-"""Codecs: what comes back, in which thread, and what a cancelled call leaves."""
+"""Codecs return the same pictures, work in threads, and survive cancelled calls."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def codecs() -> AsyncIterator[Codecs]:
 # JPEG
 
 
-async def test_grey_becomes_a_grey_jpeg_and_keeps_what_is_known(codecs: Codecs) -> None:
+async def test_grey_becomes_a_grey_jpeg_and_keeps_number_and_times(codecs: Codecs) -> None:
     encoded = await codecs.jpeg(GREY, quality=90)
     assert encoded.format.name == "MJPEG"
     assert simplejpeg.decode_jpeg_header(encoded.data)[2] == "Gray"
@@ -73,7 +73,7 @@ def coloured() -> Any:
 
 
 @pytest.mark.parametrize("name", ["RGB8", "BGR8"])
-async def test_colours_stay_what_they_are(codecs: Codecs, name: str) -> None:
+async def test_jpeg_keeps_the_colours(codecs: Codecs, name: str) -> None:
     pixels = coloured() if name == "RGB8" else coloured()[..., ::-1]
     back = await codecs.decode(await codecs.jpeg(frame_of(pixels, name), quality=95))
     assert back.format.name == "RGB8"
@@ -100,7 +100,7 @@ async def test_planes_become_a_jpeg_of_the_same_colours(codecs: Codecs, name: st
     assert np.abs(back.array().astype(int) - empty.rgb()).mean() < 2
 
 
-async def test_jpeg_is_made_smaller_as_what_it_is(codecs: Codecs) -> None:
+async def test_jpeg_is_compressed_again_in_its_own_colours(codecs: Codecs) -> None:
     large = await codecs.jpeg(GREY, quality=95)
     small = await codecs.jpeg(large, quality=30)
     assert len(small.data) < len(large.data)
@@ -111,7 +111,7 @@ async def test_jpeg_is_made_smaller_as_what_it_is(codecs: Codecs) -> None:
 @pytest.mark.parametrize(
     ("name", "why"), [("Mono12", "8 bits a sample"), ("Z16", "8 bits"), ("BayerRG8", "converted")]
 )
-async def test_jpeg_of_what_it_cannot_hold_is_refused(codecs: Codecs, name: str, why: str) -> None:
+async def test_formats_that_jpeg_lacks_are_refused(codecs: Codecs, name: str, why: str) -> None:
     size = find_format(name).depth // 9 + 1
     with pytest.raises(FrameFormatError, match=f"{find_format(name).name} cannot become.*{why}"):
         await codecs.jpeg(frame_of(np.zeros((4, 4), f"<u{size}"), name))
@@ -149,7 +149,7 @@ async def test_damaged_jpeg_is_an_error_at_every_length(codecs: Codecs) -> None:
             replace(whole, data=whole.data[:length]).grey()
 
 
-async def test_picture_of_another_size_than_told_is_refused(codecs: Codecs) -> None:
+async def test_picture_of_another_size_than_its_frame_is_refused(codecs: Codecs) -> None:
     for encode in (codecs.jpeg, codecs.png, codecs.jpegxl):
         encoded = replace(await encode(GREY), width=WIDTH - 1)
         with pytest.raises(FrameFormatError, match=f"{WIDTH}x{HEIGHT}"):
@@ -215,7 +215,7 @@ def test_any_bytes_are_a_picture_or_an_error(data: bytes, name: str) -> None:
             continue
 
 
-async def test_pixels_that_are_not_in_it_are_refused(codecs: Codecs) -> None:
+async def test_pixels_that_a_codec_cannot_give_are_refused(codecs: Codecs) -> None:
     encoded = await codecs.png(DEPTH)
     assert (await codecs.decode(encoded)).format.name == "Mono16"
     for name in ("Mono8", "RGB8", "NV12", "Mono12p"):
@@ -241,7 +241,7 @@ async def test_conversion_on_request(codecs: Codecs) -> None:
 # threads
 
 
-async def test_loop_goes_on_and_no_more_is_under_way_than_threads(
+async def test_loop_goes_on_and_each_thread_has_one_call(
     codecs: Codecs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate, begun, at_work, most = threading.Event(), threading.Semaphore(0), [], [0]
@@ -268,7 +268,7 @@ async def test_loop_goes_on_and_no_more_is_under_way_than_threads(
 
 
 @pytest.mark.parametrize("steps", range(6))
-async def test_cancelled_at_any_step_the_codecs_work_on(codecs: Codecs, steps: int) -> None:
+async def test_codecs_work_after_a_cancellation_at_any_step(codecs: Codecs, steps: int) -> None:
     tasks = [asyncio.create_task(codecs.jpeg(GREY)) for _ in range(4)]
     for _ in range(steps):
         await asyncio.sleep(0)
@@ -283,7 +283,7 @@ def own_threads() -> set[threading.Thread]:
     return {one for one in threading.enumerate() if one.name.startswith("smartcam codecs")}
 
 
-async def test_closing_ends_the_threads_and_tells_who_waits(
+async def test_closing_ends_the_threads_and_the_waiting_calls(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     gate, begun = threading.Event(), threading.Event()
@@ -315,7 +315,7 @@ async def test_closing_ends_the_threads_and_tells_who_waits(
         await codecs.__aenter__()
 
 
-async def test_codecs_that_are_not_open_say_so() -> None:
+async def test_closed_codecs_report_it() -> None:
     with pytest.raises(LocalProtocolError, match="async with"):
         await Codecs().jpeg(GREY)
     for threads in (0, 65):
@@ -324,22 +324,22 @@ async def test_codecs_that_are_not_open_say_so() -> None:
 
 
 def _spend(seconds: float) -> threading.Thread:
-    """Take CPU time; return the thread that it was taken in."""
+    """Use CPU time; return the thread that used it."""
     end = time.thread_time() + seconds
     while time.thread_time() < end:
         pass
     return threading.current_thread()
 
 
-async def test_pictures_of_a_stream_leave_the_loop_when_they_are_long(codecs: Codecs) -> None:
+async def test_slow_calls_leave_the_event_loop(codecs: Codecs) -> None:
     runs, loop = StreamRuns(codecs), threading.current_thread()
     long = 3 * MAX_LOOP_TIME
-    assert await runs(lambda: _spend(0)) is not loop  # nobody knew how long it would take
+    assert await runs(lambda: _spend(0)) is not loop  # the duration was unknown
     assert await runs(lambda: _spend(0)) is loop
     await runs(lambda: _spend(long))
     short = [await runs(lambda: _spend(0)) for _ in range(40)]
     back = short.index(loop)
-    assert back >= 1  # behind a long one others may be as long
+    assert back >= 1  # calls after a long one may be as long
     assert set(short[back:]) == {loop}
     with pytest.raises(ZeroDivisionError):
         await runs(lambda: 1 / 0)

@@ -1,4 +1,4 @@
-"""Frames of FFmpeg become frames of ours: the same samples, whatever they lay like."""
+"""Frames of FFmpeg become smartcam's frames with the same samples, from any layout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 av = pytest.importorskip("av")
 
 WIDTH, HEIGHT = 37, 19
-"""Odd, so that U and V have a column and a row that only half a pair shares."""
+"""Odd, so that the last column and row of U and V belong to half a pair."""
 
 
 def filled(name: str, bits: int = 8, seed: int = 7) -> tuple[Any, list[Any]]:
@@ -42,13 +42,13 @@ def filled(name: str, bits: int = 8, seed: int = 7) -> tuple[Any, list[Any]]:
 
 
 def pixels(video: Any) -> tuple[Any, Any]:
-    """Return the format that comes, and the samples."""
+    """Return the resulting format, and the samples."""
     came = from_video(video)
     return came.format, came.format.array(came.data, came.width, came.height, came.stride)
 
 
 def planes_of(video: Any) -> tuple[Any, list[Any]]:
-    """Return the format that comes, and its Y, U and V."""
+    """Return the resulting format, and its Y, U and V."""
     came = from_video(video)
     return came.format, list(came.format.planes(came.data, came.width, came.height, came.stride))
 
@@ -108,7 +108,7 @@ def test_planes_of_red_green_and_blue() -> None:
 
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
-def test_deep_planes_of_red_green_and_blue_can_be_told_apart(bits: int) -> None:
+def test_deep_planes_of_red_green_and_blue_keep_their_order(bits: int) -> None:
     video, (green, _, _) = filled(f"gbrp{bits}le", bits)
     found, came = pixels(video)
     assert found.name == "RGB16"
@@ -169,7 +169,7 @@ def test_woven_planes(name: str, to: str) -> None:
         assert np.array_equal(one, pairs[..., place ^ (name == "nv21")])
 
 
-def test_woven_planes_of_ten_bits_in_the_high_ones() -> None:
+def test_woven_planes_of_ten_bits_in_the_high_bits() -> None:
     video, (y, woven) = filled("p010le", 16)
     y, woven = y & 0xFFC0, woven & 0xFFC0
     for plane, samples in zip(video.planes, (y, woven), strict=True):
@@ -201,7 +201,7 @@ def test_other_sharing_is_repeated(name: str, across: int, down: int) -> None:
 @pytest.mark.parametrize(("space", "end"), [(1, "_709"), (2, ""), (5, ""), (6, ""), (9, "_2020")])
 @pytest.mark.parametrize(("told", "full"), [(0, ""), (1, ""), (2, "_full")])
 @pytest.mark.parametrize("name", ["yuv420p", "nv12", "nv21", "yuv420p10le", "p010le", "yuv411p"])
-def test_matrix_and_range_are_what_the_stream_says(
+def test_matrix_and_range_are_those_of_the_stream(
     name: str, told: int, full: str, space: int, end: str
 ) -> None:
     video, _ = filled(name, 16 if "10" in name else 8)
@@ -213,12 +213,12 @@ def test_matrix_and_range_are_what_the_stream_says(
 
 
 @pytest.mark.parametrize("alpha", [255, 128])
-def test_alpha_behind_y_u_and_v(alpha: int) -> None:
+def test_alpha_after_y_u_and_v(alpha: int) -> None:
     video, (y, u, v, _) = filled("yuva444p")
     plane = video.planes[3]
     plane.update(bytes([alpha]) * plane.buffer_size)
     found, came = pixels(video) if alpha != 255 else planes_of(video)
-    if alpha == 255:  # it hides nothing
+    if alpha == 255:  # opaque
         assert found.name == "I444"
         assert np.array_equal(came[1], u[:, :WIDTH])
         return
@@ -228,7 +228,7 @@ def test_alpha_behind_y_u_and_v(alpha: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["grayf32le", "gbrpf32le", "xyz12le", "yuva444p10le"])
-def test_what_would_be_lost_is_refused_by_name(name: str) -> None:
+def test_formats_that_would_lose_values_are_refused_by_name(name: str) -> None:
     with pytest.raises(FrameFormatError, match=f"{name}: expected one that converts without loss"):
         from_video(av.VideoFrame(WIDTH, HEIGHT, name))
 
@@ -284,7 +284,7 @@ def write(path: Path, codec: str, video: Any, **options: str) -> None:
         ("yuv_alpha.mkv", "ffv1", "yuva420p"),
     ],
 )
-async def test_file_gives_what_was_written(
+async def test_file_gives_the_written_pixels(
     tmp_path: Path, file: str, codec: str, name: str
 ) -> None:
     bits = 16 if "16" in name or "48" in name or "64" in name else 10 if "10" in name else 8
@@ -301,7 +301,7 @@ async def test_file_gives_what_was_written(
         assert all(map(np.array_equal, came, planes_of(video)[1]))
 
 
-async def test_file_that_would_lose_something_says_what_helps(tmp_path: Path) -> None:
+async def test_error_of_a_lossy_file_names_the_cure(tmp_path: Path) -> None:
     video, _ = filled("yuva444p10le", 10)
     write(tmp_path / "a.mkv", "ffv1", video)
     with pytest.raises(FrameFormatError, match=r"yuva444p10le: expected .*#format=RGB8 converts"):
@@ -324,7 +324,7 @@ async def test_webp_with_alpha(tmp_path: Path, file: str, name: str) -> None:
     frame = await first_frame(tmp_path / file)
     assert frame.format.name in ("RGBa8", "BGRa8")
     if name == "bgra":
-        hidden = frame.array()[..., 3] == 0  # whose colours the encoder makes one
+        hidden = frame.array()[..., 3] == 0  # the encoder makes their colours one
         assert np.array_equal(frame.rgb()[~hidden], from_rgb(video)[~hidden])
 
 
@@ -337,7 +337,7 @@ def from_rgb(video: Any) -> Any:
 @pytest.mark.parametrize(
     "name", [one.name for one in PIXEL_FORMATS if isinstance(one.layout, SampleLayout)]
 )
-async def test_what_is_written_is_read(tmp_path: Path, name: str) -> None:
+async def test_written_pictures_are_read_back(tmp_path: Path, name: str) -> None:
     found = find_format(name)
     layout, top = found.layout, 2**found.depth
     assert isinstance(layout, SampleLayout)
@@ -362,7 +362,7 @@ async def test_what_is_written_is_read(tmp_path: Path, name: str) -> None:
         assert np.array_equal(back.array(), wanted)
 
 
-async def test_jpegxl_is_converted_and_stands_beside_other_pictures(tmp_path: Path) -> None:
+async def test_jpegxl_is_converted_and_may_be_among_other_pictures(tmp_path: Path) -> None:
     colours = np.random.default_rng(6).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     frame = frame_of(colours, "RGB8")
     (tmp_path / "1.png").write_bytes(to_png(frame).data)
@@ -376,7 +376,7 @@ async def test_jpegxl_is_converted_and_stands_beside_other_pictures(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("file", "data", "said"),
+    ("file", "data", "message"),
     [
         ("cut.jxl", lambda whole: whole[:-20], "expected a whole picture"),
         ("none.jxl", lambda _: b"GIF89a", "expected a JPEG XL"),
@@ -389,21 +389,21 @@ async def test_jpegxl_is_converted_and_stands_beside_other_pictures(tmp_path: Pa
         ("array.npy", lambda _: b"\x93NUMPY", "cannot be read: Invalid data"),
     ],
 )
-async def test_file_that_is_none_says_what_it_is(
-    tmp_path: Path, file: str, data: Callable[[bytes], bytes], said: str
+async def test_error_of_an_invalid_file_names_the_cause(
+    tmp_path: Path, file: str, data: Callable[[bytes], bytes], message: str
 ) -> None:
     whole = to_jpegxl(frame_of(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "RGB8")).data
     (tmp_path / file).write_bytes(data(bytes(whole)))
-    with pytest.raises(FrameFormatError, match=said):
+    with pytest.raises(FrameFormatError, match=message):
         await first_frame(tmp_path / file)
 
 
-async def test_file_of_another_codec_says_why(tmp_path: Path) -> None:
-    """A TIFF of 32-bit floats is everyday, and FFmpeg does not read it."""
+async def test_error_of_another_codec_names_the_cause(tmp_path: Path) -> None:
+    """FFmpeg does not read a TIFF of 32-bit floats, which is common."""
     head = struct.pack("<2sHI", b"II", 42, 8)
     tags = {256: 4, 257: 4, 258: 32, 259: 1, 262: 1, 273: 200, 277: 1, 278: 4, 279: 64, 339: 3}
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, one) for tag, one in tags.items())
     body = head + struct.pack("<H", len(tags)) + entries + bytes(4)
     (tmp_path / "floats.tif").write_bytes(body.ljust(200, b"\0") + np.ones(16, "<f4").tobytes())
-    with pytest.raises(FrameFormatError, match=r"it ended without one: .*[Ii]nvalid data"):
+    with pytest.raises(FrameFormatError, match=r"the video ended without one: .*[Ii]nvalid data"):
         await first_frame(tmp_path / "floats.tif")

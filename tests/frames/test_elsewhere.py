@@ -1,8 +1,8 @@
-"""A camera or a file leads nowhere else: neither to another port nor to a file of ours.
+"""A camera or a file must not make the program open another port or a local file.
 
-Whatever opens a URL stands here: FFmpeg over HTTP, RTSP and on files, a GigE camera's description,
-and the WebSocket to a rosbridge. A listener counts who comes to it, and the file that must not be
-read is a video: whoever read it would give pictures.
+All code that opens a URL is tested: FFmpeg over HTTP, RTSP and on files, a GigE camera's
+description, and the WebSocket to a rosbridge. A listener counts connections. The file that must not
+be read is a video, so that a wrong read gives pictures.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_REDIRECTS = 5
 pytestmark = pytest.mark.real_time
 
 PATIENCE = 60.0
-"""Seconds that only a failure takes."""
+"""Seconds after which a test fails."""
 
 HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{to}\n#EXT-X-ENDLIST\n"
 HLS_MASTER = "#EXTM3U\n#EXT-X-STREAM-INF:BANDWIDTH=1\n{to}\n"
@@ -64,7 +64,7 @@ PLAYLISTS: dict[str, tuple[str, str, str]] = {
     "smil": ("smil", "application/smil+xml", SMIL),
     "asx": ("asx", "video/x-ms-asf", ASX),
 }
-"""By a name: how a file of it ends, its media type, and what is in it."""
+"""By a name: suffix of the file, media type, and contents."""
 
 WAYS = (
     "http://127.0.0.1:{port}/x.ts",
@@ -79,11 +79,11 @@ WAYS = (
     "async:file:{secret}",
     "crypto+file://{secret}",
 )
-"""Places elsewhere, as a playlist may say them."""
+"""Other places that a playlist may name."""
 
 
 class Listener:
-    """A port where nobody may come."""
+    """A port that no program may connect to."""
 
     def __init__(self) -> None:
         self.hits: list[bytes] = []
@@ -96,7 +96,7 @@ class Listener:
 
 @asynccontextmanager
 async def nobody_comes() -> AsyncIterator[Listener]:
-    """Have a port; at the end nobody has come to it."""
+    """Open a port; check at the end that no program has connected to it."""
     there = Listener()
     async with listening(there.serve) as there.port:
         yield there
@@ -104,7 +104,7 @@ async def nobody_comes() -> AsyncIterator[Listener]:
 
 
 def answering(answers: Callable[[str], bytes]) -> Any:
-    """Return a server that gives each request's path an answer."""
+    """Return a server whose answer depends on the request's path."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         request = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
@@ -125,7 +125,7 @@ def redirect(to: str) -> bytes:
 
 
 async def opened(url: str) -> str:
-    """Open a source and read a picture; return what it is."""
+    """Open a source and read a picture; return the format."""
     async with asyncio.timeout(PATIENCE), frames.open(url) as source:
         await source.newest()
         return str(source.format)
@@ -140,7 +140,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture
 def secret(tmp_path: Path, video: bytes) -> Path:
-    """Return a file of this machine: a video, so that it shows where it is read."""
+    """Return a local file: a video, so that a read of it gives pictures."""
     path = tmp_path / "secret.ts"
     path.write_bytes(video)
     return path
@@ -155,8 +155,8 @@ def secret(tmp_path: Path, video: bytes) -> Path:
 async def test_a_playlist_of_a_camera_is_not_followed(name: str, way: str, secret: Path) -> None:
     end, kind, text = PLAYLISTS[name]
     async with nobody_comes() as there:
-        said = text.format(to=way.format(port=there.port, secret=secret)).encode()
-        async with listening(answering(lambda _: body(said, kind))) as port:
+        playlist = text.format(to=way.format(port=there.port, secret=secret)).encode()
+        async with listening(answering(lambda _: body(playlist, kind))) as port:
             with pytest.raises(FrameSourceError):
                 await opened(f"http://127.0.0.1:{port}/video.{end}#timeout=2")
 
@@ -173,7 +173,7 @@ async def test_a_file_that_names_others_is_not_followed(name: str, way: str, sec
             await opened(str(path))
 
 
-async def test_a_playlist_is_followed_where_that_is_asked_for(video: bytes) -> None:
+async def test_playlist_is_followed_on_request(video: bytes) -> None:
     there = Listener()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -183,8 +183,8 @@ async def test_a_playlist_is_followed_where_that_is_asked_for(video: bytes) -> N
         writer.close()
 
     async with listening(serve) as elsewhere:
-        said = HLS.format(to=f"http://127.0.0.1:{elsewhere}/x.ts").encode()
-        async with listening(answering(lambda _: body(said, PLAYLISTS["hls"][1]))) as port:
+        playlist = HLS.format(to=f"http://127.0.0.1:{elsewhere}/x.ts").encode()
+        async with listening(answering(lambda _: body(playlist, PLAYLISTS["hls"][1]))) as port:
             url = f"http://127.0.0.1:{port}/video.m3u8"
             with pytest.raises(FrameFormatError, match="#elsewhere=yes follows a playlist"):
                 await opened(url)
@@ -194,11 +194,9 @@ async def test_a_playlist_is_followed_where_that_is_asked_for(video: bytes) -> N
 
 
 @pytest.mark.parametrize("to", ["file://{secret}", "{secret}", "concat:{secret}"])
-async def test_where_a_playlist_may_be_followed_no_file_of_ours_is_read(
-    to: str, secret: Path
-) -> None:
-    said = HLS.format(to=to.format(secret=secret)).encode()
-    async with listening(answering(lambda _: body(said, PLAYLISTS["hls"][1]))) as port:
+async def test_playlist_on_request_reads_no_local_file(to: str, secret: Path) -> None:
+    playlist = HLS.format(to=to.format(secret=secret)).encode()
+    async with listening(answering(lambda _: body(playlist, PLAYLISTS["hls"][1]))) as port:
         with pytest.raises(FrameSourceError):
             await opened(f"http://127.0.0.1:{port}/video.m3u8#elsewhere=yes&timeout=2")
 
@@ -242,7 +240,7 @@ async def test_a_redirect_on_the_same_host_and_port_is_followed(to: str, video: 
         assert "I420" in await opened(f"http://127.0.0.1:{port}/index")
 
 
-async def test_a_redirect_elsewhere_is_followed_where_that_is_asked_for(video: bytes) -> None:
+async def test_redirect_elsewhere_is_followed_on_request(video: bytes) -> None:
     async with listening(answering(lambda _: body(video, "video/mp2t"))) as elsewhere:
         to = f"http://127.0.0.1:{elsewhere}/x.ts"
         async with listening(answering(lambda _: redirect(to))) as port:
@@ -294,7 +292,7 @@ async def test_a_redirect_by_tls_is_not_followed(
 
 
 def rtsp_camera(to: str, at: str) -> Any:
-    """Return a camera that sends a client elsewhere when it asks by a method."""
+    """Return a camera that redirects a client after a request of a method."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:
@@ -306,12 +304,12 @@ def rtsp_camera(to: str, at: str) -> Any:
             cseq = next(line for line in request.split("\r\n") if line.startswith("CSeq"))
             login = at == "after a login" and "Authorization" not in request
             if request.startswith("OPTIONS") and at != "OPTIONS":
-                said = "200 OK\r\nPublic: OPTIONS, DESCRIBE, SETUP, PLAY"
+                answer = "200 OK\r\nPublic: OPTIONS, DESCRIBE, SETUP, PLAY"
             elif login:
-                said = '401 Unauthorized\r\nWWW-Authenticate: Digest realm="x", nonce="1"'
+                answer = '401 Unauthorized\r\nWWW-Authenticate: Digest realm="x", nonce="1"'
             else:
-                said = f"302 Moved\r\nLocation: {to}"
-            writer.write(f"RTSP/1.0 {said}\r\n{cseq}\r\n\r\n".encode())
+                answer = f"302 Moved\r\nLocation: {to}"
+            writer.write(f"RTSP/1.0 {answer}\r\n{cseq}\r\n\r\n".encode())
 
     return serve
 
@@ -332,15 +330,13 @@ def rtsp_camera(to: str, at: str) -> Any:
     ids=lambda one: one[:40],
 )
 @pytest.mark.parametrize("scheme", ["rtsp", "http"])
-async def test_a_challenge_that_cannot_be_answered_is_a_typed_error(
-    scheme: str, challenge: str
-) -> None:
+async def test_unknown_challenge_is_a_typed_error(scheme: str, challenge: str) -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:
             await reader.readuntil(b"\r\n\r\n")
-            said = f"401 No\r\nCSeq: 1\r\nWWW-Authenticate: {challenge}\r\nContent-Length: 0"
+            answer = f"401 No\r\nCSeq: 1\r\nWWW-Authenticate: {challenge}\r\nContent-Length: 0"
             version = "RTSP/1.0" if scheme == "rtsp" else "HTTP/1.1"
-            writer.write(f"{version} {said}\r\n\r\n".encode())
+            writer.write(f"{version} {answer}\r\n\r\n".encode())
 
     async with listening(serve) as port:
         with pytest.raises(FrameSourceError, match=r"cannot be read|Unauthorized"):
@@ -361,7 +357,7 @@ async def test_an_rtsp_redirect_elsewhere_is_not_followed(to: str, at: str, tran
 
 
 @pytest.mark.parametrize(
-    "said",
+    "text",
     [
         "RTSP/1.0 302 Moved\nCSeq: 1\nLocation: rtsp://127.0.0.1:{port}/x\n\n",
         "RTSP/1.0 399 Odd\r\nCSeq: 1\r\nlocation:rtsp://127.0.0.1:{port}/x\r\n\r\n",
@@ -372,9 +368,9 @@ async def test_an_rtsp_redirect_elsewhere_is_not_followed(to: str, at: str, tran
         "",
     ],
 )
-async def test_an_odd_answer_leads_nowhere_either(said: str) -> None:
+async def test_odd_answer_is_not_followed_either(text: str) -> None:
     async with nobody_comes() as there:
-        answer = said.format(port=there.port, long="x" * (1 << 17)).encode()
+        answer = text.format(port=there.port, long="x" * (1 << 17)).encode()
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await reader.readuntil(b"\r\n\r\n")
@@ -439,7 +435,7 @@ async def pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) ->
 )
 async def test_a_gige_description_elsewhere_is_not_read(url: str, secret: Path) -> None:
     async with nobody_comes() as there:
-        said = url.format(port=there.port, secret=secret).encode()
-        async with gige_camera(url=said) as camera:
+        place = url.format(port=there.port, secret=secret).encode()
+        async with gige_camera(url=place) as camera:
             with pytest.raises(SmartCamError):
                 await opened(f"gige://127.0.0.1:{camera.port}")

@@ -1,4 +1,4 @@
-"""Frames of one moment, of several cameras."""
+"""Groups of cameras give frames of one moment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def drivers(count: int, **options: Any) -> tuple[list[ScriptedDriver], FrameGrou
 
 
 async def started(group: FrameGroup, found: list[ScriptedDriver]) -> asyncio.Task[Any]:
-    """Return the wait for the group's first set; all stream."""
+    """Start all cameras, and return the task that waits for the group's first set."""
     waiting = asyncio.ensure_future(anext(group))
     await until(lambda: all(one.sink is not None for one in found))
     return waiting
@@ -113,7 +113,7 @@ async def test_camera_that_falls_silent_is_named() -> None:
         assert group.statistics().alone == {"cam0": 12, "cam1": 0}
 
 
-async def test_camera_that_is_gone_ends_the_group() -> None:
+async def test_lost_camera_ends_the_group() -> None:
     found, group = drivers(3)
     async with group:
         waiting = await started(group, found)
@@ -135,7 +135,7 @@ async def test_camera_that_does_not_open_leaves_the_others_closed() -> None:
     assert [one.calls[-1] for one in found] == ["close"] * 3
 
 
-async def test_group_that_is_cancelled_while_it_opens_leaves_all_closed() -> None:
+async def test_cancelled_opening_of_a_group_leaves_all_closed() -> None:
     found, group = drivers(2)
     found[0].waits["open"] = asyncio.Event()
     opening = asyncio.ensure_future(group.__aenter__())

@@ -1,4 +1,4 @@
-"""H.264: every frame at once, and none that is not whole."""
+"""H.264 gives every frame at once, and only whole ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ async def encoded(encoder: H264Encoder, count: int, first: int = 0) -> list[Fram
     return [await encoder.encode(drawn(number)) for number in range(first, first + count)]
 
 
-async def test_every_frame_comes_back_at_once_with_what_is_known_of_it(codecs: Codecs) -> None:
+async def test_every_frame_comes_back_at_once_with_its_number_and_times(codecs: Codecs) -> None:
     encoder, decoder = codecs.h264_encoder(keyint=KEYINT, crf=18), codecs.h264_decoder()
     for number in range(3 * KEYINT):
         sent = await encoder.encode(drawn(number))
@@ -55,7 +55,7 @@ async def test_every_frame_comes_back_at_once_with_what_is_known_of_it(codecs: C
 
 
 async def test_pictures_stay_as_they_were_while_the_decoder_goes_on(codecs: Codecs) -> None:
-    """A picture's planes are the decoder's own until somebody asks for its bytes."""
+    """A picture's planes belong to the decoder until its bytes are read."""
     encoder, decoder = codecs.h264_encoder(keyint=KEYINT, crf=18), codecs.h264_decoder()
     got = [await decoder.decode(await encoder.encode(drawn(one))) for one in range(3 * KEYINT)]
     frames = [one for one in got if one is not None]
@@ -84,7 +84,7 @@ async def test_no_frame_but_the_first_is_large(codecs: Codecs) -> None:
     assert max(sizes[1:]) < sizes[0]
 
 
-async def test_bitrate_is_kept_to(codecs: Codecs) -> None:
+async def test_bitrate_is_kept(codecs: Codecs) -> None:
     sent = await encoded(codecs.h264_encoder(fps=30, keyint=30, bitrate=100_000), 90)
     rest = sum(len(one.data) for one in sent[30:])
     free = sum(len(one.data) for one in (await encoded(codecs.h264_encoder(crf=5), 90))[30:])
@@ -110,14 +110,14 @@ async def test_other_formats_keep_their_colours(codecs: Codecs, name: str) -> No
     assert np.abs(got.rgb().astype(int) - frame.rgb()).mean() < 4
 
 
-async def test_jpeg_becomes_video_by_way_of_its_colours(codecs: Codecs) -> None:
+async def test_jpeg_is_decoded_for_video(codecs: Codecs) -> None:
     sent = await codecs.h264_encoder(crf=10).encode(await codecs.jpeg(drawn(3), quality=95))
     got = await codecs.h264_decoder().decode(sent)
     assert got is not None
     assert read_stamp(got.rgb()) == (3, 3000)
 
 
-async def test_what_cannot_become_video_is_told(codecs: Codecs) -> None:
+async def test_formats_that_cannot_become_video_are_refused(codecs: Codecs) -> None:
     encoder = codecs.h264_encoder()
     deep = frame_of(np.zeros((4, 4), "<u2"), "Mono12")
     with pytest.raises(FrameFormatError, match="Mono12 cannot become video") as got:
@@ -130,9 +130,9 @@ async def test_what_cannot_become_video_is_told(codecs: Codecs) -> None:
             codecs.h264_encoder(**{name: value})
 
 
-async def test_who_joins_late_sees_only_whole_pictures(codecs: Codecs) -> None:
-    """KEYINT + 1 is where FFmpeg alone gives half a picture: the refresh after it begins with frame
-    number 0, for which it makes up no reference."""
+async def test_late_viewer_gets_only_whole_pictures(codecs: Codecs) -> None:
+    """At KEYINT + 1 FFmpeg alone gives half a picture: the next refresh begins with frame
+    number 0, for which FFmpeg makes up no reference."""
     sent = await encoded(codecs.h264_encoder(keyint=KEYINT, crf=18), 5 * KEYINT)
     for begin in (1, KEYINT // 2, KEYINT + 1):
         decoder = codecs.h264_decoder()
@@ -144,7 +144,7 @@ async def test_who_joins_late_sees_only_whole_pictures(codecs: Codecs) -> None:
             assert np.abs(one.grey().astype(int) - stamped(number)).mean() < 3
 
 
-async def test_after_a_loss_no_picture_until_it_is_whole_again(codecs: Codecs) -> None:
+async def test_no_picture_after_a_loss_before_it_is_whole(codecs: Codecs) -> None:
     sent = await encoded(codecs.h264_encoder(keyint=KEYINT, crf=18), 5 * KEYINT)
     decoder = codecs.h264_decoder()
     for one in sent[:10]:
@@ -206,7 +206,7 @@ async def test_damaged_frame_is_an_error_and_counts_as_a_loss(codecs: Codecs) ->
         assert got[-1] is not None
 
 
-async def test_another_size_begins_anew_and_a_wrong_one_is_refused(codecs: Codecs) -> None:
+async def test_another_size_restarts_the_stream_and_a_wrong_one_is_refused(codecs: Codecs) -> None:
     encoder, decoder = codecs.h264_encoder(), codecs.h264_decoder()
     await encoder.encode(drawn(0))
     small = await encoder.encode(frame_of(stamped(1, 256, 32), "Mono8"))
@@ -218,7 +218,7 @@ async def test_another_size_begins_anew_and_a_wrong_one_is_refused(codecs: Codec
 
 
 @pytest.mark.parametrize("steps", range(5))
-async def test_after_a_cancelled_call_the_stream_is_whole(codecs: Codecs, steps: int) -> None:
+async def test_stream_is_whole_after_a_cancelled_call(codecs: Codecs, steps: int) -> None:
     encoder, decoder = codecs.h264_encoder(keyint=KEYINT, crf=18), codecs.h264_decoder()
     for number in range(3):
         await decoder.decode(await encoder.encode(drawn(number)))
@@ -227,7 +227,7 @@ async def test_after_a_cancelled_call_the_stream_is_whole(codecs: Codecs, steps:
         await asyncio.sleep(0)
     task.cancel()
     await asyncio.wait([task])
-    if not task.cancelled():  # it was done before
+    if not task.cancelled():  # done before the cancellation
         await decoder.decode(task.result())
     for number in range(4, 8):
         got = await decoder.decode(await encoder.encode(drawn(number)))

@@ -1,4 +1,4 @@
-"""Pictures of a smart camera: the emulated one, on a real socket; the bitmaps they come in."""
+"""Pictures of an emulated smart camera on a real socket, and their bitmaps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from smartcam.frames._inside import read_bitmap
 
 
 def picture(value: int) -> Any:
-    """Return a picture that shows which way round it is."""
+    """Return a picture that looks different after each turn or flip."""
     return np.arange(12, dtype=np.uint8).reshape(3, 4) + np.uint8(value)
 
 
@@ -37,7 +37,7 @@ async def test_each_new_picture_is_given_once() -> None:
                 assert (frame.grey() == picture(len(got))).all()
                 if len(got) == 3:
                     break
-                await asyncio.sleep(1)  # it is asked four times, and shows the same
+                await asyncio.sleep(1)  # four requests give the same picture
                 changed.append(time.monotonic())
                 camera.set_image(picture(len(got) + 1))
             assert source.statistics().frames == 3
@@ -54,7 +54,7 @@ async def test_each_new_picture_is_given_once() -> None:
         assert frame.began <= shown <= frame.captured
 
 
-async def test_lost_camera_ends_readers_and_the_next_connects_anew() -> None:
+async def test_lost_camera_ends_readers_and_the_next_reader_reconnects() -> None:
     async with (
         EmulatedInSight(online=True, image=picture(1)) as camera,
         frames.open(camera.url, timeout=60, stall=None) as source,
@@ -70,21 +70,21 @@ async def test_lost_camera_ends_readers_and_the_next_connects_anew() -> None:
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "message"),
     [
         ("fps=0", "fps: expected a number from 0.001 to 100, got '0'"),
         ("timeout=x", "timeout: expected a number"),
         ("fpss=2", "unknown 'fpss'; known are 'dialect'"),
     ],
 )
-def test_wrong_parameters_say_what_is_right(query: str, said: str) -> None:
+def test_wrong_parameters_are_refused_with_the_cure(query: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as got:
         frames.open(f"insight://admin:s3cret@127.0.0.1?{query}")
-    assert said in str(got.value)
+    assert message in str(got.value)
     assert "s3cret" not in str(got.value)
 
 
-async def test_refused_session_is_told_without_the_password() -> None:
+async def test_refused_session_is_reported_without_the_password() -> None:
     async with EmulatedInSight(online=True) as camera:
         url = camera.url.replace("//", "//admin:s3cret@")
         with pytest.raises(FrameSourceError, match="the user or the password is wrong") as got:
@@ -92,7 +92,7 @@ async def test_refused_session_is_told_without_the_password() -> None:
     assert "s3cret" not in str(got.value) + repr(got.value)
 
 
-async def test_picture_that_is_no_bitmap_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_picture_that_is_no_bitmap_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "smartcam.emulator._insight.commands.bitmap",
         lambda _: b"BM" + (60).to_bytes(4, "little") + bytes(54),

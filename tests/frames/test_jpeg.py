@@ -1,4 +1,4 @@
-"""JPEGs as cameras make them: what is whole is read and remarked on, what is not is refused."""
+"""JPEGs of cameras: whole ones are read with a remark, damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ WHOLE = {
     "bytes before the end mark": PLAIN[:-2] + b"\0\0\0\0" + PLAIN[-2:],
     "a revision of JFIF that is unknown": PLAIN.replace(b"JFIF\0\x01\x01", b"JFIF\0\x02\x07"),
 }
-"""Pictures that libjpeg, by Pillow and by OpenCV, shows whole."""
+"""Pictures that libjpeg decodes whole, by Pillow and by OpenCV."""
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -73,7 +73,7 @@ def test_whole_picture_is_read_and_remarked_on(name: str) -> None:
     assert np.array_equal(compressed(data).rgb(), wanted)
 
 
-async def test_remark_stands_on_the_decoded_frame() -> None:
+async def test_decoded_frame_has_the_remark() -> None:
     first = restarts(TWICE)[0]
     data = TWICE[:first] + b"\0\0\0" + TWICE[first:]
     async with frames.Codecs() as codecs:

@@ -1,4 +1,4 @@
-"""URLs of frame sources, and the frames that are drawn."""
+"""URLs of frame sources, and frames of the synthetic source."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("no_leaks")
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("", "expected a URL or a path"),
         ("v4l://x", "unknown scheme 'v4l'; known are .*did you mean 'v4l2'"),
@@ -30,12 +30,12 @@ pytestmark = pytest.mark.usefixtures("no_leaks")
         ("synthetic://?fps=nan", "fps: expected a number from"),
         ("synthetic://?fps=0", "fps: expected a number from"),
         ("synthetic://?fsp=3", "unknown parameter 'fsp'; known are .*did you mean 'fps'"),
-        ("synthetic://?fps=3&fps=4", "stands there twice"),
+        ("synthetic://?fps=3&fps=4", "is given twice"),
         ("rtsp://user:secret@[::1/x", "user:\\*\\*\\*@"),
     ],
 )
-def test_wrong_urls_say_what_is_right(url: str, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said) as caught:
+def test_wrong_urls_are_refused_with_the_cure(url: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         frames.open(url)
     assert "secret" not in str(caught.value)
 
@@ -46,7 +46,7 @@ def test_any_text_is_an_address_or_refused(text: str) -> None:
         frames.FrameAddress.parse(text)
 
 
-async def test_drawn_frames_say_their_number_and_moment() -> None:
+async def test_drawn_frames_carry_their_number_and_moment() -> None:
     async with frames.open("synthetic://?size=320x240&fps=50&name=desk") as source:
         assert (source.name, source.format.width, source.format.rates) == ("desk", 320, (50.0,))
         numbers = []
@@ -61,7 +61,7 @@ async def test_drawn_frames_say_their_number_and_moment() -> None:
         assert numbers == [1, 2, 3, 4, 5]
 
 
-async def test_frames_that_nobody_had_time_to_draw_are_lost() -> None:
+async def test_frames_that_were_not_drawn_in_time_are_lost() -> None:
     async with frames.open("synthetic://?size=320x240&fps=50") as source, source.reader() as reader:
         first = await anext(reader)
         await asyncio.sleep(0)
@@ -89,7 +89,7 @@ def test_stamp_is_read_as_it_was_drawn_or_not_at_all(
     assert read_stamp(picture[:8]) is None
 
 
-async def test_discovery_asks_each_kind_once() -> None:
+async def test_discovery_calls_each_kind_once() -> None:
     assert await frames.discover("synthetic") == []
     with pytest.raises(ConfigurationError, match="unknown scheme"):
         await frames.discover("nothing")
@@ -119,6 +119,6 @@ async def test_drawn_frames_have_their_stamp_in_every_format(
     assert depth or read_stamp(frame.rgb()) == stamp
 
 
-def test_format_that_is_not_drawn_lists_those_that_are() -> None:
+def test_error_of_another_format_lists_the_drawn_ones() -> None:
     with pytest.raises(ConfigurationError, match=r"format: expected one of Mono8, .* got 'NV12'"):
         frames.open("synthetic://?format=NV12")

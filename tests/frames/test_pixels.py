@@ -1,4 +1,4 @@
-"""Pixel formats: what their bytes become."""
+"""Pixel formats convert bytes to pixels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PACKED = [
     (b"\x12\x63\x45", "Mono12Packed", [0x123, 0x456]),
     (b"\x48\x23\x59", "Mono10Packed", [0x123, 0x166]),
 ]
-"""Bytes, and the pixels that they are by the figures of PFNC and GigE Vision, done by hand:
+"""Bytes and their pixels by the figures of PFNC and GigE Vision, done by hand:
 12p 23 61 45 is 0x456123 as a little-endian number, of which the lowest 12 bits come first."""
 
 
@@ -88,8 +88,8 @@ def test_every_name_code_and_fourcc_finds_its_format() -> None:
         assert [find_format(key) for key in keys if key] == [one] * sum(map(bool, keys))
 
 
-def test_codes_tell_the_bits_of_a_pixel() -> None:
-    """The third and fourth digit of a code of PFNC are the bits that a pixel takes."""
+def test_codes_contain_the_bits_of_a_pixel() -> None:
+    """The third and fourth digit of a code of PFNC are the bits of a pixel."""
     coded = [one for one in PIXEL_FORMATS if one.code]
     assert len(coded) > 40
     assert [one.name for one in coded if one.code >> 16 & 0xFF != one.bits] == []
@@ -148,7 +148,7 @@ def test_depth_has_distances_only() -> None:
             read(bytes(2), 1, 1, 2)
 
 
-def test_short_bytes_are_told_at_every_length() -> None:
+def test_short_bytes_are_refused_at_every_length() -> None:
     for one in (found for found in PIXEL_FORMATS if not found.compressed):
         size, stride = one.size(5, 3), one.stride(5)
         assert one.array(bytes(size), 5, 3, stride).size
@@ -212,7 +212,7 @@ COLOURED = [one.name for one in PIXEL_FORMATS if re.match(r"YUV|YCbCr|NV12|I4", 
 
 @pytest.fixture
 def numpy_alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Have no OpenCV."""
+    """Hide OpenCV."""
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "cv2", None)
         compiled.opencv.cache_clear()
@@ -268,7 +268,7 @@ def test_colours_by_numpy_alone_are_the_nearest(name: str) -> None:
 
 @pytest.mark.parametrize("matrix", COLOUR_MATRICES)
 def test_colours_of_all_u_and_v_are_within_a_level(matrix: str) -> None:
-    """Every fifth Y, U and V of 4:4:4, and for what OpenCV knows by itself of 4:2:0, too."""
+    """Every fifth Y, U and V of 4:4:4, and for OpenCV's own conversions of 4:2:0, too."""
     end = "".join(f"_{part}" for part in matrix.split() if part != "601")
     for name, low in ((f"I444{end}", 0), (f"I420{end}", 16)):
         steps = np.arange(low, 256, 5, dtype=np.uint8)
@@ -340,7 +340,7 @@ def test_limited_red_green_and_blue_are_widened() -> None:
     assert find_format("RGB8_limited").array(data, 2, 1, 6)[0, 0].tolist() == [16, 235, 0]
 
 
-def test_grey_of_colours_is_made_and_says_so() -> None:
+def test_grey_made_of_colours_is_marked() -> None:
     data = bytes([255, 0, 0, 0, 255, 0, 0, 0, 255, 255, 255, 255])
     assert find_format("RGB8").grey(data, 4, 1, 12).tolist() == [[76, 150, 29, 255]]
     assert find_format("BGR8").grey(data, 4, 1, 12).tolist() == [[29, 150, 76, 255]]
@@ -354,8 +354,8 @@ def test_colours_of_grey_are_its_grey_three_times() -> None:
 
 @pytest.mark.parametrize("pattern", ["RG", "GR", "GB", "BG"])
 @pytest.mark.parametrize("end", ["8", "12", "12p", "16"])
-def test_bayer_pattern_gives_the_colours_it_was_made_of(pattern: str, end: str) -> None:
-    """Each of four fields has one colour: what is read in its middle must be that colour."""
+def test_bayer_pattern_gives_its_original_colours(pattern: str, end: str) -> None:
+    """Each of four fields has one colour, which its middle must have."""
     found = find_format(f"Bayer{pattern}{end}")
     top = (1 << found.depth) - 1
     fields = {(0, 0): (top, 0, 0), (0, 1): (0, top, 0), (1, 0): (0, 0, top), (1, 1): (top, top, 0)}
@@ -395,13 +395,13 @@ def test_compressed_bytes_are_given_as_they_are() -> None:
             read(b"abc", 640, 480, 0)
 
 
-def test_planes_of_a_format_without_are_told() -> None:
+def test_planes_of_another_format_are_refused() -> None:
     with pytest.raises(FrameFormatError, match="a format of Y, U and V"):
         find_format("Mono8").planes(bytes(4), 2, 2, 2)
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_a_frame_is_copied_into_other_processes_whoever_has_its_bytes(kind: type) -> None:
+def test_frame_is_pickled_with_bytes_of_any_owner(kind: type) -> None:
     frame = frame_of(np.arange(12, dtype=np.uint8).reshape(3, 4), "Mono8")
     frame = replace(frame, data=kind(frame.data), chunks={"ChunkGain": 1.5})
     sent = pickle.loads(pickle.dumps(frame))  # noqa: S301 - our own

@@ -1,4 +1,4 @@
-"""Rate control over links that are simulated: what it holds, how soon, and how calmly."""
+"""Rate control over simulated links: limits, delay and calmness."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ class Sent(NamedTuple):
 
 
 class Link:
-    """A source of JPEGs, a link, and one who asks for one frame after the other.
+    """A source of JPEGs, a link, and a viewer that requests one frame after the other.
 
     Args:
-        control: says how.
+        control: rate control under test.
         rate: bits a second, at a time.
         content: bytes of a frame of quality 50, at a time.
-        base: seconds that the way takes beside the bytes.
+        base: latency of the link itself, seconds.
         source: frames a second.
-        noise: by how much frames differ, standard deviation.
-        steep: power of the steps that the bytes go with.
+        noise: standard deviation of the frames' sizes, relative.
+        steep: exponent of the size by the quality.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Link:
             self.due = max(self.due, went - self.control.rest) + self.control.rest
 
     def _through(self, size: int, begun: float) -> float:
-        """Return how long bytes take, over steps of the link."""
+        """Return the duration of a transfer, over steps of the link."""
         left, at = 8.0 * size, begun
         while (through := self.rate(at) * 0.01) < left:
             left, at = left - through, at + 0.01
@@ -94,7 +94,7 @@ class Link:
         return found[len(found) // 2]
 
     def bounds(self, begin: float, end: float) -> set[bool]:
-        """Return whether quality and frame rate could do nothing more."""
+        """Return whether quality and frame rate are at a limit."""
         return {
             one.quality == 90 or (one.quality == 10 and one.fps == 1.0)
             for one in self.last(begin, end)
@@ -102,7 +102,7 @@ class Link:
 
 
 def turns(values: list[float], dead: float) -> int:
-    """Return how often values turn back by more than ``dead``, as a share."""
+    """Return the share of values that turn back by more than ``dead``."""
     count, up, extreme = 0, None, values[0]
     for value in values:
         if up is not False and value < extreme * (1 - dead):
@@ -124,7 +124,7 @@ LINKS = st.floats(1e6, 100e6)
     content=st.floats(10e3, 100e3),
     noise=st.floats(0.0, 0.15),
 )
-def test_bit_rate_is_held(
+def test_bit_rate_is_kept(
     target: float, source: float, steep: float, content: float, noise: float
 ) -> None:
     link = Link(
@@ -153,7 +153,7 @@ def test_bit_rate_is_held(
     noise=st.floats(0.0, 0.15),
     base=st.floats(0.001, 0.02),
 )
-def test_latency_is_held(
+def test_latency_is_kept(
     rate: float, target: float, steep: float, content: float, noise: float, base: float
 ) -> None:
     link = Link(
@@ -165,34 +165,34 @@ def test_latency_is_held(
         base=base,
     )
     link.run(20.0)
-    said = link.control.statistics()
+    statistics = link.control.statistics()
     for begin in (10.0, 15.0):
         found = link.latency(begin, begin + 5.0) / target
-        assert found <= 1.1 or "lowest" in said.why or said.why.endswith("fewer")
-        assert found >= 0.9 or said.why == "the best quality"
-    if said.quality > 11:
-        assert said.fps == 30.0
+        assert found <= 1.1 or "lowest" in statistics.why or statistics.why.endswith("fewer")
+        assert found >= 0.9 or statistics.why == "the best quality"
+    if statistics.quality > 11:
+        assert statistics.fps == 30.0
     assert turns([one.quality for one in link.last(10.0, 20.0)], 0.2) <= 2
 
 
 @given(high=st.floats(10e6, 100e6), low=st.floats(1e6, 3e6))
-def test_link_that_becomes_thin_is_followed_in_a_second_and_back_slowly(
+def test_rate_follows_a_slower_link_in_a_second_and_recovers_slowly(
     high: float, low: float
 ) -> None:
     link = Link(RateControl(latency=0.1), lambda at: low if 10 <= at < 20 else high)
     link.run(40.0)
-    first = next(one for one in link.sent if one.there > 10.0)  # it was sent before, or just then
+    first = next(one for one in link.sent if one.there > 10.0)  # sent before or at the change
     begin = max(10.0, first.there) + 1.0
     assert all(one.latency <= 0.125 for one in link.last(begin, 20.0))
     assert 0.09 <= link.latency(15.0, 20.0) <= 0.11
     rises = [one.size for one in link.last(20.0, 40.0)]
     assert max(link.last(20.0, 20.9), key=lambda one: one.quality).size < 2.2 * rises[0]
-    said = link.control.statistics()
-    assert said.why == "the best quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
+    statistics = link.control.statistics()
+    assert statistics.why == "the best quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
 
 
 @given(more=st.floats(1.5, 8.0))
-def test_content_that_needs_more_is_followed_in_a_second(more: float) -> None:
+def test_rate_follows_larger_frames_in_a_second(more: float) -> None:
     control = RateControl(bitrate=4e6)
     link = Link(control, lambda _: 100e6, content=lambda at: 3e4 * (more if at > 10 else 1))
     link.run(20.0)
@@ -217,11 +217,11 @@ def test_quality_goes_first_then_the_frame_rate_and_back_in_reverse(
     assert control.statistics().why == "bit rate"
     assert not caplog.messages
     link.run(19.9)
-    said = control.statistics()
-    assert (said.quality, said.why) == (10, "bit rate, at the lowest quality")
-    assert said.fps < 15.0
-    assert said.bitrate == pytest.approx(1e6, rel=0.1)
-    assert f"{said.fps:.1f}"[:1] in caplog.messages[-1]
+    statistics = control.statistics()
+    assert (statistics.quality, statistics.why) == (10, "bit rate, at the lowest quality")
+    assert statistics.fps < 15.0
+    assert statistics.bitrate == pytest.approx(1e6, rel=0.1)
+    assert f"{statistics.fps:.1f}"[:1] in caplog.messages[-1]
     link.run(40.0)
     assert control.fps == 30.0
     assert caplog.messages[-1] == "frames: 30 a second at most: bit rate"
@@ -231,28 +231,28 @@ def test_quality_goes_first_then_the_frame_rate_and_back_in_reverse(
 
 
 @given(target=st.floats(0.2e6, 2e6))
-def test_what_is_said_is_what_is_done(target: float) -> None:
+def test_reported_settings_are_the_used_ones(target: float) -> None:
     control = RateControl(bitrate=target)
     link = Link(control, lambda _: 100e6, content=lambda at: 2e4 * (4.0 if 5 < at < 10 else 1.0))
     for until in np.arange(0.1, 20.0, 0.1):
         link.run(until)
-        said = control.statistics()
-        fewer = "lowest" in said.why or said.why.endswith("fewer")
-        assert fewer or said.fps == 30.0
+        statistics = control.statistics()
+        fewer = "lowest" in statistics.why or statistics.why.endswith("fewer")
+        assert fewer or statistics.fps == 30.0
         if fewer:
-            assert said.quality == 10
+            assert statistics.quality == 10
 
 
-def test_latency_that_the_way_itself_has_does_not_stop_the_frames() -> None:
+def test_latency_of_the_link_itself_does_not_stop_the_frames() -> None:
     link = Link(RateControl(latency=0.05), lambda _: 100e6, base=0.15)
     link.run(20.0)
-    said = link.control.statistics()
-    assert said.why == "latency, at the lowest quality"
-    assert 3.0 < said.fps < 12.0
-    assert said.latency == pytest.approx(0.151, abs=0.01)
+    statistics = link.control.statistics()
+    assert statistics.why == "latency, at the lowest quality"
+    assert 3.0 < statistics.fps < 12.0
+    assert statistics.latency == pytest.approx(0.151, abs=0.01)
 
 
-def test_both_together_hold_the_lower_one() -> None:
+def test_lower_of_both_limits_counts() -> None:
     link = Link(RateControl(bitrate=8e6, latency=0.1), lambda at: 1.5e6 if at > 10 else 100e6)
     link.run(9.5)
     assert link.control.statistics().why == "bit rate"
@@ -261,16 +261,16 @@ def test_both_together_hold_the_lower_one() -> None:
     assert 0.09 <= link.latency(15.0, 20.0) <= 0.11
 
 
-def test_what_cannot_be_held_is_said() -> None:
+def test_limit_that_cannot_be_kept_is_reported() -> None:
     link = Link(RateControl(bitrate=1e4), lambda _: 100e6)
     link.run(10.0)
-    said = link.control.statistics()
-    assert (said.quality, said.fps) == (10, 1.0)
-    assert said.why == "bit rate: no frame may be smaller, nor fewer"
+    statistics = link.control.statistics()
+    assert (statistics.quality, statistics.fps) == (10, 1.0)
+    assert statistics.why == "bit rate: no frame may be smaller, nor fewer"
 
 
 @pytest.mark.parametrize(
-    ("said", "named"),
+    ("options", "named"),
     [
         ({}, "neither"),
         ({"bitrate": 0}, "bitrate"),
@@ -283,6 +283,6 @@ def test_what_cannot_be_held_is_said() -> None:
         ({"latency": 0.1, "fps": (30.0, 1.0)}, "fps"),
     ],
 )
-def test_what_is_out_of_range_is_refused(said: dict[str, Any], named: str) -> None:
+def test_values_out_of_range_are_refused(options: dict[str, Any], named: str) -> None:
     with pytest.raises(ConfigurationError, match=named):
-        RateControl(**said)
+        RateControl(**options)

@@ -1,4 +1,4 @@
-"""A source of frames: lazy, latest-only, with an account for each reader."""
+"""A source of frames is lazy, gives the latest frame, and counts for each reader."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def test_device_streams_from_the_first_reader_to_the_last_one() -> None:
         second.close()
         await driver.rests()
         assert driver.calls == ["open", "start", "stop"]
-        source.reader()  # held by nobody
+        source.reader()  # without a reference
         gc.collect()
         async with source.reader():
             await driver.streams()
@@ -112,7 +112,7 @@ async def test_every_frame_that_was_offered_is_accounted_for(steps: list[str]) -
         assert account.delivered == len(taken)
 
 
-async def test_newest_is_the_one_that_is_there_unless_it_is_too_old() -> None:
+async def test_newest_returns_the_last_frame_unless_it_is_too_old() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
         await driver.streams()
@@ -128,7 +128,7 @@ async def test_newest_is_the_one_that_is_there_unless_it_is_too_old() -> None:
         assert (await source.newest(max_age=30)).sequence == 2
 
 
-async def test_frame_after_a_moment_is_never_one_that_may_have_begun_before() -> None:
+async def test_after_returns_no_frame_that_may_have_begun_earlier() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
         await driver.streams()
@@ -137,7 +137,7 @@ async def test_frame_after_a_moment_is_never_one_that_may_have_begun_before() ->
         await asyncio.sleep(0)
         driver.give(frame(1, captured=moment - 0.001))
         await asyncio.sleep(0.01)
-        driver.give(frame(2, captured=moment + 1e-6, duration=0.03))  # arrived later, seen before
+        driver.give(frame(2, captured=moment + 1e-6, duration=0.03))  # exposed before
         await asyncio.sleep(0.01)
         assert not waiting.done()
         now = time.monotonic()
@@ -148,7 +148,7 @@ async def test_frame_after_a_moment_is_never_one_that_may_have_begun_before() ->
         assert (await source.after(moment)).sequence == 4
 
 
-async def test_wait_that_runs_out_says_for_what_and_the_next_one_works() -> None:
+async def test_timeout_names_the_awaited_frame_and_the_next_wait_works() -> None:
     driver, source = scripted(timeout=2)
     async with source, source.reader() as reader:
         begun = asyncio.get_running_loop().time()
@@ -163,7 +163,7 @@ async def test_wait_that_runs_out_says_for_what_and_the_next_one_works() -> None
         assert (await anext(reader)).sequence == 1
 
 
-async def test_wait_for_a_time_that_is_none_is_refused() -> None:
+async def test_invalid_timeout_is_refused() -> None:
     _, source = scripted(timeout=None)
     nan = float("nan")
     async with source, source.reader() as reader:
@@ -196,7 +196,7 @@ async def test_wait_that_is_cancelled_loses_no_frame() -> None:
         assert (account.offered, account.delivered, account.skipped) == (4, 4, 0)
 
 
-async def test_device_that_is_stuck_ends_its_readers_and_is_tried_again() -> None:
+async def test_stuck_device_ends_its_readers_and_is_reopened() -> None:
     driver, source = scripted(stall=3, timeout=None)
     async with source:
         async with source.reader() as reader:
@@ -212,7 +212,7 @@ async def test_device_that_is_stuck_ends_its_readers_and_is_tried_again() -> Non
             assert (await anext(reader)).sequence == 2
 
 
-async def test_camera_that_waits_for_triggers_is_not_stuck() -> None:
+async def test_camera_without_triggers_is_not_reported_as_stuck() -> None:
     driver, source = scripted(stall=None, timeout=None)
     async with source, source.reader() as reader:
         await driver.streams()
@@ -241,7 +241,7 @@ async def test_device_that_is_unplugged_ends_each_reader_with_its_error() -> Non
         source.reader()
 
 
-async def test_file_that_is_over_ends_the_iteration() -> None:
+async def test_end_of_a_file_ends_the_iteration() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
         await driver.streams()
@@ -249,7 +249,7 @@ async def test_file_that_is_over_ends_the_iteration() -> None:
         driver.give(frame(1))
         driver.sink.ended(None)
         assert [one.sequence async for one in reader] == [1]
-        with pytest.raises(FrameSourceError, match="it ended"):
+        with pytest.raises(FrameSourceError, match="the source ended"):
             await reader.newest(max_age=0)
 
 
@@ -280,7 +280,7 @@ async def test_device_that_does_not_open_is_closed_again() -> None:
 
 
 @pytest.mark.parametrize("at", ["open", "start", "stop"])
-async def test_user_who_is_cancelled_anywhere_leaves_the_device_closed(at: str) -> None:
+async def test_cancellation_anywhere_leaves_the_device_closed(at: str) -> None:
     driver, source = scripted()
     driver.waits[at] = asyncio.Event()
 
@@ -301,7 +301,7 @@ async def test_user_who_is_cancelled_anywhere_leaves_the_device_closed(at: str) 
     await until(lambda: driver.calls[-1] == "close")
 
 
-async def test_closing_the_source_ends_who_still_waits() -> None:
+async def test_closing_the_source_ends_waiting_readers() -> None:
     driver, source = scripted(timeout=None)
     async with source:
         reader = source.reader()
@@ -321,7 +321,7 @@ async def _all(reader: FrameReader) -> list[int]:
     return [one.sequence async for one in reader]
 
 
-async def test_source_lingers_for_one_that_comes_back() -> None:
+async def test_source_lingers_for_a_returning_reader() -> None:
     driver, source = scripted(linger=10)
     async with source:
         for wait in (9, 9, 11):
@@ -343,7 +343,7 @@ async def test_time_in_the_future_is_that_of_the_arrival() -> None:
         assert source.statistics().ahead == 1
 
 
-async def test_time_of_the_cameras_own_clock_is_brought_onto_ours() -> None:
+async def test_time_of_the_camera_clock_is_converted_to_the_local_clock() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
         await driver.streams()
@@ -377,7 +377,7 @@ async def test_lens_travels_with_the_frames_and_has_their_size() -> None:
 @pytest.mark.parametrize(
     "options", [{"timeout": 0}, {"stall": -1}, {"stall": float("inf")}, {"linger": -0.1}]
 )
-def test_times_that_are_none_are_refused(options: dict[str, Any]) -> None:
+def test_invalid_times_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match=f"{next(iter(options))}: expected"):
         FrameSource(ScriptedDriver(), **options)
 
@@ -403,7 +403,7 @@ async def test_memory_is_flat_over_20_000_frames() -> None:
 # ---------------------------------------------------------------------- whose task it is
 
 
-async def test_source_closed_in_the_turn_in_which_it_was_read_gives_its_device_back() -> None:
+async def test_source_closed_in_the_same_turn_closes_its_device() -> None:
     driver = ScriptedDriver()
     async with FrameSource(driver) as source:
         source.reader()
@@ -411,7 +411,7 @@ async def test_source_closed_in_the_turn_in_which_it_was_read_gives_its_device_b
     assert driver.calls[-1] == "close"
 
 
-async def test_source_whose_task_somebody_cancels_tells_its_readers_and_streams_again() -> None:
+async def test_cancelled_task_of_a_source_ends_its_readers_and_restarts() -> None:
     driver = ScriptedDriver()
     async with FrameSource(driver, stall=None) as source:
         reader = source.reader(timeout=None)
@@ -427,13 +427,13 @@ async def test_source_whose_task_somebody_cancels_tells_its_readers_and_streams_
         assert (await again).sequence == 7
 
 
-async def test_source_that_nobody_has_gives_its_device_back() -> None:
+async def test_abandoned_source_closes_its_device() -> None:
     driver = ScriptedDriver()
     kept: list[Any] = [await FrameSource(driver, stall=None).__aenter__()]
     readers = [kept[0].reader()]
     await until(lambda: driver.sink)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # its reader has it
+        warnings.simplefilter("error")  # its reader has a reference
         kept.clear()
         gc.collect()
         driver.give(frame(1))

@@ -1,4 +1,4 @@
-"""The lens taken out of frames."""
+"""Remove the lens' distortion from frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lens(model: DistortionModel) -> CameraModel:
 
 
 def spots(camera: CameraModel, points: np.ndarray) -> bytes:
-    """Return the picture of bright spots at points before a camera."""
+    """Return a camera's picture of bright spots at points."""
     u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     picture = np.zeros((SIZE[1], SIZE[0]))
     for x, y in camera.project(points):
@@ -37,7 +37,7 @@ def spots(camera: CameraModel, points: np.ndarray) -> bytes:
 
 
 def centres(picture: np.ndarray) -> np.ndarray:
-    """Return where the spots of a picture are, from left to right."""
+    """Return the places of the spots in a picture, from left to right."""
     count, labels = cv2.connectedComponents((picture > 60).astype(np.uint8))
     found = []
     for number in range(1, count):
@@ -52,7 +52,7 @@ def seen(data: bytes) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_points_are_where_a_lens_without_distortion_has_them(model: DistortionModel) -> None:
+def test_undistorted_points_are_those_of_an_ideal_lens(model: DistortionModel) -> None:
     points = np.array([[-0.35, 0.2, 1.0], [-0.1, -0.25, 1], [0.05, 0.05, 1], [0.3, -0.1, 1]])
     undistorter = Undistorter(lens(model))
     one = frame(1, **seen(spots(lens(model), points)))

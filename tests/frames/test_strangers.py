@@ -1,4 +1,4 @@
-"""Strangers at the ports of streams and cameras: they take no place of who is there."""
+"""Strangers at the ports of streams and cameras replace no known sender."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.frames.rtp.ways import HOST, two_ports
 
 
 class Junk:
-    """A stranger that sends packets of RTP without a picture, all the time."""
+    """A stranger that continuously sends packets of RTP without a picture."""
 
     def __init__(self, port: int, host: str = HOST) -> None:
         self._sock = socket.socket(type=socket.SOCK_DGRAM)
@@ -50,7 +50,7 @@ class Junk:
 
 @pytest.mark.long
 @pytest.mark.real_time
-async def test_a_stranger_that_was_first_does_not_keep_the_sender_out() -> None:
+async def test_earlier_stranger_does_not_keep_the_sender_out() -> None:
     port = two_ports()
     async with (
         frames.open(DRAWN) as drawn,
@@ -72,7 +72,7 @@ async def test_a_stranger_that_was_first_does_not_keep_the_sender_out() -> None:
 
 @pytest.mark.real_time
 @pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is this machine's on Linux alone")
-async def test_only_the_host_that_the_url_names_is_heard() -> None:
+async def test_only_packets_of_the_host_in_the_url_count() -> None:
     port = two_ports()
     url = f"rtp://{HOST}:{port}?{SIZE}&from=127.0.0.1"
     async with (
@@ -95,7 +95,7 @@ async def test_only_the_host_that_the_url_names_is_heard() -> None:
 @pytest.mark.long
 @pytest.mark.real_time
 @pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is this machine's on Linux alone")
-async def test_another_host_does_not_take_a_sender_its_place_between_two_pictures() -> None:
+async def test_another_host_does_not_replace_a_sender_between_two_pictures() -> None:
     port = two_ports()
     async with (
         frames.open(f"synthetic://?{SIZE}&fps=0.6") as drawn,  # longer apart than CHANGED
@@ -114,7 +114,7 @@ async def test_another_host_does_not_take_a_sender_its_place_between_two_picture
                 await junk.end()
 
 
-def test_reports_to_an_rtsp_server_are_heard_of_its_viewer_alone() -> None:
+def test_reports_to_an_rtsp_server_count_of_its_viewer_alone() -> None:
     heard: list[bytes] = []
     port = _ControlPort("10.0.0.1", heard.append)
     port.datagram_received(b"stranger", ("10.0.0.2", 5001))
@@ -123,7 +123,7 @@ def test_reports_to_an_rtsp_server_are_heard_of_its_viewer_alone() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is this machine's on Linux alone")
-async def test_a_gige_stream_is_heard_of_its_camera_alone() -> None:
+async def test_gige_packets_count_of_the_camera_alone() -> None:
     where = StreamSocket("127.0.0.1", "127.0.0.1")
     size = 1400
     with socket.socket(type=socket.SOCK_DGRAM) as stranger:
@@ -149,7 +149,7 @@ async def test_events_of_a_gige_camera_are_those_of_its_address_alone() -> None:
         assert (await anext(events)).block == 7
 
 
-async def test_one_address_does_not_stand_for_all_gige_cameras() -> None:
+async def test_one_address_does_not_replace_all_gige_cameras() -> None:
     async with gige_camera() as there:
         asking = _Asking(Network("127.0.0.1", ()))
         answer = await discovery_of(there.port)
@@ -162,7 +162,7 @@ async def test_one_address_does_not_stand_for_all_gige_cameras() -> None:
 
 
 async def discovery_of(port: int) -> bytes:
-    """Return what a camera answers to the question who is there."""
+    """Return a camera's answer to a discovery request."""
     loop = asyncio.get_running_loop()
     with socket.socket(type=socket.SOCK_DGRAM) as sock:
         sock.setblocking(False)

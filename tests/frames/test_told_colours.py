@@ -1,7 +1,6 @@
-"""A red picture is red by every way that says its matrix and range.
-
-Y, U and V are worked out by the recommendations' formulas, and FFmpeg's encoders write into the
-stream what they stand for. tests/frames/v4l2 has the same for devices.
+"""A red picture is red on each path that carries its matrix and range. Y, U and V follow from the
+recommendations' formulas, and FFmpeg's encoders write matrix and range into the stream.
+tests/frames/v4l2 has the same for devices.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ pytest.importorskip("av")
 pytestmark = pytest.mark.real_time
 
 LIMIT = 30.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 WEIGHTS = {"601": (0.299, 0.114), "709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
 """Shares of red and blue in Y, from the recommendations of ITU-R."""
@@ -72,12 +71,12 @@ def encoded(codec: str, matrix: str, *, full: bool) -> list[bytes]:
     made = load("av").CodecContext.create(codec, "w")
     made.width, made.height, made.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     made.time_base = fractions.Fraction(1, 30)
-    said = f"colormatrix={X264_NAMES[matrix]}"
+    colours = f"colormatrix={X264_NAMES[matrix]}"
     if codec == "libx264":
-        params = f"{said}:fullrange={'on' if full else 'off'}:keyint=1:repeat-headers=1"
+        params = f"{colours}:fullrange={'on' if full else 'off'}:keyint=1:repeat-headers=1"
         made.options = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": params}
     else:
-        params = f"{said}:range={'full' if full else 'limited'}:keyint=1:repeat-headers=1"
+        params = f"{colours}:range={'full' if full else 'limited'}:keyint=1:repeat-headers=1"
         params += ":log-level=none"
         made.options = {"preset": "ultrafast", "tune": "zerolatency", "x265-params": params}
     made.options |= {"crf": "8"}
@@ -137,7 +136,7 @@ def red_frame(matrix: str, *, full: bool) -> Frame:
 
 
 class Showing(ShowingDriver):
-    """Shows one frame again and again."""
+    """Gives one frame repeatedly."""
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frames.FrameAddress.parse("synthetic://"))
@@ -162,7 +161,7 @@ async def showing(matrix: str, *, full: bool) -> AsyncIterator[frames.FrameSourc
 
 
 @TOLD
-async def test_our_own_rtsp_server_tells_it(matrix: str, full: bool) -> None:
+async def test_own_rtsp_server_sends_the_matrix(matrix: str, full: bool) -> None:
     async with (
         showing(matrix, full=full) as source,
         RtspServer({"red": source}, port=0, crf=8.0) as server,
@@ -171,7 +170,7 @@ async def test_our_own_rtsp_server_tells_it(matrix: str, full: bool) -> None:
 
 
 @TOLD
-async def test_a_recording_tells_it(tmp_path: Path, matrix: str, full: bool) -> None:
+async def test_recording_stores_the_matrix(tmp_path: Path, matrix: str, full: bool) -> None:
     for path in (tmp_path / "red.mcap", tmp_path / "red.mkv"):
         with Recorder(path) as recorder:
             async with showing(matrix, full=full) as source:
@@ -180,7 +179,7 @@ async def test_a_recording_tells_it(tmp_path: Path, matrix: str, full: bool) -> 
 
 
 @TOLD
-async def test_a_jpeg_of_it_is_red(matrix: str, full: bool) -> None:
+async def test_jpeg_of_a_red_frame_is_red(matrix: str, full: bool) -> None:
     async with Codecs(threads=1) as codecs:
         made = await codecs.jpeg(red_frame(matrix, full=full), quality=95)
         check_red(await codecs.decode(made), "RGB8")

@@ -54,9 +54,9 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
 
 SOON = "timeout=0.3"
-"""Seconds of real time that a test waits for a server that says nothing."""
+"""Seconds of real time that a test waits for a silent server."""
 LATER = "timeout=2"
-"""The same for one that answers at first, on a slow machine, too."""
+"""The same for a server that answers at first, even on a slow machine."""
 
 
 def threads() -> set[threading.Thread]:
@@ -136,7 +136,7 @@ async def test_slow_reader_loses_nothing_of_a_file_without_pace(tmp_path: Path) 
             found = []
             async for frame in reader:
                 found.append(frame.sequence)
-                await asyncio.sleep(pause)  # of the loop's time, which moves as it likes
+                await asyncio.sleep(pause)  # of the loop's simulated time
             return found
 
         found = await asyncio.gather(every(fast, 0), every(slow, 20))
@@ -163,7 +163,7 @@ async def test_pixels_are_converted_on_request(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("codec", "pixels", "format"), [("mjpeg", "yuvj420p", "MJPEG"), ("libx264", "yuv420p", "H264")]
 )
-async def test_bytes_are_handed_on_as_they_came(
+async def test_bytes_are_passed_on_unchanged(
     tmp_path: Path, codec: str, pixels: str, format: str
 ) -> None:
     path = write_video(tmp_path / "video.mp4", codec, pixels)
@@ -199,7 +199,7 @@ async def test_pictures_of_a_folder_or_pattern_come_by_name(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("file", "said"),
+    ("file", "message"),
     [
         ("none.mp4", "cannot be read: No such file or directory"),
         ("text.mp4", "cannot be read: Invalid data"),
@@ -207,11 +207,11 @@ async def test_pictures_of_a_folder_or_pattern_come_by_name(tmp_path: Path) -> N
         ("*.png", "there is no picture"),
     ],
 )
-async def test_what_is_no_video_is_told(tmp_path: Path, file: str, said: str) -> None:
+async def test_file_without_video_is_an_error(tmp_path: Path, file: str, message: str) -> None:
     (tmp_path / "text.mp4").write_text("no video at all\n" * 100)
     (tmp_path / "empty.mp4").write_bytes(b"")
     source = frames.open(str(tmp_path / file))
-    with pytest.raises(FrameSourceError, match=said) as got:
+    with pytest.raises(FrameSourceError, match=message) as got:
         await source.__aenter__()
     assert got.value.source == str(tmp_path / file)
     assert str(tmp_path / file) in str(got.value)
@@ -241,7 +241,7 @@ async def test_damaged_pictures_of_a_file_are_lost_and_counted(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("rtsp://h/x#transport=quic", "transport: expected tcp or udp, got 'quic'"),
         ("rtsp://h/x#pace=none", "unknown parameter 'pace'; known are delay, elsewhere,"),
@@ -253,10 +253,10 @@ async def test_damaged_pictures_of_a_file_are_lost_and_counted(tmp_path: Path) -
         ("file://x/y.mp4", "expected file:///PATH"),
     ],
 )
-def test_wrong_parameters_say_what_is_right(url: str, said: str) -> None:
+def test_wrong_parameters_are_refused_with_the_cure(url: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as got:
         frames.open(url)
-    assert said in str(got.value)
+    assert message in str(got.value)
 
 
 def test_query_is_the_server_s_and_a_path_may_have_a_sharp() -> None:
@@ -268,9 +268,13 @@ def test_query_is_the_server_s_and_a_path_may_have_a_sharp() -> None:
     assert (made.name, made._paced) == ("take#1/a#b.mp4", True)
 
 
-def test_certificates_are_looked_at_unless_one_says_no() -> None:
-    for url, said in (("https://h/x", "1"), ("rtsps://h/x", "1"), ("https://h/x#verify=no", "0")):
-        assert video.VideoDriver(frames.FrameAddress.parse(url))._options["tls_verify"] == said
+def test_certificates_are_checked_unless_switched_off() -> None:
+    for url, verified in (
+        ("https://h/x", "1"),
+        ("rtsps://h/x", "1"),
+        ("https://h/x#verify=no", "0"),
+    ):
+        assert video.VideoDriver(frames.FrameAddress.parse(url))._options["tls_verify"] == verified
 
 
 async def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,7 +287,7 @@ async def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Camera:
-    """An MJPEG camera: what it sends, and then does, is told to each client in turn."""
+    """An MJPEG camera whose bytes and next action are the same for each client."""
 
     def __init__(self) -> None:
         self.requests: list[str] = []
@@ -305,7 +309,7 @@ class Camera:
                     await asyncio.sleep(0.005)
                 if self.then == "dies":
                     return
-                if self.then == "ends":  # and none of what it said is lost
+                if self.then == "ends":  # and no byte sent before is lost
                     writer.write_eof()
                     await reader.read()
                     return
@@ -316,7 +320,7 @@ class Camera:
 
 
 @pytest.mark.parametrize("challenge", ['Digest realm="x", nonce="1"', 'Basic realm="x"'])
-async def test_camera_may_hang_up_after_it_asked_who_is_there(challenge: str) -> None:
+async def test_camera_may_close_the_connection_after_its_challenge(challenge: str) -> None:
     camera = Camera()
     refused: list[str] = []
 
@@ -327,8 +331,8 @@ async def test_camera_may_hang_up_after_it_asked_who_is_there(challenge: str) ->
             await camera.serve(reader, writer)
             return
         refused.append(request)
-        said = f"HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: {challenge}\r\nConnection: close"
-        writer.write(f"{said}\r\n\r\n".encode())
+        answer = f"HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: {challenge}\r\nConnection: close"
+        writer.write(f"{answer}\r\n\r\n".encode())
         writer.write_eof()
         await reader.read()
 
@@ -363,14 +367,14 @@ async def test_camera_is_read_and_its_query_left_to_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("then", "said"),
+    ("then", "message"),
     [
         ("dies", "the server ended the stream|cannot be read: "),
         ("stalls", "expected a picture, got no bytes for 2 s"),
     ],
 )
-async def test_server_that_dies_or_stalls_ends_readers_and_the_next_connects_anew(
-    then: str, said: str
+async def test_lost_or_stalled_server_ends_readers_and_the_next_reconnects(
+    then: str, message: str
 ) -> None:
     camera = Camera()
     async with (
@@ -378,19 +382,19 @@ async def test_server_that_dies_or_stalls_ends_readers_and_the_next_connects_ane
         frames.open(f"http://127.0.0.1:{port}/#{LATER}") as source,
     ):
         camera.then = then
-        with pytest.raises(FrameSourceError, match=said) as got:
+        with pytest.raises(FrameSourceError, match=message) as got:
             await numbers(source)
         assert got.value.source == f"http://127.0.0.1:{port}/"
         camera.then = "goes on"
         assert (await source.newest()).format.name == "Mono8"
         assert source.statistics().started == 2
-    # before an older FFmpeg, which follows redirects, the camera is asked for one first
+    # an older FFmpeg follows redirects, so the camera is asked for one first
     assert len(camera.requests) == camera.gone
     assert camera.gone in {3, 6}
 
 
 @pytest.mark.parametrize(
-    ("answer", "then", "said"),
+    ("answer", "then", "message"),
     [
         (b"HTTP/1.0 401 Unauthorized\r\n\r\n", "ends", "401 Unauthorized"),
         (b"HTTP/1.0 404 Not Found\r\n\r\n", "ends", "404 Not Found"),
@@ -399,8 +403,8 @@ async def test_server_that_dies_or_stalls_ends_readers_and_the_next_connects_ane
         (b"", "says nothing", "expected an answer, got none within 0.3 s"),
     ],
 )
-async def test_server_that_gives_no_stream_is_told_without_the_password(
-    answer: bytes, then: str, said: str, caplog: pytest.LogCaptureFixture
+async def test_server_without_a_stream_is_reported_without_the_password(
+    answer: bytes, then: str, message: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
     camera = Camera()
@@ -408,7 +412,7 @@ async def test_server_that_gives_no_stream_is_told_without_the_password(
     async with served(camera.serve) as port:
         soon = SOON if then == "says nothing" else ""
         url = f"http://admin:s3cret@127.0.0.1:{port}/?password=t0ken#{soon}"
-        with pytest.raises(FrameSourceError, match=said) as got:
+        with pytest.raises(FrameSourceError, match=message) as got:
             await frames.open(url).__aenter__()
     whole = "".join(traceback.format_exception(got.value)) + repr(got.value) + caplog.text
     assert "127.0.0.1" in whole
@@ -416,7 +420,7 @@ async def test_server_that_gives_no_stream_is_told_without_the_password(
     assert "t0ken" not in whole
 
 
-def test_secrets_stand_in_no_text_of_an_address() -> None:
+def test_texts_of_an_address_contain_no_secrets() -> None:
     address = frames.FrameAddress.parse("http://u:s3cret@h/x?user=u&pwd=s3cret&n=1#format=H264")
     assert "s3cret" not in repr(address)
     with pytest.raises(ConfigurationError) as got:
@@ -455,19 +459,19 @@ async def test_bytes_that_never_make_a_picture_are_no_stream() -> None:
             await numbers(source)
 
 
-async def test_thread_that_outlives_its_limits_is_left_and_said(
+async def test_thread_that_exceeds_its_limits_is_abandoned_and_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     path = write_video(tmp_path / "video.mkv", "ffv1", "gray")
     gate = threading.Event()
     driver = video.VideoDriver(frames.FrameAddress.parse(f"{path}#timeout=0.1"))
-    monkeypatch.setattr(video, "GRACE", -0.05)
+    monkeypatch.setattr(video, "THREAD_GRACE", -0.05)
     monkeypatch.setattr(driver, "_opened", lambda: gate.wait(60))
     task = asyncio.create_task(driver.open())
     await asyncio.sleep(0)
     task.cancel()
     await asyncio.wait([task])
-    assert "its thread hangs, and is left to end by itself" in caplog.text
+    assert "the reading thread hangs, and is abandoned" in caplog.text
     monkeypatch.undo()
     assert (await driver.open()).width == WIDTH
     gate.set()
@@ -502,7 +506,7 @@ async def test_leaving_ends_a_read_that_hangs() -> None:
             reader = source.reader()
             await reader.newest()
         assert source.statistics().streaming is False
-        for one in threads():  # while the server stalls as ever
+        for one in threads():  # while the server stalls
             await asyncio.to_thread(one.join, 60)
         assert threads() == set()
 
@@ -564,7 +568,7 @@ def test_a_thumbnail_is_no_picture_of_its_own() -> None:
 
 
 def strays(picture: bytes, marker: int, more: bytes) -> bytes:
-    """Return a picture with bytes before a segment of its head that belong to none."""
+    """Return a picture with stray bytes before a segment of its head."""
     place = picture.index(bytes((0xFF, marker)))
     return picture[:place] + more + picture[place:]
 
@@ -572,7 +576,7 @@ def strays(picture: bytes, marker: int, more: bytes) -> bytes:
 @pytest.mark.parametrize("more", [b"\0", b"\x01\x02\x03", b"\xff\0", b"--b\r\n", bytes(2000)])
 @pytest.mark.parametrize("marker", [0xDB, 0xC0, 0xDA])
 def test_stray_bytes_in_a_head_belong_to_the_picture(marker: int, more: bytes) -> None:
-    """As webcams send them, and decoders pass over them."""
+    """Webcams send such bytes, and decoders skip them."""
     sent = [strays(one, marker, more) for one in PICTURES]
     whole = b"".join(b"--b\r\n\r\n" + one + b"\r\n" for one in sent)
     for size in (1, 7, 1000, len(whole)):
@@ -585,14 +589,14 @@ def test_stray_bytes_in_a_head_belong_to_the_picture(marker: int, more: bytes) -
         assert (got, cutter.damaged) == (sent, 0)
 
 
-@pytest.mark.parametrize("said", [True, False])
-def test_a_head_that_is_cut_short_takes_nothing_of_the_next_picture(said: bool) -> None:
-    """The length of its last segment may lead into the next picture, wherever that is cut."""
+@pytest.mark.parametrize("with_length", [True, False])
+def test_truncated_head_takes_no_bytes_of_the_next_picture(with_length: bool) -> None:
+    """The length of its last segment may reach into the next picture, wherever that is cut."""
     shown = {grey_of(one) for one in PICTURES}
     for size in range(2, PICTURES[0].index(b"\xff\xda") + 20):
         cutter, cut = PictureCutter(), PICTURES[0][:size]
         sent = b"".join(
-            b"\r\n--b\r\n" + (length(one) if said else b"\r\n") + one
+            b"\r\n--b\r\n" + (length(one) if with_length else b"\r\n") + one
             for one in (cut, *PICTURES[1:4])
         )
         got = list(cutter.feed(sent))
@@ -614,14 +618,14 @@ def test_a_head_of_strays_alone_is_no_picture() -> None:
     assert cutter.damaged == 1
 
 
-def test_what_is_cut_short_is_counted_and_the_next_one_comes() -> None:
+def test_truncated_picture_is_counted_and_the_next_one_comes() -> None:
     cutter = PictureCutter()
     cut = PICTURES[0][: len(PICTURES[0]) // 2]
     unsaid = b"--b\r\n\r\n" + cut + b"\r\n--b\r\n\r\n" + PICTURES[1]
     assert list(cutter.feed(unsaid)) == [PICTURES[1]]
     assert cutter.damaged == 1
-    said = b"--b\r\n" + length(cut) + cut + b"\r\n--b\r\n\r\n" + PICTURES[1]
-    assert list(cutter.feed(said)) == [cut, PICTURES[1]]  # the decoder says what it is worth
+    stream = b"--b\r\n" + length(cut) + cut + b"\r\n--b\r\n\r\n" + PICTURES[1]
+    assert list(cutter.feed(stream)) == [cut, PICTURES[1]]  # the decoder judges the picture
     cutter.damaged = 0
     assert list(cutter.feed(b"\xff\xd8 none \xff\xd8\xff\x20 none" + PICTURES[2])) == [PICTURES[2]]
     assert cutter.damaged == 2
@@ -644,7 +648,7 @@ def _fed(cutter: PictureCutter, size: int, count: int) -> None:
 # RTSP
 
 
-async def test_rtsp_camera_that_says_nothing_is_told_without_the_password() -> None:
+async def test_silent_rtsp_camera_is_reported_without_the_password() -> None:
     async def serve(reader: Any, writer: Any) -> None:
         await reader.read()
 
@@ -690,7 +694,7 @@ async def test_rtsp_camera_is_read_over_tcp_with_its_clock() -> None:
         stamp = read_stamp(frame.grey())
         assert stamp is not None
         assert np.abs(frame.grey().astype(int) - stamped(stamp[0])).mean() < 3
-    waited = [frame.device_time is None for frame in got]  # until the camera told
+    waited = [frame.device_time is None for frame in got]  # until the camera's first report
     times = [frame.device_time for frame in got if frame.device_time is not None]
     assert waited == sorted(waited, reverse=True)
     assert len(times) > 20

@@ -1,4 +1,4 @@
-"""Web cameras that send JPEGs in parts, as real ones do, and each picture at once."""
+"""Web cameras send JPEGs in parts, and each picture comes at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: %s\r\n%s\r\n"
 
 
 class Pace:
-    """The times at which a camera sends: each 0.2 s of the loop, or up to the one it may."""
+    """The times of a camera's pictures: each 0.2 s of the loop, or up to an allowed number."""
 
     def __init__(self) -> None:
         self.most: int | None = None
@@ -36,7 +36,7 @@ class Pace:
         self._changed = asyncio.Condition()
 
     async def next(self, number: int) -> None:
-        """Return when the picture behind one may be sent."""
+        """Return as soon as the picture after ``number`` may be sent."""
         self.sent = max(self.sent, number)
         if self.most is None:
             await asyncio.sleep(0.2)
@@ -44,7 +44,7 @@ class Pace:
             await self._changed.wait_for(lambda: self.most is None or self.most > number)
 
     async def up_to(self, number: int) -> None:
-        """Let all connections send up to the picture of a number, and no more."""
+        """Allow all connections to send pictures up to a number."""
         self.most = number
         async with self._changed:
             self._changed.notify_all()
@@ -107,7 +107,7 @@ async def test_no_picture_waits_for_the_next_one(way: str) -> None:
     pace = Pace()
     head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
     async with (
-        asyncio.timeout(60),  # in vain, where a picture comes with the next one
+        asyncio.timeout(60),  # exceeded if a picture comes only with the next one
         camera(head, PARTS[way], pace) as url,
         frames.open(url) as source,
         source.reader() as reader,
@@ -120,7 +120,7 @@ async def test_no_picture_waits_for_the_next_one(way: str) -> None:
                 shown, _ = read_stamp((await anext(reader)).grey()) or (None, None)
 
 
-async def test_what_is_no_stream_of_parts_is_left_to_others() -> None:
+async def test_stream_without_parts_is_left_to_ffmpeg() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
         writer.write(
@@ -138,22 +138,22 @@ async def test_what_is_no_stream_of_parts_is_left_to_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fragment", "error", "said"),
+    ("fragment", "error", "message"),
     [
         ("#format=H264", FrameSourceError, "expected H264, got MJPEG"),
         ("#fps=3", ConfigurationError, "a recording, which alone has it"),
     ],
 )
-async def test_what_a_stream_of_parts_cannot_do_is_told(
-    fragment: str, error: type[Exception], said: str
+async def test_unsupported_options_of_a_stream_of_parts_are_errors(
+    fragment: str, error: type[Exception], message: str
 ) -> None:
     head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
     async with camera(head) as url:
-        with pytest.raises(error, match=said):
+        with pytest.raises(error, match=message):
             await frames.open(url + fragment).__aenter__()
 
 
-async def test_pixels_and_bytes_come_as_they_are_wanted() -> None:
+async def test_pixels_and_bytes_come_as_requested() -> None:
     head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
     async with camera(head) as url:
         async with frames.open(f"{url}#format=MJPEG") as source:
@@ -164,7 +164,7 @@ async def test_pixels_and_bytes_come_as_they_are_wanted() -> None:
 
 
 @pytest.mark.parametrize("line", [b"zz\r\n", b"1" * 5000, b"-1\r\n"])
-async def test_chunks_that_are_none_are_told(line: bytes) -> None:
+async def test_invalid_chunks_are_errors(line: bytes) -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
         writer.write(HEAD % (b"multipart/mixed", b"Transfer-Encoding: chunked\r\n") + line)
@@ -178,7 +178,7 @@ async def test_chunks_that_are_none_are_told(line: bytes) -> None:
 @pytest.mark.parametrize(
     "before", [b"HTTP/1.1 100 Continue\r\n\r\nHTTP/1.1 200 OK", b"HTTP/1.0 206 Partial Content"]
 )
-async def test_other_first_lines_are_understood(before: bytes) -> None:
+async def test_other_first_lines_are_accepted(before: bytes) -> None:
     head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
     before += head[len(b"HTTP/1.1 200 OK") :]
     async with camera(before) as url, frames.open(url) as source:
@@ -225,18 +225,18 @@ BAD = {
     "bytes of nothing": (PARTED + b"x" * 3_000_000, "bytes came that belong to no picture"),
     "packed": (
         HEAD % (b"multipart/x-mixed-replace; boundary=b", b"Content-Encoding: gzip\r\n"),
-        "expected bytes as they are, got Content-Encoding: gzip",
+        "expected no encoding, got Content-Encoding: gzip",
     ),
     "nothing but beginnings": (b"HTTP/1.1 102 Processing\r\n\r\n" * 9, "102 Processing"),
     "not found": (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "404 Not Found"),
-    "no HTTP": (b"\xde\xad" * 100_000, "it gives no answer that can be understood"),
+    "no HTTP": (b"\xde\xad" * 100_000, "the answer is not readable"),
     "silence": (b"", "expected an answer, got none within 0.5 s"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-async def test_bad_web_camera_is_told_in_time(name: str) -> None:
-    data, said = BAD[name]
+async def test_bad_web_camera_is_reported_in_time(name: str) -> None:
+    data, message = BAD[name]
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
@@ -244,5 +244,5 @@ async def test_bad_web_camera_is_told_in_time(name: str) -> None:
         await reader.read()
 
     async with asyncio.timeout(20), served(serve) as port:
-        with pytest.raises(FrameSourceError, match=said):
+        with pytest.raises(FrameSourceError, match=message):
             await frames.open(f"http://127.0.0.1:{port}/#timeout=0.5").__aenter__()

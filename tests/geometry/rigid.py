@@ -1,4 +1,4 @@
-"""Strategies and makers of rigid motions, and what is compared with them."""
+"""Strategies and makers of rigid motions, and comparisons."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AXES = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)]
 """Normals at which careless formulas divide by zero."""
 
 FEW = settings(max_examples=max(1, settings().max_examples // 5))
-"""Examples of a property that takes long to judge: a fifth of the profile's."""
+"""Number of examples of a slow property: a fifth of the profile's."""
 
 lengths = st.floats(0.01, 10.0)
 angles = st.floats(-np.pi, np.pi)
@@ -36,7 +36,7 @@ angles = st.floats(-np.pi, np.pi)
 
 @contextmanager
 def refused(code: str, *texts: str) -> Iterator[None]:
-    """See that a calibration is refused with ``code``, and a text that holds ``texts``."""
+    """Check that a calibration is refused with ``code``, and a text that contains ``texts``."""
     with pytest.raises(CalibrationError) as caught:
         yield
     assert caught.value.code == code
@@ -57,7 +57,7 @@ def after(seconds: float) -> datetime:
 
 @st.composite
 def rotations(draw: st.DrawFn) -> NDArray[np.float64]:
-    """Any rotation; those that take z to one of the awkward normals often."""
+    """Any rotation, often one that turns z to an awkward normal."""
     normal = draw(
         st.one_of(
             st.sampled_from(AXES),
@@ -91,7 +91,7 @@ def transforms(draw: st.DrawFn, target: str = "base", source: str = "part") -> T
 
 
 def close(first: Transform, second: Transform, tolerance: float = 1e-12) -> bool:
-    """Return True if two transforms are the same one."""
+    """Return True if two transforms are equal."""
     return (
         (first.target, first.source, first.at) == (second.target, second.source, second.at)
         and np.allclose(first.rotation, second.rotation, rtol=0, atol=tolerance)
@@ -100,6 +100,6 @@ def close(first: Transform, second: Transform, tolerance: float = 1e-12) -> bool
 
 
 def localization(x: float, y: float, theta: float = 0.0, name: str = "part") -> Localization:
-    """Return what a camera says."""
+    """Return a localization as a camera reports it."""
     pose = Pose(Header(3, NOON, "camera"), Position(x, y), Quaternion.from_theta(theta))
     return Localization(name, 0.9, 1, pose)

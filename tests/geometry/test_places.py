@@ -1,4 +1,4 @@
-"""Patterns of places: where each place is, and touches that make none."""
+"""Patterns of places: each place's pose, and touches that are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FLAT = Transform("robot", "place", np.eye(3), np.array([0.4, -0.1, 0.02]))
 
 
 @given(transforms("robot", "place"))
-def test_pattern_of_three_touches_has_its_places_where_they_were(frame: Transform) -> None:
+def test_pattern_of_three_touches_has_the_touched_places(frame: Transform) -> None:
     corners = frame.apply([[0.0, 0, 0], [0.12, 0, 0], [0, 0.05, 0]])
     pattern = PlacePattern.from_touches(*corners, rows=2, columns=4, layers=3, height=0.01)
     assert len(pattern) == len(list(pattern)) == 24

@@ -59,7 +59,7 @@ def test_quaternion_from_matrix_gives_the_rotation_back(quaternion: rotations.Ar
     assert again[np.argmax(np.abs(again))] > 0
 
 
-def test_quaternion_from_matrix_of_many_equals_one_by_one() -> None:
+def test_quaternions_of_many_matrices_equal_those_of_each() -> None:
     quaternions = Rotation.from_quat(
         [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 4]]
     ).as_quat()
@@ -128,7 +128,7 @@ def test_right_jacobian_moves_the_exponential(length: float) -> None:
     )
 
 
-def test_rigid_one_after_another_maps_points_so() -> None:
+def test_product_of_motions_maps_points_in_order() -> None:
     first, second = MANY.taken(0), MANY.taken(1)
     points = RANDOM.normal(size=(5, 3))
     np.testing.assert_allclose(
@@ -142,7 +142,7 @@ def test_rigid_inverse_of_many_leads_back() -> None:
         np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=1e-12)
 
 
-def test_rigid_stacked_of_none_is_none() -> None:
+def test_stack_of_no_motions_is_empty() -> None:
     assert (Rigid.stacked([]).size, Rigid.stacked([IDENTITY]).size) == (0, 1)
 
 

@@ -1,4 +1,4 @@
-"""Frames: transforms that know their direction, and poses by their times."""
+"""Transforms, their directions, and poses by their times."""
 
 from __future__ import annotations
 

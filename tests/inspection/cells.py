@@ -1,4 +1,4 @@
-"""Cell files for tests, and pictures to inspect."""
+"""Cell files and pictures for tests."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def programs(folder: Path, *applications: str) -> dict[int, Program]:
 def inspected(
     folder: Path, application: str, picture: NDArray[Any], *, given: bytes = b""
 ) -> Inspection:
-    """Return what an application says about a picture."""
+    """Return an application's inspection of a picture."""
     (program,) = programs(folder, f"7: {application}").values()
     return program.inspect(picture, input=given)
 

@@ -1,4 +1,4 @@
-"""Codes as a camera would see them, drawn: module size, angle, blur, noise, perspective, dots."""
+"""Draw codes as in a camera's picture: module size, angle, blur, noise, perspective, dots."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 OVERSAMPLING = 4
-"""Samples of a pixel along each side."""
+"""Number of samples along each side of a pixel."""
 
 ROOM_PX = 24
-"""Pixels around a code on each side."""
+"""Width of the border around a code, pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """The way in which a camera sees a code.
+    """Size, pose and quality of a code in a picture.
 
     Attributes:
         px: pixels of a module.
@@ -58,7 +58,7 @@ def modules_of(kind: str, content: str | bytes) -> NDArray[np.bool_]:
 def draw_code(
     kind: str, content: str | bytes, look: Look, random: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return the picture of a code, (H, W), as :class:`Look` says; it lies between two pixels."""
+    """Return the picture (H, W) of a code as :class:`Look` describes, between two pixels."""
     dark = modules_of(kind, content)
     rows, columns = dark.shape
     to_picture = _to_picture(rows, columns, look, random)

@@ -21,13 +21,20 @@ from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection import Picture, Program, Teaching, load_cell
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
-from tests.inspection.inside import GS, MAX_REASON_BYTES, elements, eyes, failed_values, gs1
+from tests.inspection.inside import (
+    GS,
+    MAX_REASON_BYTES,
+    elements,
+    failed_values,
+    frame_inspector,
+    gs1,
+)
 
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection
 
-EYES = eyes
-"""The module that cuts reasons."""
+INSPECTOR = frame_inspector
+"""Module of the function that cuts reasons."""
 
 PROGRAMS = """
 cameras:
@@ -45,7 +52,7 @@ ODD: tuple[Any, ...] = (
     *(0, 1, -1, 255, 1 << 15, 1 << 31, 1 << 32, 1 << 64, 0.5, math.nan, math.inf, -math.inf),
     *("", "x", "\0", "a" * 100, "\u00fc" * 50, "\udc80", True, None, b"x", [], (1, 2)),
 )
-"""Values that a tool of somebody's may give."""
+"""Values that a user's tool may return."""
 
 
 def check_cell_file(data: bytes) -> None:
@@ -83,12 +90,12 @@ def check_teaching(name: str, number: int, program: Program) -> None:
 
 
 def first_element(text: str) -> tuple[tuple[str, str], ...]:
-    """Return no more than the first element: a mistake."""
+    """Return only the first element, as a planted mistake."""
     return gs1.elements(text)[:1]
 
 
 def check_gs1(data: bytes) -> None:
-    """Cut a text into elements: each is whole, and together they are the text."""
+    """Check that a text's elements are whole, and that joined they are the text."""
     text = text_of(data)
     found = elements(text)
     assert "".join(one + other for one, other in found).replace(GS, "") == text.replace(GS, "")
@@ -114,7 +121,7 @@ def inspections() -> tuple[tuple[Program, Inspection], ...]:
 
 
 def check_program_result(data: bytes) -> None:
-    """Build containers of odd values: bytes that can be read, or a typed error."""
+    """Check that containers of odd values are readable, or a typed error."""
     choices = Choices(data)
     program, seen = choices.pick(inspections())
     values = dict(seen.values)

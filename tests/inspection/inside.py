@@ -1,9 +1,9 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam.inspection._camera import eyes
-from smartcam.inspection._camera.eyes import failed_values
+from smartcam.inspection._camera import frame_inspector
+from smartcam.inspection._camera.frame_inspector import failed_values
 from smartcam.inspection._measure.edges import (
     Choice,
     Edge,

@@ -1,4 +1,4 @@
-"""A part as a camera sees it, drawn exactly: a plate with two straight sides, and a hole."""
+"""An exactly drawn part for measuring: a plate with two straight sides, and a hole."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from smartcam.inspection import Program, load_cell
 from tests.inspection.rendering import Array, disc, half_plane, photographed, pixel_means
 
 WIDE = 92.4
-"""Pixels from one side of the plate to the other one."""
+"""Width of the plate, pixels."""
 
 HOLE, RADIUS = np.array([8.3, 4.6]), 21.7
 """Centre of the hole from the plate's middle, along and across it, and its radius; pixels."""
 
 SIZE = (240, 220)
-"""Rows and columns."""
+"""Rows and columns of a picture."""
 
 
 def plate(
@@ -29,7 +29,7 @@ def plate(
     seed: int = 1,
     bits: int = 8,
 ) -> Any:
-    """Return the picture of a bright plate with a dark hole, turned clockwise as people see it."""
+    """Return the picture of a bright plate with a dark hole, turned clockwise."""
     ahead = np.array([math.cos(turn), math.sin(turn)])
     at = np.array(middle)
 
@@ -52,7 +52,7 @@ def plate(
 
 
 def program(folder: Path, measure: str, before: str = "", more: str = "") -> Program:
-    """Return the program of one `measure`, as a cell file says it."""
+    """Return the program of one `measure` entry of a cell file."""
     path = folder / "cell.yaml"
     path.write_text(
         f"cameras:\n  cam:\n    software:\n      frames: .\n{more}      applications:\n"

@@ -1,4 +1,4 @@
-"""A source of frames that a test has in hand, and a tool that it can hold up."""
+"""A source of frames that a test controls, and a tool that a test can block."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MONO = find_format("Mono8")
 
 
 class Desk:
-    """A scene in front of a camera, and the camera's cable.
+    """A controlled camera: its scene and its cable.
 
     Attributes:
         level: grey level of the next pictures.
@@ -69,13 +69,13 @@ class Desk:
         )
 
     def unplug(self) -> None:
-        """Pull the cable out."""
+        """Unplug the cable."""
         self.plugged = False
         if self.sink is not None:
             self.sink.ended(FrameSourceError("the cable is out", source=self.url))
 
     def plug(self) -> None:
-        """Put it in again."""
+        """Plug the cable in again."""
         self.plugged = True
 
 
@@ -121,7 +121,7 @@ FRAMES.register("desk", DeskDriver)
 
 
 class Gate:
-    """Holds tools up until it is opened.
+    """A gate that blocks tools until it is opened.
 
     Attributes:
         reached: number of tools that came to it.
@@ -135,7 +135,7 @@ class Gate:
         self.reached = 0
 
     def has(self, reached: int) -> bool:
-        """Return whether so many tools came to it."""
+        """Return whether ``count`` tools have reached the gate."""
         return self.reached == reached
 
     def pass_through(self) -> None:
@@ -145,7 +145,7 @@ class Gate:
 
 
 class LevelSettings(ToolSettings):
-    """The range of brightness."""
+    """Allowed range of brightness."""
 
     most: int = Field(255, description="the brightest that is good")
     gate: str | None = Field(None, description="the gate to wait at")
@@ -153,7 +153,7 @@ class LevelSettings(ToolSettings):
 
 
 class Level(Tool[LevelSettings]):
-    """The grey level of the first pixel, the input data, and a right angle."""
+    """A tool that returns the first pixel's grey level, the input data, and a right angle."""
 
     settings_model = LevelSettings
 
@@ -190,7 +190,7 @@ cameras:
 
 
 def cell_of(folder: Path, desk: Desk, more: str = "") -> Path:
-    """Write the cell file of a camera at a desk, and return its path."""
+    """Write the cell file of the controlled camera, and return its path."""
     path = folder / "cell.yaml"
     path.write_text(CELL.format(url=desk.url, more=f"\n      {more}" if more else ""))
     return path

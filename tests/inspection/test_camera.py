@@ -1,4 +1,4 @@
-"""Software cameras: a source of frames and programs, seen by clients as any smart camera is."""
+"""Software cameras: programs on a source of frames, used by clients as a smart camera."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def cell(tmp_path: Path, desk: Desk) -> Path:
 
 @contextlib.asynccontextmanager
 async def opened(cell: Path, **options: Any) -> AsyncIterator[SoftwareCamera[Any]]:
-    """Give a software camera in this process."""
+    """Open a software camera in this process."""
     async with smartcam.connect(f"software:{cell}#line1/cam1", **{**LIMITS, **options}) as camera:
         assert isinstance(camera, SoftwareCamera)
         yield camera
@@ -179,7 +179,7 @@ async def test_a_lost_source_is_a_system_error_until_it_is_back(cell: Path, desk
         assert (await triggered(camera)).level == 77
 
 
-async def test_a_source_that_is_lost_under_a_trigger_ends_it(cell: Path, desk: Desk) -> None:
+async def test_source_lost_during_a_trigger_ends_the_trigger(cell: Path, desk: Desk) -> None:
     async with opened(cell) as camera:
         desk.streams = False
         trigger = asyncio.ensure_future(triggered(camera))
@@ -189,9 +189,7 @@ async def test_a_source_that_is_lost_under_a_trigger_ends_it(cell: Path, desk: D
             await trigger
 
 
-async def test_a_source_that_is_not_there_yet_is_a_system_error_and_then_seen(
-    cell: Path, desk: Desk
-) -> None:
+async def test_missing_source_is_a_system_error_until_it_comes(cell: Path, desk: Desk) -> None:
     desk.unplug()
     async with opened(cell) as camera:
         assert camera.status & Status.SYSTEM_ERROR
@@ -248,7 +246,7 @@ async def test_a_cancelled_trigger_leaves_a_working_camera(
         assert (await triggered(camera)).level == 2
 
 
-async def test_a_tool_with_a_fault_gives_a_result_that_is_not_ok_and_says_so(cell: Path) -> None:
+async def test_faulty_tool_gives_a_result_that_is_not_ok_with_a_reason(cell: Path) -> None:
     async with opened(cell, application=20) as camera:
         found = await triggered(camera)
         assert not found.ok
@@ -258,7 +256,9 @@ async def test_a_tool_with_a_fault_gives_a_result_that_is_not_ok_and_says_so(cel
 
 def inspector_of(device: SoftwareDevice) -> Inspector:
     emulated: Any = device.emulator.device
-    return device.eyes if isinstance(device.emulator, EmulatedCamera) else emulated.job.inspector
+    return (
+        device.inspector if isinstance(device.emulator, EmulatedCamera) else emulated.job.inspector
+    )
 
 
 @pytest.mark.parametrize("protocol", ["bvs", "insight"])
@@ -288,7 +288,7 @@ async def test_a_fault_with_a_text_that_no_result_can_hold_ends_its_run(
 async def test_values_that_cannot_be_built_end_their_run_without_a_result(
     cell: Path, monkeypatch: pytest.MonkeyPatch, protocol: str
 ) -> None:
-    where = "eyes.failed_values" if protocol == "bvs" else "device._as_mapping"
+    where = "frame_inspector.failed_values" if protocol == "bvs" else "device._as_mapping"
     monkeypatch.setattr(f"smartcam.inspection._camera.{where}", lambda *_: 1 / 0)
     device = SoftwareDevice(load_cell(cell)["line1/cam1"], protocol=protocol)
     async with device:
@@ -301,7 +301,7 @@ async def test_values_that_cannot_be_built_end_their_run_without_a_result(
 async def test_tools_that_do_not_end_give_a_result_and_keep_no_later_trigger(
     cell: Path, desk: Desk, gate: Gate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.inspection._camera.eyes.TOOLS_TIMEOUT", 0.3)
+    monkeypatch.setattr("smartcam.inspection._camera.frame_inspector.TOOLS_TIMEOUT", 0.3)
     async with opened(cell, application=12) as camera:
         found = await triggered(camera)
         assert not found.ok
@@ -312,7 +312,7 @@ async def test_tools_that_do_not_end_give_a_result_and_keep_no_later_trigger(
         gate.open.set()
 
 
-async def test_a_run_that_was_given_up_keeps_no_later_one_while_its_tool_goes_on(
+async def test_cancelled_run_with_a_working_tool_does_not_delay_later_runs(
     cell: Path, desk: Desk, gate: Gate
 ) -> None:
     async with stopped_run(cell, gate) as camera:
@@ -326,18 +326,18 @@ async def test_a_run_that_was_given_up_keeps_no_later_one_while_its_tool_goes_on
 async def test_given_up_tools_have_a_bounded_number_of_threads(
     cell: Path, gate: Gate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.inspection._camera.eyes.MAX_HUNG_THREADS", 2)
+    monkeypatch.setattr("smartcam.inspection._camera.frame_inspector.MAX_HUNG_THREADS", 2)
     device = SoftwareDevice(load_cell(cell)["line1/cam1"])
     async with device:
-        eyes = device.eyes
+        inspector = device.inspector
         for number in range(5):
             seen = asyncio.Event()
-            eyes.begin(InspectionOrder(12, number, b""), seen.set, lambda _: None)
+            inspector.begin(InspectionOrder(12, number, b""), seen.set, lambda _: None)
             await seen.wait()
             await until(partial(gate.has, min(number + 1, 3)))
         gate.open.set()
         ended: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        eyes.begin(InspectionOrder(7, 5, b""), lambda: None, ended.set_result)
+        inspector.begin(InspectionOrder(7, 5, b""), lambda: None, ended.set_result)
         async with asyncio.timeout(PATIENCE):
             assert (await ended)["ok"]
         assert gate.reached == 3  # the others were cancelled before they began
@@ -439,7 +439,7 @@ async def test_the_picture_that_was_judged_can_be_read_with_its_result(
         *(("Mono12", 0x234, 0x2342), ("Mono12", 4095, 0xFFFF), ("Mono16", 0x1234, 0x1234)),
     ],
 )
-async def test_a_picture_of_more_bits_is_read_from_its_file_as_bright_as_it_was_judged(
+async def test_picture_of_more_bits_keeps_its_brightness_in_its_file(
     tmp_path: Path, desk: Desk, name: str, level: int, kept: int
 ) -> None:
     desk.format, desk.level = find_format(name), level
@@ -453,7 +453,7 @@ async def test_a_picture_of_more_bits_is_read_from_its_file_as_bright_as_it_was_
     assert (picture.levels == kept).all()  # white is white to what asks whether it is cut off
 
 
-async def test_a_picture_that_is_not_made_in_time_is_a_typed_error(cell: Path) -> None:
+async def test_picture_not_made_in_time_is_a_typed_error(cell: Path) -> None:
     async with opened(cell) as camera:
         await triggered(camera)
         for read in (camera.read_image, camera.read_drawn_image):
@@ -461,7 +461,7 @@ async def test_a_picture_that_is_not_made_in_time_is_a_typed_error(cell: Path) -
                 await read(timeout=1e-9)
 
 
-async def test_bad_pictures_are_kept_with_what_was_said_and_the_oldest_make_room(
+async def test_bad_pictures_are_kept_with_findings_and_the_oldest_are_deleted(
     tmp_path: Path, desk: Desk
 ) -> None:
     cv2: Any = pytest.importorskip("cv2")
@@ -538,7 +538,7 @@ async def test_closing_amid_an_inspection_ends_everything(
     assert desk.sink is None
 
 
-async def test_opening_that_is_cancelled_gives_the_source_back(cell: Path, desk: Desk) -> None:
+async def test_cancelled_opening_closes_the_source(cell: Path, desk: Desk) -> None:
     desk.streams = False
     camera = smartcam.connect(f"software:{cell}")
     opening = asyncio.ensure_future(camera.open())
@@ -558,12 +558,12 @@ async def test_opening_that_is_cancelled_gives_the_source_back(cell: Path, desk:
         ("software:{cell}.not", "cannot be read|No such file|not found|does not exist"),
     ],
 )
-def test_a_wrong_address_says_what_there_is(cell: Path, address: str, said: str) -> None:
+def test_wrong_address_is_refused_with_known_cameras(cell: Path, address: str, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         smartcam.connect(address.format(cell=cell))
 
 
-def test_an_address_of_the_process_is_none_on_the_wire(cell: Path) -> None:
+def test_software_address_is_no_network_address(cell: Path) -> None:
     with pytest.raises(UnsupportedError, match="smartcam-emulator --program"):
         smartcam.settings.parse_address(f"software:{cell}")
 
@@ -586,7 +586,7 @@ async def test_a_damaged_picture_is_lost_and_any_other_fault_ends_the_pictures(
     async with (
         device,
         smartcam.connect(device.url, application=7, **LIMITS) as camera,
-        judged_source(device.eyes, drawn=True) as source,
+        judged_source(device.inspector, drawn=True) as source,
         source.reader(timeout=PATIENCE) as reader,
     ):
         await camera.trigger(timeout=PATIENCE)
@@ -666,11 +666,11 @@ async def test_an_insight_client_reads_cells_and_the_judged_picture(cell: Path, 
             desk.level = 22
             assert (await triggered(camera)).level == 22
             desk.unplug()
-            await until(lambda: device.eyes.trouble)
+            await until(lambda: device.inspector.trouble)
             with pytest.raises(smartcam.SmartCamError):
                 await triggered(camera)
             desk.plug()
-            await until(lambda: not device.eyes.trouble)
+            await until(lambda: not device.inspector.trouble)
             assert (await triggered(camera)).level == 22
 
 
@@ -683,7 +683,7 @@ async def test_a_second_client_takes_the_camera_over(cell: Path, desk: Desk) -> 
             await until(lambda: not first.connected)
 
 
-async def test_a_port_that_is_taken_gives_the_source_back(cell: Path, desk: Desk) -> None:
+async def test_occupied_port_closes_the_source(cell: Path, desk: Desk) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,4 @@
-"""Software cameras before the judge of cameras: each check holds in every dialect."""
+"""Run the judge of cameras on software cameras: each check holds in every dialect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture that was judged: with its result in the process, in recordings and their replays."""
+"""Pictures with their results: in the process, in recordings and in replays."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LIMITS: dict[str, Any] = {
 
 
 class Pictures(Observer):
-    """Notes the pictures that come with results, and the order of both."""
+    """Record pictures and results in their order."""
 
     def __init__(self) -> None:
         self.pictures: dict[int, Frame] = {}
@@ -80,9 +80,7 @@ async def test_each_of_equal_results_has_its_own_picture_in_a_recording(
         assert np.array_equal(one.picture.array(), frame.array())
 
 
-async def test_a_replay_gives_the_results_whose_pictures_the_recording_has(
-    tmp_path: Path, desk: Desk
-) -> None:
+async def test_replay_gives_results_from_recorded_pictures(tmp_path: Path, desk: Desk) -> None:
     file = tmp_path / "run.mcap"
     with Recorder(file) as recorder:
         async with opened(cell_of(tmp_path, desk), recorder) as camera:
@@ -109,7 +107,7 @@ async def test_a_recorder_that_shall_have_no_pictures_has_none(tmp_path: Path, d
     assert (recorder.counts.results, recorder.counts.pictures) == (1, 0)
 
 
-async def test_results_of_a_free_run_keep_their_pictures_whoever_listened_before(
+async def test_results_of_a_free_run_keep_their_pictures_after_earlier_sessions(
     tmp_path: Path, desk: Desk
 ) -> None:
     path = cell_of(tmp_path, desk)

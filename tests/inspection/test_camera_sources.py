@@ -1,4 +1,4 @@
-"""The three doors of a software camera, and pictures in files as what it looks at."""
+"""Software cameras in a process, a fleet and a command, with pictures from files."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ async def test_pictures_of_other_sizes_and_kinds_in_a_folder_have_their_turn(
         assert found == [10, 20, 7, 15, 10]
 
 
-async def test_a_damaged_picture_in_a_folder_is_one_system_error_and_the_others_have_their_turn(
+async def test_damaged_picture_in_a_folder_is_one_system_error(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("av")
@@ -107,7 +107,7 @@ async def test_a_free_run_goes_round_a_folder_in_order(tmp_path: Path) -> None:
     assert levels == [10 * (1 + (begin + n) % 3) for n in range(6)]
 
 
-async def test_a_picture_that_is_none_is_a_system_error_not_a_result(tmp_path: Path) -> None:
+async def test_unreadable_picture_is_a_system_error_not_a_result(tmp_path: Path) -> None:
     pytest.importorskip("av")
     write_pictures(tmp_path / "shots", [10])
     (tmp_path / "shots" / "part2.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
@@ -125,7 +125,7 @@ async def test_a_picture_that_is_none_is_a_system_error_not_a_result(tmp_path: P
 # ---------------------------------------------------------------------- in a fleet
 
 
-async def test_a_fleet_shares_it_with_typed_results_and_the_judged_pictures(
+async def test_fleet_shares_a_software_camera_with_typed_results_and_pictures(
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("zenoh")
@@ -167,7 +167,7 @@ def write_located(folder: Path) -> Path:
 
 
 def outlined(pixels: NDArray[Any]) -> bool:
-    """Return whether the part's edges are drawn over in green, halfway along three of them."""
+    """Return whether the middles of three of the part's edges are drawn over in green."""
     whole = pixels.astype(int)
     green = whole[:, :, 1] - whole[:, :, 0] > 40
     return all(
@@ -216,7 +216,7 @@ async def test_outlines_of_located_parts_are_in_a_fleets_frames(tmp_path: Path) 
         ({}, "expected one of url, emulated, software; got none of them"),
     ],
 )
-def test_a_fleet_file_says_what_is_wrong_with_it(
+def test_mistake_in_a_fleet_file_is_reported(
     tmp_path: Path, entry: dict[str, Any], said: str
 ) -> None:
     pytest.importorskip("yaml")
@@ -229,7 +229,7 @@ def test_a_fleet_file_says_what_is_wrong_with_it(
 # ---------------------------------------------------------------------- by the command
 
 
-async def test_the_command_serves_it_until_it_is_ended(tmp_path: Path) -> None:
+async def test_command_serves_a_software_camera_until_ended(tmp_path: Path) -> None:
     pytest.importorskip("click")
     pytest.importorskip("yaml")
     path = tmp_path / "cell.yaml"
@@ -265,7 +265,7 @@ cameras:
 # ---------------------------------------------------------------------- on a page
 
 
-async def test_the_live_page_gets_the_judged_picture_with_what_the_tools_saw(
+async def test_live_page_shows_the_picture_with_the_tools_marks(
     tmp_path: Path,
 ) -> None:
     aiohttp: Any = pytest.importorskip("aiohttp")

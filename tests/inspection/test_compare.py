@@ -1,4 +1,4 @@
-"""The tool `compare`: where a region differs from a taught picture, and what is no difference."""
+"""The tool `compare`: differences from a taught picture, and changes that are none."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_light_that_may_not_change_is_a_difference(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (2, -1), (-3, 3), (0.5, 0.5), (1.4, -2.6)])
-def test_label_beside_its_place_is_ok_and_the_shift_is_told(
+def test_shifted_label_is_ok_and_the_shift_is_reported(
     tmp_path: Path, shift: tuple[float, float]
 ) -> None:
     found = compared(tmp_path, noisy(moved(*shift)))
@@ -68,14 +68,14 @@ def test_label_beside_its_place_is_ok_and_the_shift_is_told(
     assert abs(found.value.shift_y - shift[1]) <= 0.75
 
 
-def test_missing_label_is_told(tmp_path: Path) -> None:
+def test_missing_label_is_a_difference(tmp_path: Path) -> None:
     found = compared(tmp_path, noisy(np.full((100, 200), 90, np.uint8)))
     assert not found.ok
     assert found.value.differing > 3000
     assert found.reason == f"{found.value.differing} pixels differ, allowed 0"
 
 
-def test_missing_label_of_low_contrast_is_told(tmp_path: Path) -> None:
+def test_missing_label_of_low_contrast_is_a_difference(tmp_path: Path) -> None:
     faint = label()
     faint[faint == 220] = 150
     cv2.imwrite(str(tmp_path / "faint.png"), faint)
@@ -109,7 +109,7 @@ def test_print_that_the_light_hides_is_not_ok(
         assert reason in found.reason
 
 
-def test_dark_print_on_paper_that_is_over_exposed_is_judged(tmp_path: Path) -> None:
+def test_dark_print_on_over_exposed_paper_is_judged(tmp_path: Path) -> None:
     bright = label() * 1.25
     assert bright.max() > 255
     found = compared(tmp_path, noisy(bright))
@@ -118,7 +118,7 @@ def test_dark_print_on_paper_that_is_over_exposed_is_judged(tmp_path: Path) -> N
     assert not compared(tmp_path, noisy(bright)).ok
 
 
-def test_damage_is_told_with_its_place(tmp_path: Path) -> None:
+def test_damage_is_a_difference_with_its_place(tmp_path: Path) -> None:
     torn = label()
     torn[60:74, 130:152] = 90
     found = compared(tmp_path, noisy(torn))
@@ -130,7 +130,7 @@ def test_damage_is_told_with_its_place(tmp_path: Path) -> None:
     assert compared(tmp_path, noisy(torn), ", allowed: 500").ok
 
 
-def test_wrong_text_is_told(tmp_path: Path) -> None:
+def test_wrong_text_is_a_difference(tmp_path: Path) -> None:
     other = label()
     other[34:62, 54:148] = 220
     cv2.putText(other, "LOT 41", (56, 58), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 20, 2, cv2.LINE_AA)
@@ -157,7 +157,7 @@ def test_region_alone_can_be_taught_and_follows_a_turned_part(tmp_path: Path) ->
     assert not inspected(tmp_path, cell, noisy(spoiled)).ok
 
 
-def test_picture_of_another_size_is_told(tmp_path: Path) -> None:
+def test_picture_of_another_size_has_a_reason(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "good.png"), label())
     found = inspected(tmp_path, "{compare: {taught: good.png}}", label()[:90])
     assert (found.ok, found.reason) == (
@@ -183,7 +183,7 @@ def test_region_that_cannot_be_compared_is_refused(
         programs(tmp_path, f"7: {{compare: {{taught: good.png, {settings}}}}}")
 
 
-def test_what_follows_needs_a_region(tmp_path: Path) -> None:
+def test_compare_needs_a_region_to_follow(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "good.png"), label())
     tools = "present: {grey: [0, 40]}, compare: {taught: good.png, follow: present}"
     with pytest.raises(ConfigurationError, match="compare: expected a region"):

@@ -1,4 +1,4 @@
-"""The process of a software camera, of its agent or of its source is killed while it is used."""
+"""Kill the process of a software camera, its agent or its source during use."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def cell_of(folder: Path, frames: str, more: str = "") -> Path:
 
 @contextlib.asynccontextmanager
 async def running(*command: str) -> AsyncIterator[Process]:
-    """Run a command until it has said a line."""
+    """Start a command, and wait for a line of its output."""
     with await asyncio.to_thread(Process, *command) as process:
         await asyncio.to_thread(process.read_until, b"\n")
         yield process
@@ -71,7 +71,7 @@ async def killed(process: Process) -> None:
 
 
 async def under_way(camera: smartcam.Camera[Any]) -> asyncio.Task[Any]:
-    """Return a trigger whose picture is still to come."""
+    """Return a trigger that waits for its picture."""
     trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
     await camera.wait_status(
         lambda status: not status & Status.WAITING_FOR_TRIGGER, timeout=PATIENCE
@@ -80,7 +80,7 @@ async def under_way(camera: smartcam.Camera[Any]) -> asyncio.Task[Any]:
 
 
 async def refused(error: type[Exception], *calls: Callable[[], Coroutine[Any, Any, Any]]) -> None:
-    """See that each call ends at once with an error."""
+    """Check that each call ends at once with an error."""
     for call in calls:
         async with asyncio.timeout(PATIENCE):
             with pytest.raises(error):

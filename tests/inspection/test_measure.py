@@ -64,7 +64,7 @@ def test_width_in_16_bits_is_the_same(tmp_path: Path) -> None:
     assert abs(found.values["width"] - WIDE) < 4 * found.values["sigma"] < 0.2
 
 
-def test_width_outside_of_its_tolerance_says_so(tmp_path: Path) -> None:
+def test_width_outside_of_its_tolerance_has_a_reason(tmp_path: Path) -> None:
     found = inspected(tmp_path, f"{{width: {ACROSS}, tolerance: 92.00 +- 0.10 px}}")
     assert not found.ok
     assert "px is above 92.10" in found.reason
@@ -90,7 +90,7 @@ def test_circle_gives_its_diameter_and_centre(tmp_path: Path) -> None:
     assert (found.values["edges"], found.values["left_out"]) == (24, 0)
 
 
-def test_scratch_across_a_circle_is_told_and_does_not_count(tmp_path: Path) -> None:
+def test_scratch_across_a_circle_is_an_outlier(tmp_path: Path) -> None:
     picture = plate()
     picture[97:107, 110:124] = 30  # over the hole's rim, at the top
     found = inspected(tmp_path, CIRCLE, picture)
@@ -140,7 +140,7 @@ def test_place_of_an_edge_counts_from_the_start_of_its_strip(tmp_path: Path) -> 
 PLATE = "present: {grey: [90, 255], area: [4000, 60000]}, "
 
 
-def test_measuring_follows_what_an_earlier_tool_found(tmp_path: Path) -> None:
+def test_measurement_follows_an_earlier_tool(tmp_path: Path) -> None:
     width_of_plate = "{follow: present, width: {across: [[45, -66], [45, 66]], strip: 8}}"
     one = program(tmp_path, width_of_plate, PLATE)
     for middle, degrees in (((110.2, 118.7), 4.0), ((104.6, 112.1), -9.0)):
@@ -149,7 +149,7 @@ def test_measuring_follows_what_an_earlier_tool_found(tmp_path: Path) -> None:
         assert found.values["measure_width"] == pytest.approx(WIDE, abs=0.15)
 
 
-def test_nothing_is_measured_where_the_earlier_tool_found_nothing(tmp_path: Path) -> None:
+def test_measurement_needs_the_finding_it_follows(tmp_path: Path) -> None:
     dark = np.full((240, 220), 20, dtype=np.uint8)
     found = program(tmp_path, f"{{follow: present, width: {ACROSS}}}", PLATE).inspect(dark)
     assert not found.findings["measure"].ok
@@ -165,7 +165,9 @@ def test_nothing_is_measured_where_the_earlier_tool_found_nothing(tmp_path: Path
         (CIRCLE, NoValueReason.NO_EDGE, "no edge"),
     ],
 )
-def test_empty_picture_is_told(tmp_path: Path, measure: str, why: NoValueReason, said: str) -> None:
+def test_empty_picture_has_a_reason(
+    tmp_path: Path, measure: str, why: NoValueReason, said: str
+) -> None:
     flat = np.full((240, 220), 90, dtype=np.uint8)
     found = inspected(tmp_path, measure, flat)
     assert not found.ok
@@ -174,13 +176,13 @@ def test_empty_picture_is_told(tmp_path: Path, measure: str, why: NoValueReason,
     assert math.isnan(found.findings["measure"].details.value)
 
 
-def test_two_edges_where_one_was_expected_are_told(tmp_path: Path) -> None:
+def test_two_edges_instead_of_one_have_a_reason(tmp_path: Path) -> None:
     found = inspected(tmp_path, f"{{edge: {ACROSS}}}")
     assert found.findings["measure"].details.trouble is NoValueReason.TWO_EDGES
     assert math.isnan(found.value.place)
 
 
-def test_saturated_picture_is_told(tmp_path: Path) -> None:
+def test_saturated_picture_has_a_reason(tmp_path: Path) -> None:
     bright = np.minimum(plate().astype(int) * 2, 255).astype(np.uint8)
     found = inspected(tmp_path, WIDTH, bright)
     assert found.findings["measure"].details.trouble is NoValueReason.SATURATED
@@ -192,7 +194,7 @@ def test_colour_picture_is_measured_by_its_brightness(tmp_path: Path) -> None:
     assert found.values["width"] == pytest.approx(WIDE, abs=0.1)
 
 
-def test_colour_that_is_cut_off_is_told_unless_it_is_allowed(tmp_path: Path) -> None:
+def test_saturated_colour_has_a_reason_unless_allowed(tmp_path: Path) -> None:
     colour = np.repeat(plate()[:, :, None], 3, axis=2)
     colour[:, :, 0] = np.minimum(colour[:, :, 0].astype(int) * 2, 255)
     found = inspected(tmp_path, WIDTH, colour)
@@ -203,7 +205,7 @@ def test_colour_that_is_cut_off_is_told_unless_it_is_allowed(tmp_path: Path) -> 
 
 
 def limited(least: float, most: float, bits: int = 8, noise: float = 0.3) -> Any:
-    """Return a plate of so little noise that pixels of one level are nearly equal, in video range.
+    """Return a plate with very little noise, in video range.
 
     ``least``, ``most``: levels of 8 bits of the dark and the bright side, before they are cut off.
     """
@@ -222,7 +224,7 @@ def limited(least: float, most: float, bits: int = 8, noise: float = 0.3) -> Any
     ("least", "most", "end"),
     [(-10, 200, "black"), (60, 260, "white"), (14, 180, "black"), (60, 200, ""), (17.5, 233, "")],
 )
-def test_levels_that_video_cuts_off_are_told(
+def test_levels_saturated_by_video_range_have_a_reason(
     tmp_path: Path, least: float, most: float, end: str, bits: int
 ) -> None:
     found = inspected(tmp_path, WIDTH, limited(least, most, bits))
@@ -234,7 +236,7 @@ def test_levels_that_video_cuts_off_are_told(
         assert abs(details.value - WIDE) < 4 * details.sigma
 
 
-def test_one_colour_that_is_cut_off_is_told_in_every_kind_of_frame(tmp_path: Path) -> None:
+def test_one_saturated_colour_has_a_reason_in_every_kind_of_frame(tmp_path: Path) -> None:
     red = np.minimum(1.6 * limited(20, 200), 255)
     colours = np.stack([red, limited(20, 120), limited(20, 90)], axis=2).round().astype(np.uint8)
     y, u, v = (
@@ -271,7 +273,7 @@ def test_one_colour_that_is_cut_off_is_told_in_every_kind_of_frame(tmp_path: Pat
         assert found.findings["measure"].details.trouble is NoValueReason.SATURATED, name
 
 
-def test_colour_that_would_be_less_than_nothing_is_told(tmp_path: Path) -> None:
+def test_colour_clipped_at_zero_has_a_reason(tmp_path: Path) -> None:
     colours = np.stack([limited(20, 200), limited(20, 90), limited(20, 60)], axis=2)
     assert inspected(tmp_path, WIDTH, colours).findings["measure"].details.trouble is None
     colours[:, :, 2] = np.where(colours[:, :, 0] > 180, 0, colours[:, :, 2])
@@ -279,7 +281,7 @@ def test_colour_that_would_be_less_than_nothing_is_told(tmp_path: Path) -> None:
     assert found.findings["measure"].details.trouble is NoValueReason.SATURATED
 
 
-def test_picture_of_another_size_is_told_rather_than_measured_elsewhere(tmp_path: Path) -> None:
+def test_picture_of_another_size_is_not_measured(tmp_path: Path) -> None:
     found = inspected(tmp_path, WIDTH, plate()[:100, :100])
     assert found.findings["measure"].details.trouble is NoValueReason.OUTSIDE
 
@@ -313,7 +315,7 @@ def test_drawings_show_edges_regions_and_the_value(tmp_path: Path) -> None:
         ("{width: {across: [[1, 1], [9, 1]], which: nearest}}", "outermost"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(tmp_path: Path, measure: str, said: str) -> None:
+def test_wrong_settings_are_refused(tmp_path: Path, measure: str, said: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         program(tmp_path, measure)
     assert said in str(caught.value)
@@ -324,7 +326,7 @@ def test_settings_that_cannot_work_are_refused(tmp_path: Path, measure: str, sai
 
 
 def tilted(pixels: Any) -> Any:
-    """Return robot's points (N, 3), metres, of pixels, as a tilted camera without a lens sees."""
+    """Return the robot's points (N, 3), metres, of pixels of a tilted camera without distortion."""
     at = np.column_stack([pixels, np.ones(len(pixels))])
     matrix = np.array([[1e-4, 8e-6, 0.2], [6e-6, -1.05e-4, 0.4], [1e-5, 2e-5, 1.0]])
     mapped = at @ matrix.T
@@ -341,7 +343,7 @@ def plane(seed: int, sigma: float = 2e-4) -> Any:
 
 
 def exact_pair() -> tuple[FoundPoint, FoundPoint]:
-    """Return two edges whose places are known exactly."""
+    """Return two edges with exact places."""
     strip = strip_between(ENDS[0], ENDS[1], 9.0)
     nothing = 1e-12 * np.eye(2)
     return tuple(  # type: ignore[return-value]
@@ -364,7 +366,7 @@ def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> Non
     assert true.value == pytest.approx(1e3 * float(np.linalg.norm(ends[1] - ends[0])), rel=1e-2)
 
 
-def test_calibration_without_a_known_error_adds_none_and_says_so() -> None:
+def test_calibration_without_a_known_error_is_remarked() -> None:
     found = fit_plane(GRID[[0, 2, 6]], tilted(GRID)[[0, 2, 6]], model="affine")
     assert found.touch_sigma is None
     assert plane_of(found).remark == "sigma is without the touches' error, which nothing tells"
@@ -385,7 +387,7 @@ def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
     assert in_picture.excess > 3.0 or not in_picture.kept.all()
 
 
-def test_lengths_on_a_sheet_are_those_on_paper() -> None:
+def test_lengths_on_a_sheet_match_the_paper() -> None:
     calibration = calibrate_sheet(seen(sigma=0.05), touched(SIGMA), camera=CAMERA)
     flat = plane_of(calibration)
     pixels = CAMERA.project(TARGET.points[[0, 8]] @ SEEN.rotation.T + SEEN.translation)
@@ -394,7 +396,7 @@ def test_lengths_on_a_sheet_are_those_on_paper() -> None:
 
 
 def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
-    """Return the distance of two pixels, known exactly, in a plane."""
+    """Return the distance of two exact pixels in a plane."""
     strip = strip_between(pixels[0], pixels[1], 9.0)
     nothing = 1e-12 * np.eye(2)
     ends = [
@@ -405,7 +407,7 @@ def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
 
 
 def wrong_lens(off: Any) -> CameraModel:
-    """Return the camera with fx, fy, cx, cy and coefficients that are off by so much (9,)."""
+    """Return the camera with errors (9,) of fx, fy, cx, cy and coefficients."""
     shift = np.array([[off[0], 0.0, off[2]], [0.0, off[1], off[3]], [0.0, 0.0, 0.0]])
     return replace(CAMERA, matrix=CAMERA.matrix + shift, distortion=CAMERA.distortion + off[4:])
 
@@ -427,7 +429,7 @@ FAR, ACROSS_ALL = [[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.
 def test_sigma_on_a_sheet_has_the_lens_error_in_it(
     pixels: Any, number: int, least: float, most: float
 ) -> None:
-    """Calibrations by lenses that are as wrong as their covariance says; chance does 7 % of 100."""
+    """Compare sigmas with the scatter of lenses drawn from the covariance, within 7 % of chance."""
     spread = np.array([1.5, 1.5, 1.0, 1.0, 3e-3, 5e-3, 1e-4, 1e-4, 0.0])
     mixed = np.eye(9)
     mixed[0, 1] = mixed[1, 0] = 0.9  # of the focal lengths
@@ -456,7 +458,7 @@ def test_sigma_on_a_sheet_has_the_lens_error_in_it(
     assert without[0] < 0.5 * observed
 
 
-def test_place_beyond_the_calibrated_plane_is_told() -> None:
+def test_place_beyond_the_calibrated_plane_has_a_reason() -> None:
     calibration = calibrate_sheet(seen(), touched(), camera=CAMERA)
     with pytest.raises(NotMeasuredError) as caught:
         plane_of(calibration).points(np.array([[-50.0, 10.0]]))

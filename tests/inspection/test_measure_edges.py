@@ -1,4 +1,4 @@
-"""Edges: what is found, and what is refused rather than measured wrong."""
+"""Edges: accurate places, and errors instead of wrong measurements."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ V, U = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
 
 
 def edge_at(place: float, blur: float = 0.8, turned: float = 0.0) -> Array:
-    """Return the shares of light behind an edge at a place along the strip."""
+    """Return the shares of light after an edge at a place along the strip."""
     x, y = MIDDLE + place * AHEAD
     return pixel_means(SHAPE, half_plane((x, y), TURN + turned, blur))
 
@@ -47,7 +47,7 @@ def measured(
 
 
 def refused(levels: Array, seed: int = 1, noise: float = 2.0) -> NoValueReason | None:
-    """Return why there is no edge; None: there is one."""
+    """Return the reason why there is no edge; None if there is an edge."""
     try:
         measured(levels, seed, noise)
     except NotMeasuredError as trouble:
@@ -74,7 +74,7 @@ def test_edge_beside_white_is_right_or_refused(white: float) -> None:
             assert white < 255
 
 
-def test_edge_beside_black_that_is_cut_off_is_refused_unless_it_is_allowed() -> None:
+def test_edge_beside_saturated_black_is_refused_unless_allowed() -> None:
     levels = -8 + 150 * edge_at(0.4)
     assert refused(levels) is NoValueReason.SATURATED
     found = measured(levels, settings=EdgeSettings(cut_off=True))
@@ -82,9 +82,7 @@ def test_edge_beside_black_that_is_cut_off_is_refused_unless_it_is_allowed() -> 
 
 
 @pytest.mark.parametrize(("white", "step"), [(235, 1), (200, 1), (65520, 16)])
-def test_edge_beside_any_level_that_cuts_off_is_refused_unless_it_is_allowed(
-    white: int, step: int
-) -> None:
+def test_edge_beside_any_saturation_level_is_refused_unless_allowed(white: int, step: int) -> None:
     rng = np.random.default_rng(1)
     top = white / step
     steps = 0.2 * top + top * edge_at(0.4) + rng.normal(0.0, 2.0 * top / 235, SHAPE)
@@ -98,7 +96,7 @@ def test_edge_beside_any_level_that_cuts_off_is_refused_unless_it_is_allowed(
 
 @pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("noise", [0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
-def test_level_that_does_not_cut_off_is_none_that_does(noise: float) -> None:
+def test_other_levels_are_not_taken_for_saturation(noise: float) -> None:
     for seed in range(20):
         levels = 40 + (150 + seed / 20) * edge_at(0.4)
         assert refused(levels, seed, noise) is None
@@ -117,7 +115,7 @@ def test_bar_is_no_single_edge(wide: float) -> None:
 
 
 @pytest.mark.parametrize("apart", [3.0, 5.0, 12.0])
-def test_weak_edge_beside_the_one_expected_is_told(apart: float) -> None:
+def test_weak_edge_beside_the_expected_edge_is_reported(apart: float) -> None:
     levels = 50 + 150 * edge_at(-2) - 40 * edge_at(-2 + apart)
     assert refused(levels) is NoValueReason.TWO_EDGES
 
@@ -148,7 +146,7 @@ FEATURELESS: dict[str, tuple[Callable[[], Array], set[NoValueReason]]] = {
 
 
 @pytest.mark.parametrize("name", FEATURELESS)
-def test_what_is_no_edge_is_refused(name: str) -> None:
+def test_other_changes_of_level_are_refused(name: str) -> None:
     levels, reasons = FEATURELESS[name]
     assert {refused(levels(), seed) for seed in range(3)} <= reasons
 
@@ -174,7 +172,7 @@ def test_tiny_picture_is_refused(shape: tuple[int, int]) -> None:
         find_point(np.zeros(shape, dtype=np.uint8), strip, EdgeSettings(), "single")
 
 
-def test_polarity_and_choice_take_the_edge_that_is_meant() -> None:
+def test_polarity_and_choice_select_the_edge() -> None:
     levels = 50 + 100 * edge_at(-9) - 60 * edge_at(0) + 90 * edge_at(9)
     picture = photographed(levels, 1.0, np.random.default_rng(1))
 
@@ -214,7 +212,7 @@ def test_pair_of_one_edge_is_refused() -> None:
         find_pair(picture, STRIP, EdgeSettings(), "single")
 
 
-def test_more_edges_than_are_told_apart_are_refused_rather_than_some_taken() -> None:
+def test_too_many_edges_are_refused() -> None:
     shape, middle = (21, 440), 10.0
     bars = [
         (24 + 40 * k, 100 + 2 * min(k, 6 - k)) for k in range(7)
@@ -253,7 +251,7 @@ def test_noise_of_a_large_picture_is_estimated_from_a_part() -> None:
     assert noise_of(picture) == pytest.approx(3.0, rel=0.05)
 
 
-def test_edge_that_is_no_blurred_step_says_by_how_much_it_may_be_wrong() -> None:
+def test_misfit_of_an_edge_bounds_its_error() -> None:
     plain = measured(50 + 150 * edge_at(-1))
     odd = measured(50 + 150 * edge_at(-1) - 40 * edge_at(1))  # an edge and, hidden in it, another
     assert plain.misfit == 0.0
@@ -281,7 +279,7 @@ def test_strips_turn_with_their_direction() -> None:
         assert found.blur == pytest.approx(0.7, abs=0.05)
 
 
-def test_places_in_a_strip_are_those_of_its_points() -> None:
+def test_places_in_a_strip_match_its_points() -> None:
     strips = Strips(MIDDLE[None], AHEAD[None], 20.0, 6.0)
     along, beside = np.array([[3.0, -4.0]]), np.array([[1.0, 2.5]])
     back = strips.places(strips.points(along, beside))

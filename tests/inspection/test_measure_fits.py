@@ -1,4 +1,4 @@
-"""Lines and circles through edges: outliers, rough parts, and what no fit can tell."""
+"""Lines and circles through edges: outliers, rough parts, and undetermined fits."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def on_circle(
 
 
 @pytest.mark.parametrize("wrong", [1, 4, 9])
-def test_wrong_edges_of_a_line_are_told_and_do_not_move_it(wrong: int) -> None:
+def test_outliers_of_a_line_are_reported_and_do_not_move_it(wrong: int) -> None:
     for seed in range(10):
         random = np.random.default_rng(seed)
         offsets = random.normal(0, 0.01, 20)
@@ -51,7 +51,7 @@ def test_wrong_edges_of_a_line_are_told_and_do_not_move_it(wrong: int) -> None:
 
 
 @pytest.mark.parametrize("wrong", [1, 4, 10])
-def test_wrong_edges_of_a_circle_are_told_and_do_not_move_it(wrong: int) -> None:
+def test_outliers_of_a_circle_are_reported_and_do_not_move_it(wrong: int) -> None:
     for seed in range(10):
         random = np.random.default_rng(seed)
         offsets = random.normal(0, 0.01, 24)
@@ -98,7 +98,7 @@ def test_line_runs_the_way_that_was_asked_for() -> None:
     assert fit_line(edges, -AHEAD).shape.direction @ AHEAD < -0.99
 
 
-def test_turned_line_says_the_same_of_places_beside_it() -> None:
+def test_rotated_line_has_the_same_offset_variance() -> None:
     edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
     one, other = fit_line(edges, AHEAD).shape, fit_line(edges, -AHEAD).shape
     for place in (np.array([-50.0, 40.0]), np.array([180.0, 60.0])):
@@ -134,7 +134,7 @@ def test_arc_that_is_too_short_for_its_radius_is_refused() -> None:
     assert caught.value.why is NoValueReason.UNCERTAIN
 
 
-def test_what_all_edges_may_be_wrong_by_is_not_averaged_away() -> None:
+def test_common_error_of_all_edges_is_not_averaged() -> None:
     edges = on_circle(np.random.default_rng(1).normal(0, 0.01, 24))
     found = circle_of(FoundShape(edges, (), 0.8, 0.2), PIXELS).shape
     assert math.sqrt(found.covariance[2, 2]) == pytest.approx(0.2, rel=0.01)

@@ -1,4 +1,4 @@
-"""Tolerances: how they are written, when a value is good, and how they are learned of pictures."""
+"""Tolerances: their notation, verdicts on values, and learning from pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import Finding
 from smartcam.inspection._inside import learned
-from smartcam.inspection._learning import GOOD_SHARE, Lesson
+from smartcam.inspection._learning import TOLERANCE_COVERAGE, Lesson
 from smartcam.inspection._measure.tolerances import Tolerance
 
 
@@ -72,7 +72,7 @@ def test_no_value_is_never_good() -> None:
     assert Tolerance.parse("12 +- 1 mm").complaint(12.0, math.nan, 2.0)
 
 
-def test_directions_are_compared_whatever_whole_turns_are_between_them() -> None:
+def test_directions_are_compared_modulo_a_turn() -> None:
     back = Tolerance.parse("180 +- 1 deg")
     for value in (179.99, -179.99, 180.0, -180.0):
         assert back.complaint(value, 0.01, 2.0) == ""
@@ -92,7 +92,7 @@ SIGMA = 0.01
 def lesson(
     values: list[float], before: str | None = None, *, unit: str = "px", **more: Any
 ) -> Lesson:
-    """Return what good pictures with these measured values teach; NaN: an edge was not found."""
+    """Return the lesson of good pictures with these measured values; NaN: no edge was found."""
     good: dict[str, Any] = {}
     for number, value in enumerate(values, 1):
         there = math.isfinite(value)
@@ -112,7 +112,7 @@ def values_of(number: int, seed: int, mean: float = 92.4, spread: float = 0.05) 
     return given
 
 
-def test_good_values_are_inside_with_their_guard_and_the_words_say_what_of() -> None:
+def test_learned_tolerance_contains_good_values_with_guard_and_is_explained() -> None:
     values = values_of(20, 1)
     found = lesson(values)
     limits = tolerance(found)
@@ -134,7 +134,7 @@ def test_other_good_parts_are_inside_in_as_many_lessons_as_promised(number: int)
             continue  # one of five was left out
         limits = tolerance(found)
         inside = [math.erf(one / math.sqrt(2)) / 2 for one in (limits.least, limits.most)]
-        shares.append(inside[1] - inside[0] >= GOOD_SHARE)
+        shares.append(inside[1] - inside[0] >= TOLERANCE_COVERAGE)
     assert len(shares) >= 0.95 * lessons
     assert sum(shares) >= 0.91 * len(shares)  # 95 % are promised, give or take 1.5 %
 
@@ -167,7 +167,7 @@ def test_too_few_values_leave_the_tolerance_as_it_is(values: list[float]) -> Non
         (None, "", " mm"),
     ],
 )
-def test_form_and_unit_stay_as_they_were_written(before: str | None, form: str, unit: str) -> None:
+def test_form_and_unit_of_a_tolerance_are_kept(before: str | None, form: str, unit: str) -> None:
     values = values_of(10, 4, 12.0, 0.02)
     found = lesson(values, before, unit="mm")
     limits = tolerance(found)
@@ -184,7 +184,7 @@ def test_directions_on_both_sides_of_a_half_turn_are_near_each_other() -> None:
     assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
 
 
-def test_pictures_that_are_all_the_same_get_the_room_that_measuring_needs() -> None:
+def test_equal_pictures_get_a_tolerance_for_the_measuring_error() -> None:
     limits = tolerance(lesson([92.4] * 6))
     assert limits.complaint(92.4, SIGMA, 2.0) == ""
     assert 0.02 < limits.most - 92.4 < 0.1

@@ -18,7 +18,7 @@ LIGHT = "grey: [200, 255]"
 TWO = board((20, 20, 10, 10, 250), (100, 50, 30, 12, 230))
 
 
-def test_largest_spot_is_told_with_its_place(tmp_path: Path) -> None:
+def test_largest_spot_has_its_place_in_the_result(tmp_path: Path) -> None:
     value = inspected(tmp_path, f"{{present: {{{LIGHT}}}}}", TWO).value
     assert (value.ok, value.count, value.area) == (True, 2, 360)
     assert (value.x, value.y, value.angle) == (114.5, 55.5, 0.0)
@@ -28,7 +28,7 @@ def test_largest_spot_is_told_with_its_place(tmp_path: Path) -> None:
     ("said", "ok"),
     [("2", True), ("1", False), ("3", False), ("[1, 2]", True), ("[0, 1]", False), ("0", False)],
 )
-def test_number_of_spots_has_to_be_as_said(tmp_path: Path, said: str, ok: bool) -> None:
+def test_number_of_spots_is_judged(tmp_path: Path, said: str, ok: bool) -> None:
     found = inspected(tmp_path, f"{{present: {{{LIGHT}, count: {said}}}}}", TWO)
     assert found.ok is ok
     assert bool(found.reason) is not ok
@@ -67,7 +67,7 @@ def test_round_spot_has_no_direction_and_can_be_followed(tmp_path: Path) -> None
     assert found.value.in_area == 19 * 19  # centres on the border count
 
 
-def test_colour_is_found_where_grey_is_the_same(tmp_path: Path) -> None:
+def test_colour_is_found_among_equal_greys(tmp_path: Path) -> None:
     picture = np.full((80, 120, 3), (0, 130, 0), np.uint8)  # a green about as bright as the red
     picture[30:50, 40:70] = (255, 0, 0)
     red = "present: {colour: {hue: [170, 10], saturation: [100, 255]}}"
@@ -84,7 +84,7 @@ def test_grey_picture_is_never_good_for_its_colours(tmp_path: Path) -> None:
         assert "the picture has no colours" in found.reason
 
 
-def test_region_of_corners_counts_what_is_inside(tmp_path: Path) -> None:
+def test_polygon_region_counts_spots_inside(tmp_path: Path) -> None:
     picture = np.full((100, 200), 250, np.uint8)
     triangle = "[[20, 10], [60, 10], [20, 50]]"
     value = inspected(tmp_path, f"{{present: {{{LIGHT}, region: {triangle}}}}}", picture).value

@@ -1,4 +1,4 @@
-"""Programs: the layout that follows from the tools, following, verdicts, faults of tools."""
+"""Programs: layout, following, verdicts, faults of tools."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ SPOT = "present: {grey: [200, 255], area: [10, 9000]}"
 
 
 class BrightnessSettings(ToolSettings):
-    """The brightness that is allowed."""
+    """Allowed range of brightness."""
 
     least: float = 0.0
 
 
 class Brightness(Tool[BrightnessSettings]):
-    """The mean brightness of a region: a tool of somebody's own."""
+    """A user's tool: mean brightness of a region."""
 
     settings_model = BrightnessSettings
     fields = "mean: real32"
 
     def inspect(self, view: View) -> Finding:
-        """Return the mean; an all black picture is this tool's fault."""
+        """Return the mean; raise for an all black picture, as a faulty tool."""
         mean = float(view.grey.mean())
         if mean == 0:
             raise ZeroDivisionError("black")
@@ -59,7 +59,7 @@ def _brightness() -> None:
     register_tool("brightness", Brightness)
 
 
-def test_tool_of_ones_own_is_found_by_its_name_and_gives_its_fields(tmp_path: Path) -> None:
+def test_own_tool_is_found_by_name_and_gives_its_fields(tmp_path: Path) -> None:
     found = inspected(tmp_path, "{brightness: {region: [0, 0, 10, 10]}}", board())
     assert found.layout == Layout("ok: bool, reason: string[80], mean: real32")
     assert found.value == (True, "", 100.0)
@@ -90,7 +90,7 @@ def test_field_without_a_value_is_nothing_by_its_type(tmp_path: Path) -> None:
     assert math.isnan(value.x)
 
 
-def test_reason_is_cut_for_the_wire_at_a_whole_character(tmp_path: Path) -> None:
+def test_reason_is_cut_at_a_whole_character(tmp_path: Path) -> None:
     class Complaining(Tool[ToolSettings]):
         settings_model = ToolSettings
 
@@ -103,7 +103,7 @@ def test_reason_is_cut_for_the_wire_at_a_whole_character(tmp_path: Path) -> None
     assert found.value.reason == "ä" * 38 + "..."
 
 
-def test_sequence_number_stands_in_front_where_it_is_wanted(tmp_path: Path) -> None:
+def test_sequence_number_comes_first_if_wanted(tmp_path: Path) -> None:
     found = inspected(tmp_path, f"{{sequence: true, {SPOT}}}", board())
     assert found.layout.sequence(found.payload(sequence=-1001)) == -1001
     assert found.layout.sequence(found.payload()) == 0
@@ -111,7 +111,7 @@ def test_sequence_number_stands_in_front_where_it_is_wanted(tmp_path: Path) -> N
     assert plain.payload(sequence=5) == plain.payload()
 
 
-def test_tool_follows_what_an_earlier_tool_found(tmp_path: Path) -> None:
+def test_tool_follows_an_earlier_tool(tmp_path: Path) -> None:
     application = (
         f"{{{SPOT}, present hole: {{follow: present, region: [-4, -4, 8, 8], grey: [0, 20], "
         "area: [4, 100]}}"
@@ -143,7 +143,7 @@ def test_application_follows_another_by_its_name(tmp_path: Path) -> None:
     assert (lost.ok, lost.reason) == (False, "spot: 0 spots, expected 1 to 1000")
 
 
-def test_region_out_of_the_picture_is_a_finding_that_says_so(tmp_path: Path) -> None:
+def test_region_out_of_the_picture_is_a_finding_with_a_reason(tmp_path: Path) -> None:
     for region in ("[190, 0, 20, 20]", "[-5, 0, 20, 20]", "[500, 500, 5, 5]"):
         found = inspected(tmp_path, f"{{brightness: {{region: {region}}}}}", board())
         assert not found.ok
@@ -159,7 +159,7 @@ def test_exception_of_a_tool_names_application_and_tool(tmp_path: Path) -> None:
     assert (caught.value.application, caught.value.tool) == (7, "brightness")
 
 
-def test_pose_and_back_is_the_same_point() -> None:
+def test_pose_and_its_inverse_give_the_same_point() -> None:
     pose = PixelPose(30.0, -4.0, 0.7, 1.5)
     points = np.random.default_rng(1).uniform(-50, 50, (20, 2))
     assert np.allclose(pose.from_picture(pose.to_picture(points)), points)
@@ -194,7 +194,7 @@ def test_two_lists_in_one_program_are_refused(tmp_path: Path) -> None:
         ("7: {compare: {taught: nowhere.png}}", "No such file"),
     ],
 )
-def test_mistake_in_a_cell_is_told_with_its_line(
+def test_mistake_in_a_cell_is_reported_with_its_line(
     tmp_path: Path, application: str, message: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=message) as caught:
@@ -263,12 +263,12 @@ def test_odd_picture_has_an_outcome_of_every_tool(tmp_path: Path, name: str) -> 
     ],
     ids=lambda one: f"{one.shape} {one.dtype}",
 )
-def test_array_that_is_no_picture_is_refused(picture: np.ndarray[Any, Any]) -> None:
+def test_wrong_array_is_refused(picture: np.ndarray[Any, Any]) -> None:
     with pytest.raises(FrameFormatError, match="picture: expected"):
         Picture.of(picture)
 
 
-def test_sixteen_bits_are_judged_by_those_that_mean_something() -> None:
+def test_sixteen_bits_are_judged_by_their_significant_bits() -> None:
     levels = np.array([[0, 1 << 11, (1 << 12) - 1]], np.uint16)
     assert Picture(levels, depth=12).grey.tolist() == [[0, 128, 255]]
     assert Picture(levels << 4).grey.tolist() == [[0, 128, 255]]

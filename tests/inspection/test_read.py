@@ -1,4 +1,4 @@
-"""The tool `read`: bytes, GS1, corners, what is expected, and what is tried after a miss."""
+"""The tool `read`: bytes, GS1, corners, expected texts, and retries after a miss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import zxingcpp
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
-from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
+from smartcam.inspection._read.ladder import CONFIRMED_KINDS, RUNGS
 from smartcam.inspection._read.patterns import TextPattern, TooLongError
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
@@ -34,7 +34,7 @@ def picture(kind: str = "DataMatrix", text: str | bytes = TEXT, **look: Any) -> 
 
 
 def beside(*pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return pictures beside each other, on white."""
+    """Return pictures side by side on white."""
     height = max(one.shape[0] for one in pictures)
     return np.hstack(
         [
@@ -53,7 +53,7 @@ def test_code_of_each_kind_is_read_with_its_place(tmp_path: Path, kind: str) -> 
     assert (found.value.count, found.findings["read"].details[0].prepared) == (1, "")
 
 
-def test_bytes_come_as_they_are_and_text_spells_out_nothing(tmp_path: Path) -> None:
+def test_bytes_are_unchanged_and_text_has_no_escapes(tmp_path: Path) -> None:
     data = b"[)>\x1e06\x1dP4711\x1d\x1e\x04"
     found = inspected(tmp_path, "{read: {codes: DataMatrix}}", picture(text=data))
     (code,) = found.findings["read"].details
@@ -94,7 +94,7 @@ def test_element_strings_are_cut_by_their_lengths(
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 90, 200])
-def test_corners_and_angle_are_those_of_the_printed_code(tmp_path: Path, degrees: float) -> None:
+def test_corners_and_angle_match_the_printed_code(tmp_path: Path, degrees: float) -> None:
     grey = picture(px=6, degrees=degrees)
     found = inspected(tmp_path, "{read: {codes: DataMatrix, corners: true}}", grey)
     difference = found.value.angle - math.radians(degrees)
@@ -127,7 +127,7 @@ def test_code_beside_a_region_of_corners_does_not_count(tmp_path: Path) -> None:
         assert [code.text for code in found.value.read] == [text]
 
 
-def test_text_has_to_be_what_is_expected_all_of_it(tmp_path: Path) -> None:
+def test_whole_text_must_match(tmp_path: Path) -> None:
     for pattern, ok in ((r"SN:\d\d-\d{4}", True), (r"SN", False), (r"\d+", False)):
         found = inspected(tmp_path, f"{{read: {{expect: '{pattern}'}}}}", picture())
         assert found.ok is ok
@@ -152,7 +152,7 @@ def test_pattern_that_is_too_large_is_refused(tmp_path: Path) -> None:
         "(a|a?)+b",
     ],
 )
-def test_pattern_with_countless_ways_through_a_text_says_no_or_gives_up(pattern: str) -> None:
+def test_pattern_of_exponential_time_is_refused_or_times_out(pattern: str) -> None:
     expected = TextPattern(pattern)
     for length in (28, 4000):
         with contextlib.suppress(TooLongError):
@@ -179,7 +179,7 @@ def test_comparing_lets_other_threads_run() -> None:
         other.join()
 
 
-def test_patterns_match_what_those_of_re_match() -> None:
+def test_patterns_match_like_re() -> None:
     random = np.random.default_rng(5)
     atoms = [
         "a",
@@ -232,7 +232,7 @@ def test_text_that_takes_too_long_to_compare_is_not_ok(tmp_path: Path) -> None:
     assert (found.ok, found.reason.endswith("takes too long")) == (False, True)
 
 
-def test_other_repetitions_are_taken(tmp_path: Path) -> None:
+def test_other_repetitions_are_accepted(tmp_path: Path) -> None:
     for pattern in ("(SN:)?[0-9]+-[0-9]+", r"(SN|:|\d{2}|-)+", r"(\w+:)?(\d+-){1,3}\d*"):
         assert inspected(tmp_path, f"{{read: {{expect: '{pattern}'}}}}", picture()).ok
 
@@ -244,7 +244,7 @@ def test_bytes_have_to_be_the_input(tmp_path: Path) -> None:
     assert not inspected(tmp_path, cell, picture()).ok
 
 
-def test_several_codes_come_as_a_list_the_upper_ones_first(tmp_path: Path) -> None:
+def test_several_codes_are_listed_from_top_to_bottom(tmp_path: Path) -> None:
     upper = beside(picture(text="A"), picture("QRCode", "B", px=3))
     both = np.vstack([upper, np.full((60, upper.shape[1]), 210, np.uint8)])
     lower = picture(text="C")
@@ -258,7 +258,7 @@ def test_several_codes_come_as_a_list_the_upper_ones_first(tmp_path: Path) -> No
     assert (few.ok, few.reason) == (False, "3 codes, expected 4")
 
 
-def test_text_that_has_no_room_is_told_and_not_cut(tmp_path: Path) -> None:
+def test_too_long_text_is_reported_and_not_cut(tmp_path: Path) -> None:
     found = inspected(tmp_path, "{read: {length: 9}}", picture())
     assert (found.ok, found.value.text) == (False, "")
     assert found.reason == "the text has 10 bytes or a zero, expected up to 9"
@@ -282,7 +282,7 @@ def test_unused_correction_tells_damage(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- after a miss
 
 
-def test_nothing_is_prepared_where_no_time_is_given(tmp_path: Path) -> None:
+def test_without_time_no_picture_is_prepared(tmp_path: Path) -> None:
     dotted = picture(px=6, dots=0.7)
     assert not inspected(tmp_path, "{read: {codes: DataMatrix, seconds: 0}}", dotted).ok
     found = inspected(tmp_path, "{read: {codes: DataMatrix, seconds: 9}}", dotted)
@@ -300,7 +300,7 @@ def test_prepared_picture_gives_places_in_the_picture(look: dict[str, Any]) -> N
 
 
 @pytest.mark.parametrize("rung", RUNGS, ids=lambda rung: rung.name)
-def test_each_rung_says_where_its_pixels_are(rung: object) -> None:
+def test_each_rung_maps_its_pixels_back(rung: object) -> None:
     prepare = next(one.prepare for one in RUNGS if one is rung)
     grey = np.full((90, 140), 200, np.uint8)
     grey[20:41, 90:111] = 0  # a spot around (100, 30)
@@ -316,7 +316,7 @@ def test_each_rung_says_where_its_pixels_are(rung: object) -> None:
 def test_weak_kind_counts_only_if_a_second_reading_is_the_same(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    assert kind in CONFIRMED
+    assert kind in CONFIRMED_KINDS
     grey = picture(kind, codes.CONTENTS[kind], px=8, dots=0.6)
     assert codes.alone(kind, grey) == []
     assert [code.text for code in codes.with_ladder(kind, grey)] == [codes.CONTENTS[kind]]
@@ -338,7 +338,7 @@ def test_weak_kind_counts_only_if_a_second_reading_is_the_same(
     assert [code.text for code in codes.with_ladder(kind, grey)] == [codes.CONTENTS[kind]]
 
 
-def test_bar_code_that_lies_aslant_is_read(tmp_path: Path) -> None:
+def test_slanted_bar_code_is_read(tmp_path: Path) -> None:
     for kind, degrees in (("Code128", 45.0), ("PDF417", 17.0), ("EAN13", -30.0)):
         grey = picture(kind, codes.CONTENTS[kind], px=3, degrees=degrees)
         assert codes.alone(kind, grey) == []
@@ -366,7 +366,7 @@ def test_ladder_reads_drawn_codes_that_zxing_cpp_alone_misses_and_none_wrong() -
             assert count["smartcam", *case] >= number, case
 
 
-def test_nothing_is_read_where_there_is_nothing() -> None:
+def test_no_code_is_read_in_an_empty_picture() -> None:
     random = np.random.default_rng(3)
     for grey in (
         random.integers(0, 256, (120, 160), np.uint8),

@@ -1,4 +1,4 @@
-"""The page of teaching in a real browser, from a drawn region to the saved file."""
+"""The teaching page in a real browser, from a drawn region to the saved file."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ async def opened(page: Page, site: TeachSite) -> AsyncIterator[TeachSite]:
 
 
 async def drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> None:
-    """Drag over the picture, between shares of its width and height."""
+    """Drag over the picture; places are shares of its width and height."""
     box = await page.locator("#canvas").bounding_box()
     assert box is not None
     places = [(box["x"] + box["width"] * x, box["y"] + box["height"] * y) for x, y in (begin, end)]
@@ -139,9 +139,7 @@ async def test_a_way_is_drawn_and_a_measured_tolerance_is_learned(
     assert 119 < tolerance.least < 120 < tolerance.most < 121
 
 
-async def test_a_wrong_setting_is_told_beside_it_and_nothing_is_saved(
-    page: Page, path: Path
-) -> None:
+async def test_wrong_setting_is_reported_beside_it_and_not_saved(page: Page, path: Path) -> None:
     files = sorted((path.parent / "shots").iterdir())
     async with opened(page, TeachSite(Teaching(path, "cam", 7), files)):
         await page.fill("#set-grey", "[9, 0]")
@@ -152,7 +150,7 @@ async def test_a_wrong_setting_is_told_beside_it_and_nothing_is_saved(
     assert await asyncio.to_thread(path.read_text) == FILE
 
 
-async def test_pictures_are_taken_with_the_camera(page: Page, path: Path) -> None:
+async def test_camera_takes_pictures(page: Page, path: Path) -> None:
     async with frames.open("synthetic://?size=320x240&fps=50", linger=2.0) as source:
         site = TeachSite(Teaching(path, "cam", 7), source=source)
         async with opened(page, site):

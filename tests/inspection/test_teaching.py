@@ -1,4 +1,4 @@
-"""Teaching: the file stays as it was written, what is tried is what is saved."""
+"""Teaching: the file keeps its notation, and saved tools equal the tried ones."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def spots(*sides: int) -> Picture:
     return Picture(pixels)
 
 
-def test_only_what_differs_is_written(path: Path) -> None:
+def test_only_differences_are_written(path: Path) -> None:
     teaching = Teaching(path, "cam", 9)
     assert teaching.tools == {"present": {"grey": [0, 9], "region": [0, 0, 9, 9]}}
     teaching.save({"present": {"grey": [0, 20], "region": [0, 0, 9, 9], "count": 2}})
@@ -100,7 +100,7 @@ def test_saving_twice_changes_nothing(path: Path) -> None:
     assert path.read_text() == once
 
 
-def test_what_others_wrote_meanwhile_stays(path: Path) -> None:
+def test_concurrent_changes_of_the_file_are_kept(path: Path) -> None:
     teaching = Teaching(path, "cam", 9)
     path.write_text(FILE.replace("# stays", "# changed by hand"))
     teaching.save({"present": {"grey": [1, 2]}})
@@ -129,7 +129,7 @@ def test_a_wrong_setting_is_refused_and_the_file_stays(
 @pytest.mark.parametrize(
     ("camera", "said"), [("cm", "did you mean 'cam'"), ("other", "no software camera 'other'")]
 )
-def test_a_camera_that_is_none_says_which_there_are(path: Path, camera: str, said: str) -> None:
+def test_unknown_camera_is_refused_with_the_known_ones(path: Path, camera: str, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         Teaching(path, camera, 9)
 
@@ -150,7 +150,7 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
     assert not any(taught.inspect(one).ok for one in (spots(10), spots(10, 10, 10), spots(13, 10)))
 
 
-def test_tolerances_of_areas_that_nobody_knows_are_not_made_up(path: Path) -> None:
+def test_tolerances_of_unknown_areas_are_not_learned(path: Path) -> None:
     tools = {"present": {"grey": [0, 120]}}  # only the largest is in the result
     program = Teaching(path, "cam", 7).program(tools)
     found = learned(tools, {"one": program.inspect(spots(10, 6))})
@@ -158,7 +158,7 @@ def test_tolerances_of_areas_that_nobody_knows_are_not_made_up(path: Path) -> No
 
 
 @pytest.mark.parametrize("value", [[1, 2], 3, 0.5, True, "a", r"\d{3}", {"hue": [1, 2]}, "12", ""])
-def test_a_setting_is_read_as_it_was_shown(value: object) -> None:
+def test_shown_setting_can_be_read(value: object) -> None:
     text = setting_text(value)
     assert "\n" not in text
     assert read_settings({"tool": {"x": text}}) == {"tool": {"x": value}}

@@ -2,8 +2,8 @@
 
 Pixels darker than the mean of their surroundings are joined into connected pieces. A piece whose
 area is that of the ellipse with its second moments is a spot: letters, lines, rings and corners
-fill less of that ellipse. How large the surroundings are decides how large a dot may be and still
-be dark all over; a few sizes cover all grids that an image can show.
+fill less of that ellipse. The size of the surroundings limits the size of the dots that are dark
+all over; a few sizes cover all grids that an image can show.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MIN_ELLIPSE_SHARE = 0.85
 triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
-"""A dot is at most this many times as long as wide: so a circle looks at a tilt of 80 degrees."""
+"""A dot is at most this many times as long as wide, like a circle at a tilt of 80 degrees."""
 
 
 MIN_RECTANGLE_SHARE = 0.2

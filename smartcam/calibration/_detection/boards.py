@@ -35,8 +35,8 @@ USUAL_SIDE_PX = 800
 and at twice this size, unless the image is smaller."""
 
 NEIGHBOURS = 8
-"""Nearest saddles among which the next corners are looked for: four corners and what else is
-near."""
+"""Nearest saddles among which the next corners are looked for: four corners and other saddles
+nearby."""
 
 FITTED_SHARE = 0.45
 """Edges at a corner are fitted along this part of a square's side, which ends before the next
@@ -174,8 +174,7 @@ def completed(image: GreyImage, board: Board) -> Board | None:
     near = board.places
     for _ in range(MAX_ROUNDS):
         missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
-        # a place without a corner may have one when a corner beside it has given a better
-        # prediction
+        # a new corner beside an empty place may predict that place better
         beside = np.abs(missing[:, None] - near).max(axis=2).min(axis=1, initial=2) <= 1
         missing = missing[beside]
         points, signs = _fitted(image, board, missing)

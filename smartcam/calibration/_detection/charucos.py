@@ -18,8 +18,8 @@ from smartcam.calibration._detection.markers import (
     check_one_board,
     marker_dictionary,
     marker_finder,
+    remarks_on_strays,
     seen_from_nearest,
-    strays_told,
 )
 from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._views import TargetView
@@ -102,7 +102,7 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
         points=corners.points[seen],
         covariance=corners.covariance[seen],
         name=name,
-        warnings=strays_told(sighting.strays),
+        warnings=remarks_on_strays(sighting.strays),
     )
 
 
@@ -136,12 +136,12 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
 
 def _other_pattern(target: Charuco, seen: _Sighting) -> CalibrationError:
     """Return the error for markers that are arranged as in the other ``legacy_pattern``."""
-    said, other = target.legacy_pattern, not target.legacy_pattern
+    expected, other = target.legacy_pattern, not target.legacy_pattern
     return Code.WRONG_TARGET.refusal(
         f"{_name(target)}: expected markers as "
-        f"legacy_pattern={said} has them, of which {seen.agreeing} stand to each other as on "
+        f"legacy_pattern={expected} has them, of which {seen.agreeing} stand to each other as on "
         f"that board; got {seen.otherwise} that stand as legacy_pattern={other} has them",
-        f"legacy_pattern={said}",
+        f"legacy_pattern={expected}",
         f"legacy_pattern={other}",
     )
 
@@ -168,7 +168,7 @@ class _Sighting(NamedTuple):
 
 
 def _detect(image: GreyImage, target: Charuco) -> _Sighting:
-    """Look for a board in a reduced image, then in the given one, then in one twice as large.
+    """Find a board in a reduced image, else in the given image, else in it enlarged twofold.
 
     Each image is searched only if the one before shows too little, and the last one only if there
     may be markers that were too small to be read.

@@ -108,7 +108,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
 
 
 _ANOTHER: Final = Code.WRONG_TARGET.remark(
-    "expected one such board in the picture, got several: which one is meant is not told; cover "
+    "expected one such board in the picture, got several: the meant one is unknown; cover "
     "the others, or use ChArUco boards of other markers"
 )
 
@@ -289,8 +289,8 @@ def _number_part(
 ) -> tuple[Arrangement, float] | None:
     """Return the numbering of a part of a board by its mark; None if no mark is seen.
 
-    Beside the dark dot at the origin the paper is light: around the dot, and along both of the
-    board's edges that meet there. So a place inside the board, or on something else, is not taken
+    Beside the dark dot at the origin the paper is light: around the dot, and along the two edges of
+    the board that meet at the dot. So a place inside the board, or on another object, is not taken
     for its corner.
     """
     found = []
@@ -350,7 +350,7 @@ def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arran
 
 
 def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> float:
-    """Count the corners that say that the square at the origin is black, minus the others."""
+    """Return the number of corners that show a black square at the origin, minus the others."""
     order = way.order
     # gains refer to the found grid's columns and rows, which may run against the target's
     against = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))

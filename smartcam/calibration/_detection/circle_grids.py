@@ -93,7 +93,7 @@ def _grids(
 ) -> Iterator[tuple[GreyImage, Array, list[Arrangement]]]:
     """Yield dots (N, 2), pixels, that are arranged as the target's, and the ways to number them.
 
-    The image that is yielded with them is the given one or its negative, whichever has them dark.
+    With them comes the image in which they are dark: the given one or its negative.
     """
     for light, scale, spots in _looks(image.bytes, target):
         for points, places in _laid_out(spots, target, seen):
@@ -291,7 +291,7 @@ def _number(
 
 
 def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
-    """Return an error that says what is seen instead."""
+    """Return an error that reports the dots seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:
         what = "saw more than these in rows and columns, as of a larger grid"

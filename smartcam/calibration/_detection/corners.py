@@ -80,7 +80,7 @@ def refine_corners(
     ``points`` (N, 2) are found to a pixel or two. ``ways`` (N, 2, 2), pixels, lead along the two
     edges; in both directions they span the part of the corner's four squares that is fitted.
     ``clear`` (N, 2) is the part of ``ways`` from an edge within which nothing is printed on the
-    squares; None takes all of it. ``single`` says that it is the corner of one square, which lies
+    squares; None takes all of it. ``single``: the corner is that of one square, which lies
     between the first way and the second one's opposite, which stand counter-clockwise in the
     image's u and v.
     """

@@ -6,8 +6,8 @@ and ``s' = sqrt(2) * s``. Eight values, the centre (two), the shape (three), blu
 are fitted to all pixels around a dot.
 
 The centre of the ellipse is not the image of the dot's centre: perspective makes the nearer half
-larger, and a lens bends it. :class:`GridMap` maps the whole grid into the image, and so tells how
-far the centre of a round dot's outline lies from the image of the dot's centre.
+larger, and a lens bends it. :class:`GridMap` maps the whole grid into the image, and so gives the
+distance of a round dot's outline's centre from the image of the dot's centre.
 """
 
 from __future__ import annotations
@@ -97,12 +97,11 @@ class GridMap:
 
     def shifts(self, flat: Array, diameters: Array) -> Array:
         """Return the offsets of the outlines' centres from those of the dots, (N, 2), pixels."""
-        # A tilted circle's image is an ellipse whose middle is not where the circle's centre is
-        # seen. Instead of a formula for a pinhole, the dot's outline is mapped as the grid is,
-        # lens and all, and the middle of its area taken: of a polygon with corners p_i
-        #     sum (p_i + p_i+1) (p_i x p_i+1) / (3 sum p_i x p_i+1).
-        # Source of the bias: Heikkila, Geometric Camera Calibration Using Circular Control Points
-        # (2000).
+        # A tilted circle's image is an ellipse whose middle is not the image of the circle's
+        # centre. Instead of a formula for a pinhole, the dot's outline is mapped as the grid is,
+        # lens and all, and the middle of its area taken: of a polygon with corners p_i     sum (p_i
+        # + p_i+1) (p_i x p_i+1) / (3 sum p_i x p_i+1). Source of the bias: Heikkila, Geometric
+        # Camera Calibration Using Circular Control Points (2000).
         at = flat[:, None] + diameters[:, None, None] / 2 * OUTLINE
         outline = self(at.reshape(-1, 2)).reshape(at.shape) - self(flat)[:, None]
         ahead = np.roll(outline, -1, axis=1)

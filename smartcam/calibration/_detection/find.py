@@ -1,4 +1,4 @@
-"""Printed targets in images: :func:`find_target`."""
+"""Find the points of a printed target in an image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Find dots in rows and columns among others that are in none.
+"""Find the dots of a grid among other dots.
 
 A dot whose neighbours lie opposite each other in two directions may belong to a grid. From there
 each next dot is looked for at the place that the ones before it predict, until no more are found.
@@ -148,8 +148,8 @@ class _Grown:
         for index in ranked[np.argsort(worse)][
             : int((worse < MAX_OPPOSITE_DIFFERENCE).sum())
         ].tolist():
-            ahead, behind = np.nonzero(np.triu(apart[index] < MAX_OPPOSITE_DIFFERENCE))
-            steps = (ways[index, ahead] - ways[index, behind]) / 2
+            ahead, opposite = np.nonzero(np.triu(apart[index] < MAX_OPPOSITE_DIFFERENCE))
+            steps = (ways[index, ahead] - ways[index, opposite]) / 2
             steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
             across, *others = steps
             for other in others:
@@ -241,7 +241,7 @@ class _Grown:
 def _across(ways: Array, apart: Array) -> Array:
     """Return the deviation from opposite (N,) of the best pair across the best one.
 
-    ``ways`` (N, K, 2) lead to the neighbours; ``apart`` (N, K, K) says how far each two are from
+    ``ways`` (N, K, 2) lead to the neighbours; ``apart`` (N, K, K) is the deviation of each two from
     being opposite.
     """
     count, around, _ = apart.shape

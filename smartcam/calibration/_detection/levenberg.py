@@ -1,4 +1,4 @@
-"""Many small least-squares problems of one kind, solved side by side.
+"""Solve many small least-squares problems of one kind side by side.
 
 Levenberg's and Marquardt's method, for fits to the pixels around each of many points: NumPy's cost
 of a call is paid once for all of them, and those that no longer move drop out.
@@ -30,7 +30,7 @@ MIN_BLUR_PIXELS = 0.25
 fit can measure."""
 
 MAX_BLUR_PIXELS = 6.0
-"""Largest blur of a fit, pixels: a fit that needs more shows something else than an edge."""
+"""Largest blur of a fit, pixels: a larger one is not that of an edge."""
 
 MIN_HALF_STEP = 4.0
 """Half the step from black to white is at least this many grey levels of 255."""

@@ -18,7 +18,7 @@ from smartcam.calibration._detection.markers import (
     check_one_board,
     marker_dictionary,
     marker_finder,
-    strays_told,
+    remarks_on_strays,
 )
 from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._views import TargetView
@@ -86,7 +86,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         points=corners.points[seen],
         covariance=corners.covariance[seen],
         name=name,
-        warnings=strays_told(strays),
+        warnings=remarks_on_strays(strays),
     )
 
 

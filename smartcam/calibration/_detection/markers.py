@@ -47,7 +47,7 @@ MIN_CONTRARY_MARKERS = 3
 """A group that contradicts the description of the target has at least this many markers."""
 
 MAX_NUMBERS_IN_MESSAGE = 8
-"""At most this many marker numbers stand in one message."""
+"""A message lists at most this many marker numbers."""
 
 MIN_AGREEING_MARKERS = 2
 """At least this many markers must agree: one alone rests on a single reading."""
@@ -77,7 +77,7 @@ class MarkerAgreement(NamedTuple):
     """The result of comparing markers with a board."""
 
     good: NDArray[np.bool_]  # indices of the markers that lie as on the board
-    contrary: int  # count of others that agree with each other, elsewhere
+    contrary: int  # count of markers that agree with each other at other places
 
 
 def marker_dictionary(name: str, needed: int, what: str) -> Any:
@@ -198,8 +198,8 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
     return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
 
 
-def strays_told(numbers: Sequence[int]) -> tuple[Remark, ...]:
-    """Return the remark that names the markers left out; nothing if none were."""
+def remarks_on_strays(numbers: Sequence[int]) -> tuple[Remark, ...]:
+    """Return the remark that names the markers left out; nothing without any."""
     if not numbers:
         return ()
     shown = ", ".join(map(str, numbers[:MAX_NUMBERS_IN_MESSAGE])) + (

@@ -113,7 +113,7 @@ def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
 def marked(
     ways: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], what: str
 ) -> tuple[Arrangement, float]:
-    """Return the arrangement with a dark mark at its origin, and by how much it is darker.
+    """Return the arrangement with a dark mark at its origin, and the mark's margin in grey levels.
 
     ``level`` returns the grey level, of 255, at the place where an arrangement would have its mark.
     ``what`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too

@@ -128,10 +128,10 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
             value = one.values[number]
             if math.isfinite(value):
                 x = middle + (place - len(chart.series) / 2) * wide
-                said = f"{name}{left_out}: {one.name} {value:.3g} {chart.unit}"
+                label = f"{name}{left_out}: {one.name} {value:.3g} {chart.unit}"
                 fill = "off" if chart.off[number] else kind
                 tall = min(value * zoom, HEIGHT)
-                yield rectangle((x, foot - tall), (wide, tall), f'class="{fill}"', said)
+                yield rectangle((x, foot - tall), (wide, tall), f'class="{fill}"', label)
                 if tall < value * zoom and place == 0:
                     at = (middle, foot - HEIGHT - 6)
                     yield text(at, f"{value:.2g}", "small", ' text-anchor="middle"')
@@ -151,7 +151,7 @@ def _legend(chart: Chart, y: float) -> Iterator[str]:
     ]
     if any(chart.off):
         entries.append(("off", "left out"))
-    for kind, said in entries:
+    for kind, label in entries:
         yield rectangle((x, y - 10), (12, 12), f'class="{kind}"')
-        yield text((x + 18, y), said)
-        x += 18 + LETTER_WIDTH_PX * len(said) + 20
+        yield text((x + 18, y), label)
+        x += 18 + LETTER_WIDTH_PX * len(label) + 20

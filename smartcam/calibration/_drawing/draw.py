@@ -73,18 +73,19 @@ def draw_uncertainty(
 ) -> str:
     """Return a map of the uncertainty of a lens, SVG, otherwise as :func:`draw_views`.
 
-    For a comparison of two lenses there are two maps: by how much the lenses differ, and by how
-    much noise alone makes them differ. Colours follow the logarithm, from dark to light; numbers
-    are pixels of one coordinate. A white cross marks the largest value; white dots are the points
-    in the views of a calibration. ``distance`` is as in
-    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    A comparison of two lenses gives two maps: their difference, and the difference that noise alone
+    causes. Colours follow the logarithm, from dark to light; numbers are pixels of one coordinate.
+    A white cross marks the largest value; white dots are the points in the views of a calibration.
+    ``distance`` is as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     if isinstance(shown, LensComparison):
-        observed = [Map("difference", _size(shown.pixels), shown.lengths, _said(shown.observed))]
+        observed = [
+            Map("difference", _size(shown.pixels), shown.lengths, _figures_text(shown.observed))
+        ]
         if shown.expected is not None and shown.predicted is not None:
             expected = np.sqrt(np.trace(shown.expected, axis1=2, axis2=3) / 2)
-            said = _said(shown.predicted)
-            observed.append(Map("what noise leads to", _size(shown.pixels), expected, said))
+            caption = _figures_text(shown.predicted)
+            observed.append(Map("expected from noise", _size(shown.pixels), expected, caption))
         return draw_maps(observed, title, "px")
     points = np.zeros((0, 2))
     if isinstance(shown, IntrinsicCalibration):
@@ -93,11 +94,11 @@ def draw_uncertainty(
     if not isinstance(shown, ProjectionUncertainty):
         raise _wrong("draw_uncertainty", "a calibration of a lens, its map or a comparison", shown)
     where = "infinity" if shown.distance is None else f"{shown.distance:g} m"
-    name = f"standard deviation of where a point at {where} is projected"
-    said = _said(shown.figures)
+    name = f"standard deviation of the projection of a point at {where}"
+    caption = _figures_text(shown.figures)
     if not (reached := np.isfinite(shown.sigma)).all():
-        said += f"; the model of the lens ends before {1 - reached.mean():.1%} of the image"
-    return draw_maps([Map(name, shown.size, shown.sigma, said, points)], title, "px")
+        caption += f"; the model of the lens ends before {1 - reached.mean():.1%} of the image"
+    return draw_maps([Map(name, shown.size, shown.sigma, caption, points)], title, "px")
 
 
 def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[Any], Any]:
@@ -117,9 +118,9 @@ def _size(pixels: Array) -> tuple[int, int]:
     return width, height
 
 
-def _said(figures: MapFigures) -> str:
-    known = {name: one for name, one in figures._asdict().items() if math.isfinite(one)}
-    return ", ".join(f"{name} {value:.2g}" for name, value in known.items())
+def _figures_text(figures: MapFigures) -> str:
+    finite = {name: one for name, one in figures._asdict().items() if math.isfinite(one)}
+    return ", ".join(f"{name} {value:.2g}" for name, value in finite.items())
 
 
 # ---------------------------------------------------------------------- bars

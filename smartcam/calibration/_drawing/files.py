@@ -37,17 +37,17 @@ def draw_file(
     calibration's ``load``.
     """
     document = read_document(path)
-    known = PICTURES.get(document.kind, ())
-    if not known or picture not in {None, *known}:
+    possible = PICTURES.get(document.kind, ())
+    if not possible or picture not in {None, *possible}:
         wanted = picture or " or ".join(PICTURES)
         raise Code.WRONG_KIND.refusal(
             f"{path}: holds {document.kind!r}, of which there is "
-            f"{' and '.join(known) or 'no picture'}; expected {wanted}",
+            f"{' and '.join(possible) or 'no picture'}; expected {wanted}",
             wanted,
             document.kind,
         )
     title, data = str(path), document.data
-    chosen = picture or known[0]
+    chosen = picture or possible[0]
     if document.kind == PlaneCalibration.kind:
         return draw_plane(PlaneCalibration.from_data(data), title=title)
     kinds = (IntrinsicCalibration, StereoCalibration, HandEyeCalibration)

@@ -44,14 +44,14 @@ class Map(NamedTuple):
     title: str
     size: tuple[int, int]  # size of the image, pixels
     values: Array  # (h, w), from corner to corner; NaN where there is no value
-    said: str = ""  # text below the map
+    caption: str = ""  # text below the map
     points: Array = np.zeros((0, 2))  # pixels that are marked by dots
 
 
 def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
     """Return maps side by side, with one legend: their colours mean the same."""
-    known = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
-    positive = known[known > 0.0]
+    finite = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
+    positive = finite[finite > 0.0]
     most = float(positive.max()) if len(positive) else 1.0
     least = float(positive.min()) if len(positive) else 0.1
     least = max(min(least, 0.999 * most), most / 10.0**MAX_DECADES)
@@ -84,8 +84,8 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
     yield f'<path d="{dots}" class="seen"/>'
     yield rectangle((left, HEAD), (WIDTH, tall), 'class="axis"')
     yield from _numbers(one.values, left, tall)
-    if one.said:
-        yield text((left, HEAD + tall + 20), one.said)
+    if one.caption:
+        yield text((left, HEAD + tall + 20), one.caption)
 
 
 def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
@@ -97,8 +97,8 @@ def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
             ends if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
         ):
             value = values[row, column]
-            said = f"{value:.2g}" if math.isfinite(value) else "beyond the model"
-            yield text((left + x, HEAD + y), said, "on-map", f' text-anchor="{anchor}"')
+            label = f"{value:.2g}" if math.isfinite(value) else "beyond the model"
+            yield text((left + x, HEAD + y), label, "on-map", f' text-anchor="{anchor}"')
     if np.isfinite(values).any():
         row, column = np.unravel_index(np.nanargmax(values), values.shape)
         at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * tall / rows])
@@ -137,5 +137,5 @@ def _legend(y: float, least: float, most: float, unit: str) -> Iterator[str]:
         part = tick / (TICKS - 1)
         value = least * (most / least) ** part
         anchor = "start" if tick == 0 else "end" if tick == TICKS - 1 else "middle"
-        said = f"{value:.2g}{f' {unit}' if tick == TICKS - 1 else ''}"
-        yield text((BORDER + part * WIDTH, y + 16), said, "", f' text-anchor="{anchor}"')
+        label = f"{value:.2g}{f' {unit}' if tick == TICKS - 1 else ''}"
+        yield text((BORDER + part * WIDTH, y + 16), label, "", f' text-anchor="{anchor}"')

@@ -1,6 +1,6 @@
 """Draw boards and cameras in space, seen from a corner of the room.
 
-The projection is parallel: far things are as large as near ones, so one scale holds for the whole
+The projection is parallel: far objects are as large as near ones, so one scale holds for the whole
 picture.
 """
 
@@ -39,14 +39,14 @@ LETTER_PX: Final = (7.5, 15.0)
 """Approximate width and height of a letter, pixels."""
 
 LABEL_OFFSET_PX: Final = np.array([0.0, 14.0])
-"""Offset of a label from its thing, pixels."""
+"""Offset of a label from its object, pixels."""
 
 LABEL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
     (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
 ]
-"""Further offsets of a label, pixels; the first that is free is taken."""
+"""Further offsets of a label, pixels; the first free one is used."""
 
 
 class DrawnBoard(NamedTuple):
@@ -147,7 +147,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         for one in scene.boards
     ]
     items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
-    items.sort(key=lambda one: -one.depth)  # draw far things first
+    items.sort(key=lambda one: -one.depth)  # draw far objects first
     parts = [text((BORDER, 28), title, "title")] if title else []
     parts += [one.drawn for one in items]
     for one, tips in zip(scene.axes, ends, strict=True):
@@ -179,7 +179,7 @@ def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
     """Yield labels that cover no other label; those without room are left out."""
-    taken: list[tuple[float, float, float, float]] = []
+    occupied: list[tuple[float, float, float, float]] = []
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
@@ -188,8 +188,8 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
             x, y = at + offset
             box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
-            if not outside and not any(_overlap(box, one) for one in taken):
-                taken.append(box)
+            if not outside and not any(_overlap(box, one) for one in occupied):
+                occupied.append(box)
                 if math.hypot(*offset) > 25:
                     yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')
                 yield text((x, y + 5), label, "halo", ' text-anchor="middle"')

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
-"""Pattern of a name: no dot, no slash, nothing that a file system gives a meaning to."""
+"""Pattern of a name: no dot, no slash, and no other letter with a meaning to a file system."""
 
 MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""
 
 EXPORTS = "exports"
-"""Name of the folder, inside of the given one, in which exported files stand."""
+"""Name of the folder, inside of the given one, for exported files."""
 
 _SUFFIXES = (".json", ".yaml", ".txt", ".calib")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)

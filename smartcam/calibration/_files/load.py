@@ -1,4 +1,4 @@
-"""Load calibrations that bring localizations to the robot, whichever kind a file holds."""
+"""Load a calibration of any kind that maps localizations to the robot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
     If the calibration is not good, a warning is logged.
 
     Raises:
-        CalibrationError: the file is damaged, newer, or holds something else.
+        CalibrationError: the file is damaged, newer, or of another kind.
         OSError: the file does not exist, or cannot be read.
     """
     return of_document(read_document(path), str(path))

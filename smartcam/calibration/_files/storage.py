@@ -119,10 +119,10 @@ class SavedCalibration(Stored):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote; log a warning if the calibration is not good.
+        """Read a file that :meth:`save` wrote; log a warning if the calibration is not good.
 
         Raises:
-            CalibrationError: the file is damaged, newer, or holds something else.
+            CalibrationError: the file is damaged, newer, or of another kind.
             OSError: the file does not exist, or cannot be read.
         """
         found = cls.from_data(store.read(path, cls.kind))

@@ -4,8 +4,7 @@ A file is JSON: ``schema``, ``schema_version``, ``kind``, ``written_at``, ``unit
 ``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with as many
 digits as it takes to read the same bits again; NaN and infinity, which JSON lacks, are refused.
 
-How a file replaces another one, and how many earlier ones are kept, is in
-:mod:`smartcam._whole_files`.
+:mod:`smartcam._whole_files` replaces files and keeps earlier ones.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Document:
     Attributes:
         kind: kind of the data: ``plane``, ...
         data: the data.
-        context: what was said about the data: frames, tool, raw samples, ...
+        context: facts about the data: frames, tool, raw samples, ...
         written_at: time of writing, UTC, ISO 8601.
         software: versions of the programs that wrote it, by name.
         version: the file's schema version, major and minor.
@@ -130,7 +129,7 @@ def read(path: StrPath, kind: str) -> dict[str, Any]:
 
 
 def read_document(path: StrPath) -> Document:
-    """Return all that a file holds.
+    """Return the contents of a file.
 
     Raises ``BROKEN_FILE``, ``NEWER_VERSION``; and OSError if the file cannot be read.
     """
@@ -148,9 +147,9 @@ def read_document(path: StrPath) -> Document:
     if content.get("schema") != SCHEMA:
         raise _broken(path, f"schema {content.get('schema')!r}, expected {SCHEMA!r}")
     version = _version(path, content.get("schema_version"))
-    said = content.pop("sha256", None)
-    if said != _digest(content):
-        raise _broken(path, "its hash is another: it was damaged, or changed by hand")
+    stated = content.pop("sha256", None)
+    if stated != _digest(content):
+        raise _broken(path, "its hash does not match: it was damaged, or changed by hand")
     for major in range(version[0], SCHEMA_VERSION[0]):
         content = MIGRATIONS[major](content)
     try:
@@ -183,7 +182,7 @@ def _version(path: StrPath, text: object) -> tuple[int, int]:
             text,
         )
     if any(major not in MIGRATIONS for major in range(version[0], SCHEMA_VERSION[0])):
-        raise _broken(path, f"schema_version {text!r}, which there never was")
+        raise _broken(path, f"schema_version {text!r}, which does not exist")
     return version
 
 

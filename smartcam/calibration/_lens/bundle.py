@@ -1,6 +1,6 @@
-"""Lenses, a rig of cameras and poses of targets, adjusted together to the least reprojection error.
+"""Adjust lenses, a rig of cameras and poses of targets together to the least reprojection error.
 
-If a sheet is not as it was meant to be, its points are adjusted, too, in the same equations. Each
+If a sheet is not exact, its points are adjusted, too, in the same equations. Each
 target pose affects only its own views, so its six unknowns are eliminated; see
 :mod:`smartcam.calibration._least_squares`.
 """
@@ -75,7 +75,7 @@ class Bundle:
     # F unknowns; (4 + K, 0) for a lens that is known
     basis: tuple[Array, ...]
     rigid: bool = False  # whether ``rig`` is known and not adjusted
-    # (T, 3), points of the target, metres, if they are not as they were meant to be
+    # (T, 3), points of the target, metres, if they are not the nominal ones
     points: Array | None = None
     free: bool = False  # whether ``points`` are adjusted; then they must be given
 
@@ -92,7 +92,7 @@ class Bundle:
         return cls((camera,), Rigid.stacked([]), poses, (known,), points=points)
 
     def known(self) -> Bundle:
-        """Return the bundle with nothing to adjust but the poses."""
+        """Return the bundle with only the poses to adjust."""
         lenses = tuple(known_lens(one) for one in self.cameras)
         return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
 
@@ -256,7 +256,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
     """Leave out each observed pose in turn, by a single step or, if needed, a new fit."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
-    # without the pose. What it leaves is of second order in how far the pose pulls the others.
+    # without the pose. The rest is of second order in the pull of the pose on the others.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
     matrix, right, _, _ = adjusted.normal.reduced()
     count, found = adjusted.bundle.of_cameras, []
@@ -337,7 +337,7 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
 class BundleEquations:
     """The parts of a bundle's equations that do not change while the bundle is adjusted.
 
-    ``prior``: whether free points are held where they were meant to be, within
+    ``prior``: whether free points are held at their nominal places, within
     LOOSE_SIGMA_RATIO and TIGHT_SIGMA_RATIO.
     """
 
@@ -384,7 +384,7 @@ class BundleEquations:
                 right[places.ravel()] += between[:, -1]
                 found.mixed[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and self._prior is not None:
-            # minimise also |p - meant|^2 / loose^2, and the same of them as a whole: see _prior
+            # minimise also |p - nominal|^2 / loose^2, and the same of the whole sheet: see _prior
             some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
             pull = self._prior @ off.ravel()
             matrix[some, some] += self._prior
@@ -426,14 +426,14 @@ def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     return found
 
 
-def _prior(meant: Array) -> Array:
-    """Return the weights (3 T, 3 T) that hold a sheet's points near where they were meant to be.
+def _prior(nominal: Array) -> Array:
+    """Return the weights (3 T, 3 T) that hold a sheet's points near their nominal places.
 
     Single points are held loosely; their common shift, turn and scale, which move no pixel, firmly.
     """
-    spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
-    near, axes = meant - meant.mean(axis=0), np.eye(3)
+    spacing = float(np.linalg.norm(nominal[1:] - nominal[0], axis=1).min())
+    near, axes = nominal - nominal.mean(axis=0), np.eye(3)
     moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
     whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
     weights: Array = whole @ whole.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
-    return weights + np.eye(3 * len(meant)) / (LOOSE_SIGMA_RATIO * spacing) ** 2
+    return weights + np.eye(3 * len(nominal)) / (LOOSE_SIGMA_RATIO * spacing) ** 2

@@ -1,4 +1,4 @@
-"""Compare two calibrations of one lens: how much they differ, and whether noise explains it."""
+"""Compare two calibrations of one lens, and test whether noise explains the difference."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class LensComparison:
 
     Attributes:
         distance: distance of the points from the camera, metres; None: infinity.
-        pixels: (h, w, 2), where the first lens sees a point.
+        pixels: (h, w, 2), pixels of the points in the first lens.
         difference: (h, w, 2), the pixel of the same point in the second lens minus that in the
             first, after ``motion``; NaN where a lens does not show the point.
         expected: (h, w, 2, 2), covariance of ``difference`` that the noise of both calibrations
@@ -151,10 +151,10 @@ def compare(
 ) -> LensComparison:
     """Compare where two calibrations of one lens project the same points.
 
-    A small motion of the camera is removed from the difference first: the one that fits best to the
-    target's points, where both calibrations have seen it. For lenses without views it is fitted to
-    points at the distance, in the largest circle around the image's centre. The noise of the two is
-    assumed to be independent; calibrations from the same images differ less.
+    A small motion of the camera is removed from the difference first: the motion that fits best to
+    the target's points in the area that both calibrations have seen. For lenses without views it is
+    fitted to points at the distance, in the largest circle around the image's centre. The noise of
+    the two is assumed to be independent; calibrations from the same images differ less.
 
     Args:
         a: calibration that is subtracted, or a bare lens, which is compared without a prediction.
@@ -165,7 +165,7 @@ def compare(
     Raises:
         CalibrationError: ``SHAPE``: neither calibrations nor lenses, or no such rows and columns;
             ``WRONG_SIZE``: images of two sizes; ``NOT_FINITE``: no such distance; ``OUT_OF_FIELD``:
-            the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion maps one
+            the lenses share too few places of the image; ``POOR_FIT``: no motion maps one
             lens to the other.
     """
     return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
@@ -234,20 +234,20 @@ def rig_difference(
 def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     """Return the points that the motion is fitted to, and whether they are only directions.
 
-    They are the target's points in those cells of the image in which both have seen it, or in all
-    cells if those are too few. For lenses without views they are in the largest circle around the
+    They are the target's points in the cells of the image in which both have seen it, or in all
+    cells if these are too few. For lenses without views they are in the largest circle around the
     image's centre: in corners without any view, lenses may project so differently that the camera
     would seem turned.
     """
-    known = [(one.camera, one.points) for one in (a, b) if one.points is not None]
-    if not known:
+    finite = [(one.camera, one.points) for one in (a, b) if one.points is not None]
+    if not finite:
         size = np.array(a.camera.size, dtype=np.float64)
         pixels = places(a.camera.size, SHAPE).reshape(-1, 2)
         inside = np.linalg.norm(pixels - (size - 1) / 2, axis=1) <= size.min() / 2
         return known_points(points_at(a.camera, pixels[inside], distance)), True
-    cells = [_cells(camera, points) for camera, points in known]
+    cells = [_cells(camera, points) for camera, points in finite]
     common = set(cells[0]).intersection(*cells)
-    both = np.concatenate([points for _, points in known])
+    both = np.concatenate([points for _, points in finite])
     shared = both[np.isin(np.concatenate(cells), list(common))]
     return known_points(shared if len(common) >= MIN_MOTION_PLACES else both), False
 
@@ -270,14 +270,14 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
         moved = gauge @ motion.rotation.T + motion.translation
         by_motion = sensitivity(second, moved, far=far).by_motion.reshape(-1, 6)
         off = (seen - _project(second, moved)).reshape(-1)
-        known = np.isfinite(off)
-        if np.count_nonzero(known) < len(known) / 2:
+        finite = np.isfinite(off)
+        if np.count_nonzero(finite) < len(finite) / 2:
             break
         step = np.asarray(
-            np.linalg.lstsq(by_motion[known], off[known], rcond=None)[0], dtype=np.float64
+            np.linalg.lstsq(by_motion[finite], off[finite], rcond=None)[0], dtype=np.float64
         )
         motion = motion.turned_after(step)
-        if np.abs(by_motion[known] @ step).max() < SETTLED_PX:
+        if np.abs(by_motion[finite] @ step).max() < SETTLED_PX:
             return motion
     raise Code.POOR_FIT.refusal(
         "compare: expected two calibrations of one lens, got lenses of which no motion of the "
@@ -288,8 +288,8 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
 
 def _project(camera: CameraModel, points: Array) -> Array:
     """Project points to pixels (N, 2); NaN stays NaN."""
-    known = np.isfinite(points).all(axis=1, keepdims=True)
-    return np.where(known, camera.project(np.where(known, points, [0.0, 0.0, 1.0])), np.nan)
+    finite = np.isfinite(points).all(axis=1, keepdims=True)
+    return np.where(finite, camera.project(np.where(finite, points, [0.0, 0.0, 1.0])), np.nan)
 
 
 def _root(covariance: Array) -> Array:
@@ -311,12 +311,12 @@ def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]
     # Q / (2 N) is as chi^2 over its freedom, (sum l)^2 / sum l^2 (Satterthwaite, An Approximate
     # Distribution of Estimates of Variance Components, 1946); and as D is an estimate itself, it is
     # F. Half of the views count: some tell far more than others.
-    known = np.isfinite(difference).all(axis=1)
-    if not known.any():
+    finite = np.isfinite(difference).all(axis=1)
+    if not finite.any():
         raise Code.OUT_OF_FIELD.refusal(
             "compare: expected lenses that reach the same places of the image, got none", got=0
         )
-    off, moves = difference[known], spread[known]
+    off, moves = difference[finite], spread[finite]
     back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + MIN_DIFFERENCE_PX**2 * np.eye(2))
     squares = float(np.einsum("ni,nij,nj->", off, back, off)) / (2 * len(off))
     gram = np.einsum("nip,nij,njq->pq", moves, back, moves)

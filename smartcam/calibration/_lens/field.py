@@ -1,11 +1,11 @@
 """Compute how the error of a lens moves points over the field, beyond what a pose compensates.
 
 Two calibrations of one lens may differ without disagreeing: if the principal point is off, the
-camera seems turned by as much, and every pose that is found with that lens is turned along. So an
+camera seems turned by as much, and every pose that is found with that lens is turned equally. So an
 error over the field is given without the small motion of the camera that fits it best. The points
 that this motion is fitted to are a choice, the gauge: best are those of the target where the
-calibration saw it. Points that are much nearer or farther are then less certain, as they are for
-anybody who finds the camera's pose with targets at one distance and uses it at another.
+calibration saw it. Points that are much nearer or farther are then less certain, as in a program
+that finds the camera's pose with targets at one distance and uses it at another.
 
 Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
 formulas here are written anew.
@@ -104,24 +104,24 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
 
     ``far``: the points, in the camera's frame, are directions to points at infinity.
     """
-    known = np.isfinite(points).all(axis=1, keepdims=True)
-    there = np.where(known, points, [0.0, 0.0, 1.0])
+    finite = np.isfinite(points).all(axis=1, keepdims=True)
+    there = np.where(finite, points, [0.0, 0.0, 1.0])
     at = linearize(there, camera)
     motion = pose_changes(at.by_point, there)
     if far:
         motion[:, :, 3:] = 0.0
-    missing = np.where(known, 0.0, np.nan)[:, :, None]
+    missing = np.where(finite, 0.0, np.nan)[:, :, None]
     return Sensitivity(at.by_lens + missing, motion + missing, at.by_point + missing)
 
 
 def known_points(points: Array) -> Array:
     """Return those points (N, 3) that are not NaN; raise ``OUT_OF_FIELD`` if they are too few."""
-    known = points[np.isfinite(points).all(axis=1)]
-    if len(known) < MIN_MOTION_PLACES:
+    finite = points[np.isfinite(points).all(axis=1)]
+    if len(finite) < MIN_MOTION_PLACES:
         raise Code.OUT_OF_FIELD.refusal(
             f"field of the lens: expected {MIN_MOTION_PLACES} places or more that its model "
-            f"reaches, got {len(known)} of {len(points)}",
+            f"reaches, got {len(finite)} of {len(points)}",
             MIN_MOTION_PLACES,
-            len(known),
+            len(finite),
         )
-    return known
+    return finite

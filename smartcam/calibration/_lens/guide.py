@@ -71,7 +71,7 @@ class NextView(NamedTuple):
     """A view that may be taken.
 
     Attributes:
-        text: where and how the target is to be held, for people.
+        text: text for people: place and tilt of the target.
         transform: ``T_camera_target``.
         outline: (4, 2), the target's corners as they would be seen, pixels.
         mean: RMS uncertainty of a coordinate over the field with this view, pixels.
@@ -126,7 +126,7 @@ def suggest_views(
     shown = target or calibration.views[0].view.target
     found = candidates(camera, shown, roll)
     basis = _fitted(calibration.covariance)
-    start, times = _known(calibration, basis)
+    start, times = _mixed_covariance(calibration, basis)
     weight = basis.T @ _criterion(calibration, distance) @ basis
     added = _informations(camera, found.poses, shown.points, basis)
     added = added / (_variance(calibration) * times)
@@ -153,15 +153,15 @@ def _variance(calibration: IntrinsicCalibration) -> float:
 
 def _fitted(covariance: Array) -> Array:
     """Return the derivatives (4 + K, F) of all values by those that were fitted."""
-    columns, held = np.eye(len(covariance)), np.diag(covariance) <= 0.0
+    columns, fixed = np.eye(len(covariance)), np.diag(covariance) <= 0.0
     # fx and fy are one unknown
-    if not held[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):
-        columns[1, 0], held[1] = 1.0, True
-    fitted: Array = columns[:, ~held]
+    if not fixed[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):
+        columns[1, 0], fixed[1] = 1.0, True
+    fitted: Array = columns[:, ~fixed]
     return fitted
 
 
-def _known(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, float]:
+def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, float]:
     """Return the covariance of the fitted values (F, F), and its ratio to that of noise alone.
 
     V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it

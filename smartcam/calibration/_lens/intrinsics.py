@@ -117,7 +117,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
             :attr:`ViewFit.held_out`. It is corrected for the six parameters of each held-out pose.
             NaN if there were too few views.
         coverage: range of places, sizes and tilts in which the target was shown.
-        sheet: (T, 3), offsets of the target's points from where they were meant to be, metres; None
+        sheet: (T, 3), offsets of the target's points from their nominal places, metres; None
             if they are taken as exact.
         warnings: remarks to read before using the calibration.
     """
@@ -206,16 +206,16 @@ class IntrinsicCalibration(storage.SavedCalibration):
         return tuple(self._errors(one) for one in views)
 
     def _errors(self, view: TargetView) -> Array:
-        meant = self.views[0].view.target
-        if self.sheet is not None and view.target != meant:
+        first = self.views[0].view.target
+        if self.sheet is not None and view.target != first:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"point_errors: expected views of {meant}, whose points were adjusted, got one of "
+                f"point_errors: expected views of {first}, whose points were adjusted, got one of "
                 f"{view.target}",
-                meant,
+                first,
                 view.target,
             )
         near = Rigid.stacked([locate(view, self.camera).transform.rigid])
-        points = None if self.sheet is None else meant.points + self.sheet
+        points = None if self.sheet is None else first.points + self.sheet
         bundle = Bundle.single(self.camera, near, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
@@ -252,8 +252,7 @@ def calibrate_intrinsics(
     view of a target that looks the same after half a turn may number its points from either end.
 
     If *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
-    does, nothing can show it: the lens is then that of the flipped pictures, and right only for
-    those.
+    does, no test can notice it: the lens is then right only for flipped pictures.
 
     Args:
         views: views of one target, 3 or more, of images of one size; tilted in several directions,
@@ -263,11 +262,11 @@ def calibrate_intrinsics(
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
         sheet: whether the target's points are adjusted, too, since printers stretch and paper
             bends. ``auto``: if that lowers the held-out error by more than chance. ``exact``:
-            never. ``free``: always. Adjusted points that few views show stay near where they were
-            meant to be. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an
-            exact sheet. Targets of more than 1000 points are taken as exact, untested.
-        drop_bad: whether views that fit far worse than the others are left out (and named), at
-            most a third of them; else they are only named.
+            never. ``free``: always. Adjusted points that few views show stay near their nominal
+            places. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an exact
+            sheet. Targets of more than 1000 points are taken as exact, untested.
+        drop_bad: whether views that fit far worse than the others are left out, at most a third of
+            them; a warning names them in any case.
 
     Raises:
         CalibrationError: ``TOO_FEW`` views or points; ``COLLINEAR`` points of a view;
@@ -281,10 +280,10 @@ def calibrate_intrinsics(
     check_choice(sheet, get_args(Sheet), "sheet")
     check_views(given, "intrinsics", MIN_VIEWS)
     _check_motion(given)
-    held = tuple(as_list(fixed, str, "fixed: name"))
+    fixed_names = tuple(as_list(fixed, str, "fixed: name"))
     used = list(range(len(given)))
     while True:
-        adjusted = fit_lens([given[number] for number in used], distortion_model, held)
+        adjusted = fit_lens([given[number] for number in used], distortion_model, fixed_names)
         worst, ratio = worst_view([given[number] for number in used], adjusted)
         dropped = len(given) - len(used) + 1
         enough = len(used) > MIN_VIEWS and dropped <= MAX_BAD_VIEW_SHARE * len(given)
@@ -299,7 +298,7 @@ def calibrate_intrinsics(
     again = functools.partial(
         calibrate_intrinsics,
         distortion_model=distortion_model,
-        fixed=held,
+        fixed=fixed_names,
         sheet=sheet,
         drop_bad=drop_bad,
     )

@@ -1,9 +1,9 @@
 """Explain views that fit a lens worse than noise would: flipped pictures, a zoom, or others.
 
-The likeliest explanation is not proven. So it is given as a warning, which says what else was
-tried: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each view is
-eliminated first, from the residuals and from the changes that each cause would make, so only what
-no pose can compensate is compared.
+The likeliest explanation is not proven. So it is given as a warning, which names the other
+explanations: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each
+view is eliminated first, from the residuals and from the changes that each cause would make, so
+only the parts that no pose can compensate are compared.
 """
 
 from __future__ import annotations
@@ -211,8 +211,8 @@ def misfit_remarks(
     """Yield a remark if flipped pictures, or a zoom, explain the views better than all else.
 
     In a flipped picture a board is found as well if it looks the same in a mirror; its points are
-    then those of a camera with a mirrored lens. But a misfit that large may have other causes: each
-    is fitted as well, and the one that explains most counts.
+    then those of a camera with a mirrored lens. But such a large misfit may have other causes: each
+    cause is fitted, and the best one counts.
 
     ``more``: variance in addition to the points' own, pixels^2. ``free`` (4 + K,): mask of the
     lens' values that were fitted. ``names``: names of the views.
@@ -243,13 +243,13 @@ def misfit_remarks(
     others = ", ".join(
         f"{what} {before / max(after, 1e-300):.3g}" for what, (after, _) in explained.items()
     )
-    told = f"times smaller so; what else was tried explains less for what it takes: {others}"
+    rest = f"times smaller so; what else was tried explains less for what it takes: {others}"
     changed, after = _zoomed(reduced, usual)
     if before > ZOOM_COST_RATIO * after and score(after, 3) < best:
         yield Code.WRONG_LENS.remark(
             f"views of two focal lengths: those from {names[changed]} on are of another one than "
             f"those before, was the zoom or the focus moved? The squares of all are "
-            f"{before / max(after, 1e-300):.3g} {told}"
+            f"{before / max(after, 1e-300):.3g} {rest}"
         )
         return
     flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in FLIPS.values()]
@@ -264,7 +264,7 @@ def misfit_remarks(
         which = ", ".join(itertools.compress(names, fewer.tolist()))
         yield Code.MIRRORED.remark(
             f"pictures that look flipped {how} against the others, or those of another camera: "
-            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {told}"
+            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {rest}"
         )
 
 

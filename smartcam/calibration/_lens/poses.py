@@ -109,9 +109,9 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     )
     if not found:
         raise Code.POOR_FIT.refusal(
-            f"pose of the target{_of(view)}: expected one before the camera that shows its "
+            f"pose of the target{_of(view)}: expected one in front of the camera that shows its "
             f"{len(view.ids)} points where they are, got none",
-            "a pose before the camera",
+            "a pose in front of the camera",
         )
     more = excess(found[0].residuals[0], view.covariance, found[0].freedom)
     if more:

@@ -106,7 +106,7 @@ def excess(residuals: Array, covariance: Array, freedom: int) -> float:
     Added to each coordinate, it makes the sum of the weighted squares equal to their degrees of
     freedom. It is 0 if chance makes residuals as large in 1 of 100 cases or more. ``residuals`` are
     (N, 2), pixels, ``covariance`` is (N, 2, 2), and ``freedom`` is the number of coordinates minus
-    that of fitted parameters; with 0 or less nothing can be said.
+    that of fitted parameters; with 0 or less the result is 0.
     """
     # Along each point's principal axes: find s^2 of sum e_j^2 / (l_j + s^2) = freedom, which falls
     # with s^2, so there is one root at most; at sum e_j^2 / freedom it is negative or 0.

@@ -1,9 +1,9 @@
 """Estimate the points of a printed sheet from the views, since printing is not exact.
 
 Printers stretch, paper bends. If many views show the same points off in the same way, the sheet is
-wrong, and a lens that is fitted to the points as they were meant absorbs that error. Then the
-points are adjusted together with lenses and poses. As a whole they keep the place, direction and
-size that were meant, so the scale stays.
+wrong, and a lens that is fitted to the nominal points absorbs that error. Then the points are
+adjusted together with lenses and poses. As a whole they keep their nominal place, direction and
+size, so the scale stays.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 Sheet: TypeAlias = Literal["auto", "exact", "free"]
-"""Treatment of a sheet's points: as they were meant, adjusted, or chosen by the fit."""
+"""Treatment of a sheet's points: nominal, adjusted, or chosen by the fit."""
 
 MIN_POSES: Final = 4
 """Fewer views than this, each left out in turn, do not show how much is chance."""
@@ -38,7 +38,7 @@ MAX_FREE_POINTS: Final = 1000
 
 
 class Shape(NamedTuple):
-    """The fitted points of a sheet, and the evidence that they are not as they were meant."""
+    """The fitted points of a sheet, and the evidence that the sheet is not exact."""
 
     adjusted: AdjustedBundle
     left_out: list[LeftOut]  # left-out fit of each pose
@@ -47,9 +47,9 @@ class Shape(NamedTuple):
 
 
 def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet) -> Shape:
-    """Return the fit with the target's points either as meant or adjusted.
+    """Return the fit with the target's points either nominal or adjusted.
 
-    ``adjusted`` has the points as they were meant. With ``sheet`` ``auto``, points are adjusted if
+    ``adjusted`` has the nominal points. With ``sheet`` ``auto``, points are adjusted if
     that predicts left-out views better, by more than the chance between views.
 
     Raises ``SHAPE`` if there are more points than may be adjusted.
@@ -79,8 +79,8 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     return exact._replace(remarks=[_remark(off, done)] if better else [])
 
 
-def _off(bundle: Bundle, meant: Array) -> Array:
-    return np.zeros(meant.shape) if bundle.points is None else bundle.points - meant
+def _off(bundle: Bundle, nominal: Array) -> Array:
+    return np.zeros(nominal.shape) if bundle.points is None else bundle.points - nominal
 
 
 def _squares(left_out: Sequence[LeftOut]) -> Array:
@@ -91,7 +91,7 @@ def _remark(off: Array, what: str) -> Remark:
     rms = 1e3 * math.sqrt(float((off**2).sum(axis=1).mean()))
     most = 1e3 * float(np.linalg.norm(off, axis=1).max())
     return Code.SHEET_NOT_EXACT.remark(
-        f"the sheet's points are {rms:.2g} mm rms from where they were meant to be, {most:.2g} mm "
+        f"the sheet's points are {rms:.2g} mm rms from their nominal places, {most:.2g} mm "
         f"at most: {what}"
     )
 
@@ -99,46 +99,46 @@ def _remark(off: Array, what: str) -> Remark:
 def adjust_shape(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
     """Return the least-squares solution in which the target's points are adjusted, too.
 
-    ``bundle`` is near the solution; the target's points start from its ``points``, or from where
-    they were meant to be if that is None. ``more`` is a first guess of the variance in addition to
-    the points' covariance, pixels^2, which is estimated anew.
+    ``bundle`` is near the solution; the target's points start from its ``points``, or from their
+    nominal places if that is None. ``more`` is a first guess of the variance in addition to the
+    points' covariance, pixels^2, which is estimated anew.
     """
-    meant = sights[0].view.target.points
-    points = meant if bundle.points is None else bundle.points
+    nominal = sights[0].view.target.points
+    points = nominal if bundle.points is None else bundle.points
     free = dataclasses.replace(bundle, points=points, free=True)
     adjusted = adjust_weighted(free, sights, more)
-    return dataclasses.replace(adjusted, bundle=_as_meant(adjusted.bundle, meant))
+    return dataclasses.replace(adjusted, bundle=_moved_bundle(adjusted.bundle, nominal))
 
 
-def _as_meant(bundle: Bundle, meant: Array) -> Bundle:
-    """Return an equivalent bundle whose points have the place, direction and size meant."""
+def _moved_bundle(bundle: Bundle, nominal: Array) -> Bundle:
+    """Return an equivalent bundle whose points have the nominal place, direction and size."""
     # Points q = s A p + a are shown as p is by poses (R A^T, s t - R A^T a) and a rig (R_c, s t_c):
     # R A^T q + s t - R A^T a = s (R p + t), and a point s times as far away is in the same pixel.
     if bundle.points is None:
         return bundle
-    size, turn, shift = likest(bundle.points, meant)
+    size, turn, shift = best_similarity(bundle.points, nominal)
     back = bundle.poses.rotation @ turn.T
     poses = Rigid(back, size * bundle.poses.translation - back @ shift)
     points = size * bundle.points @ turn.T + shift
     return dataclasses.replace(bundle, points=points, poses=poses, rig=bundle.rig.scaled(size))
 
 
-def as_meant(points: Array, meant: Array) -> Array:
-    """Return the points, moved to the place, direction and size that were meant."""
-    size, turn, shift = likest(points, meant)
+def moved_to_nominal(points: Array, nominal: Array) -> Array:
+    """Return the points, moved and scaled to the nominal place, direction and size."""
+    size, turn, shift = best_similarity(points, nominal)
     fitted: Array = size * points @ turn.T + shift
     return fitted
 
 
-def likest(points: Array, meant: Array) -> tuple[float, Array, Array]:
-    """Return the scale, turn and shift that bring points (T, 3) nearest to those meant."""
+def best_similarity(points: Array, nominal: Array) -> tuple[float, Array, Array]:
+    """Return the scale, turn and shift that bring points (T, 3) nearest to the nominal ones."""
     # Least squares of s R a + t - b: with the points centred and sum b a^T = U S V^T it is
     # R = U diag(1, 1, det(U V^T)) V^T and s = sum b (R a) / sum |a|^2.
     # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
     # Patterns (1991).
     middle = points.mean(axis=0)
-    near, far = points - middle, meant - meant.mean(axis=0)
+    near, far = points - middle, nominal - nominal.mean(axis=0)
     left, _, right = np.linalg.svd(far.T @ near)
     turn = left @ np.diag([1.0, 1.0, math.copysign(1.0, np.linalg.det(left @ right))]) @ right
     size = float(((near @ turn.T) * far).sum() / (near**2).sum())
-    return size, turn, meant.mean(axis=0) - size * turn @ middle
+    return size, turn, nominal.mean(axis=0) - size * turn @ middle

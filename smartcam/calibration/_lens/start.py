@@ -38,7 +38,7 @@ MAX_GOOD_RMS_PX: Final = 0.5
 
 
 def parameter_names(model: DistortionModel) -> tuple[str, ...]:
-    """Return the names of what :func:`~smartcam.calibration._lens.bundle.lens_values` gives.
+    """Return the names of the :func:`~smartcam.calibration._lens.bundle.lens_values`.
 
     Raises ``SHAPE`` if there is no such model.
     """
@@ -51,8 +51,8 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
     ``fixed``: names of coefficients that stay 0; ``aspect``: fx and fy are one unknown. Raises
     ``SHAPE`` if there is no such model, or if it has no coefficient of that name.
     """
-    names, own, held = parameter_names(model), coefficient_names(model), set(fixed)
-    unknown = sorted(held.difference(own, {"aspect"}))
+    names, own, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
+    unknown = sorted(fixed_names.difference(own, {"aspect"}))
     if unknown:
         raise Code.SHAPE.refusal(
             f"fixed: expected coefficients of {model} ({', '.join(own)}) or aspect, got "
@@ -61,10 +61,10 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
             unknown,
         )
     columns = np.eye(len(names))
-    if "aspect" in held:
+    if "aspect" in fixed_names:
         columns[:, 0] += columns[:, 1]
-        held.add("fy")
-    kept: Array = columns[:, [name not in held for name in names]]
+        fixed_names.add("fy")
+    kept: Array = columns[:, [name not in fixed_names for name in names]]
     return kept
 
 
@@ -99,7 +99,7 @@ def _fit(
     views: Sequence[TargetView], model: DistortionModel, basis: Array, length: float | None
 ) -> AdjustedBundle:
     guess = _first(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
-    # what must stay 0 is set to 0, and fy to fx if they are one unknown
+    # coefficients that stay 0 are set to 0, and fy to fx if they are one unknown
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)

@@ -179,7 +179,7 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
         off = [one.off for one in found if one.ident == ident]
         yield Code.OUTLIER.remark(
             f"point {ident} of the target is {np.median(off):.3g} pixels off in {len(off)} of "
-            f"{len(names)} views: it is not where it was meant to be, or something is taken for "
+            f"{len(names)} views: it is not at its nominal place, or something is taken for "
             f"it; it {done} there"
         )
     rest = [one for one in found if one.ident not in often]
@@ -214,9 +214,9 @@ def without_strays(
     names = [label(view, number) for number, view in enumerate(views)]
     left = without(views, found)
     kept = [one._replace(view=view) for one, view in zip(fitted, left, strict=True)]
-    said = stray_remarks(found, names, "was not used"), view_remarks(views, names)
+    remarks = stray_remarks(found, names, "was not used"), view_remarks(views, names)
     of_lens = lens_remarks(kept, "lens", more) if given else ()
-    return left, [*itertools.chain(*said), *of_lens]
+    return left, [*itertools.chain(*remarks), *of_lens]
 
 
 def examined(
@@ -235,8 +235,8 @@ def examined(
     fitted = [Fitted(one.view, found.camera, one.transform.rigid, points) for one in found.views]
     names = [label(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", found.rms, views)
-    said = [*view_remarks(views, names), *_remarks_on_middle(found)]
-    said += misfit_remarks(
+    of_fit = [*view_remarks(views, names), *_remarks_on_middle(found)]
+    of_fit += misfit_remarks(
         list(itertools.compress(fitted, used)),
         found.sigma**2,
         np.diag(found.covariance) > 0,
@@ -244,10 +244,10 @@ def examined(
     )
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
-        found, said = again(without(views, off)), []  # check_rms says it of these views
+        found, of_fit = again(without(views, off)), []  # remarked on by check_rms
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:

@@ -46,7 +46,7 @@ class ProjectionUncertainty:
         size: width and height of the images, pixels.
         distance: distance of the points from the camera, metres; None: infinity.
         pixels: (h, w, 2), places of the map.
-        covariance: (h, w, 2, 2), of the projection of a point that truly appears at that place,
+        covariance: (h, w, 2, 2), of the projection of a point whose true pixel is that place,
             pixels^2; NaN where no direction leads to the pixel.
         by_point: (h, w, 2, 3), derivative of the pixel by the point, in pixels per metre along the
             axes of the camera's frame; at infinity per radian.
@@ -73,8 +73,8 @@ class ProjectionUncertainty:
         # A pixel's derivative by the point, J (2, 3), is 0 along the ray, so J^+ gives the least
         # shift, which is across it.
         back = np.full_like(self.by_point.swapaxes(2, 3), np.nan)
-        known = np.isfinite(self.by_point).all(axis=(2, 3))
-        back[known] = np.linalg.pinv(self.by_point[known])
+        finite = np.isfinite(self.by_point).all(axis=(2, 3))
+        back[finite] = np.linalg.pinv(self.by_point[finite])
         shifts = back @ self.covariance @ back.swapaxes(2, 3)
         across: Array = np.sqrt(np.trace(shifts, axis1=2, axis2=3) / 2)
         return across
@@ -89,12 +89,12 @@ def figures(sigma: Array) -> MapFigures:
     """Sum up a map (h, w) of standard deviations, or of lengths, by four numbers."""
     rows, columns = sigma.shape
     corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
-    known = sigma[np.isfinite(sigma)]
+    finite = sigma[np.isfinite(sigma)]
     return MapFigures(
         float(sigma[rows // 2, columns // 2]),
         _mean(corners[np.isfinite(corners)]),
-        float(known.max()) if len(known) else math.nan,
-        _mean(known),
+        float(finite.max()) if len(finite) else math.nan,
+        _mean(finite),
     )
 
 

@@ -98,7 +98,7 @@ class Drift(NamedTuple):
         expected: RMS length of the offsets that errors of touches and calibration explain, metres.
         chance: probability, 0 to 1, with which these errors alone give offsets as large.
         z: ``chance`` in standard deviations of a normal distribution.
-        stale: True if ``chance`` is less than the level asked for.
+        stale: True if ``chance`` is less than the given level.
     """
 
     offsets: Array
@@ -119,7 +119,7 @@ class PlaneCalibration(storage.SavedCalibration):
             :func:`~smartcam.calibration.fit_touches`.
         camera_points: (N, 2), as given.
         robot_points: (N, 3), as given, metres.
-        weights: (N,), as given, ones where none were; 0 for a point that ``robust`` left out.
+        weights: (N,), as given, or ones; 0 for a point that ``robust`` left out.
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
         place: centre and size of the points, in both spaces.
         unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
@@ -242,8 +242,8 @@ class PlaneCalibration(storage.SavedCalibration):
     def judged(self, predicted: float | None = None, where: str = "") -> Judgement:
         """Return the verdict and the advice.
 
-        ``predicted``: RMS error to expect, metres; None: that at the points. ``where``: the place
-        that the verdict is about, for people.
+        ``predicted``: RMS error to expect, metres; None: that at the points. ``where``: text for
+        people: the place of the verdict.
         """
         counted, out = self.weights > 0.0, [1 + index for index in self.outliers]
         if predicted is None and self.touch_sigma is not None:
@@ -329,10 +329,10 @@ class PlaneCalibration(storage.SavedCalibration):
         if not isinstance(localizations, list):
             localizations = [*localizations]
         found = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
-        told = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
-        if told and self.touch_sigma is not None:
+        with_sigma = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
+        if with_sigma and self.touch_sigma is not None:
             sigmas = robot_sigmas(
-                [localizations[n] for n in told],
+                [localizations[n] for n in with_sigma],
                 self.transform,
                 self.normal,
                 self._rows,
@@ -340,7 +340,7 @@ class PlaneCalibration(storage.SavedCalibration):
                 self.place.camera_size,
                 flip=flip,
             )
-            for n, sigma in zip(told, sigmas, strict=True):
+            for n, sigma in zip(with_sigma, sigmas, strict=True):
                 found[n] = found[n]._replace(pose=found[n].pose.with_sigma(sigma))
         return found
 
@@ -406,7 +406,7 @@ class PlaneCalibration(storage.SavedCalibration):
     def check(
         self, camera_points: ArrayLike, robot_points: ArrayLike, *, level: float = STALE_LEVEL
     ) -> Drift:
-        """Compare points that were touched again with where the calibration expects them.
+        """Compare points that were touched again with their places by the calibration.
 
         Offsets are compared with the covariance of the new touches plus that of the calibration,
         which all points share. With several points two tests are made, each at half the level: of
@@ -574,7 +574,7 @@ def fit_plane(
     marks, touched = once.camera, once.robot
     kept = np.arange(len(marks))
     least = MODELS["similarity" if model == "auto" else model].least
-    # the message that points are the same must speak of the points as they came
+    # the message about equal points must name the points as given
     if len(marks) < len(camera):
         check_samples(camera, robot, least, touch_sigma, strays=robust)
     if robust:
@@ -684,7 +684,7 @@ def _moved_remark(missed: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
 
 
 def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Return the remark on a point left out: how far off it is, and how much touching explains."""
+    """Return the remark on a point left out: its distance, and the part that touching explains."""
     distance = float(np.linalg.norm(found.residuals[index]))
     variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
     variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2

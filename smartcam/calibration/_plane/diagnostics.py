@@ -121,7 +121,7 @@ def check_side(normal: Array, tool_z: Array) -> float:
 
 
 def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: bool) -> str | None:
-    """Return the remark on a scale that is not the nominal one; None if it is.
+    """Return the remark on a scale that is not the nominal one; None for the nominal one.
 
     Scales are in metres per unit of the camera; ``uncertainty`` is the standard deviation of
     ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
@@ -162,7 +162,7 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _fit(evidence: Evidence) -> Iterator[Remark]:
-    """Look for one point that is far worse than the others, then test all of them together."""
+    """Test for one point that is far worse than the others, then test all of them together."""
     fitted, weights = evidence.fitted, evidence.pairs.weights
     total = squares(fitted.residuals, weights)
     chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]
@@ -228,8 +228,8 @@ def _studentized(fitted: Fit) -> Array:
     """Return each residual's square over its own variance (N,), 0 if that is 0."""
     values, vectors = np.linalg.eigh(fitted.blocks)
     along = np.einsum("nij,ni->nj", vectors, fitted.residuals)
-    known = values > _TINY * values.max()
-    squared: Array = np.where(known, along**2 / np.where(known, values, 1.0), 0.0).sum(axis=1)
+    good = values > _TINY * values.max()
+    squared: Array = np.where(good, along**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
     return squared
 
 

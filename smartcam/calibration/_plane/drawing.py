@@ -1,7 +1,7 @@
 """Draw a plane calibration as SVG: the touched points, their residuals, the predicted error.
 
-It shows the camera's plane as the camera sees it, x to the right and y up. Errors are far too small
-to be seen, so residuals and ellipses are drawn larger, by a factor that the picture names.
+It shows the camera's plane as the camera sees it, x to the right and y up. Errors are too small to
+see, so residuals and ellipses are enlarged by a factor that the picture names.
 """
 
 from __future__ import annotations
@@ -176,8 +176,8 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     yield "</g>"
     for step in range(11):
         yield _cell(BORDER + 20 * step, field.foot + 45, 20, 14, step / 10)
-    said = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
-    yield _text((BORDER + 232, field.foot + 57), said)
+    label = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
+    yield _text((BORDER + 232, field.foot + 57), label)
 
 
 def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
@@ -262,9 +262,9 @@ def _legend(
 
 def _text(
     place: Array | tuple[float, float],
-    said: str,
+    label: str,
     kind: str = "",
     *,
     beside: tuple[float, float] = (0.0, 0.0),
 ) -> str:
-    return text((place[0] + beside[0], place[1] + beside[1]), said, kind)
+    return text((place[0] + beside[0], place[1] + beside[1]), label, kind)

@@ -236,9 +236,9 @@ class _Homogeneous:
 
 def _check_mapped(given: Array, result: Array) -> None:
     """Raise if a point of finite numbers was mapped to none; NaN may give NaN."""
-    known = np.isfinite(given).all(axis=1)
-    result[~known] = np.nan
-    wrong = known & ~np.isfinite(result).all(axis=1)
+    finite = np.isfinite(given).all(axis=1)
+    result[~finite] = np.nan
+    wrong = finite & ~np.isfinite(result).all(axis=1)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise not_finite(f"point {given[row].tolist()}", result[row].tolist())

@@ -6,9 +6,9 @@ in the robot's frame. So this motion is applied *after* the static chain (derive
 3.2.5.2, applies it before, which would be right only with the camera's place on the robot, and a
 plane's calibration does not know that.
 
-That holds as long as the plane of the parts is where the camera thinks it is: the motion must map
-the plane onto itself, as shifts within the plane and turns about its normal do. After a camera is
-raised or tilted, the same pixels show other places, so such poses are refused.
+That holds as long as the camera sees the plane of the parts at its calibrated place: the motion
+must map the plane onto itself, as shifts within the plane and turns about its normal do. After a
+camera is raised or tilted, the same pixels show other places, so such poses are refused.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class MovingCamera:
     """A calibrated camera on a robot that moves.
 
     Args:
-        static: solver from the camera, where it was calibrated, to the robot's frame.
+        static: solver from the camera, at the pose of its calibration, to the robot's frame.
         calibrated_at: pose of the robot at the calibration, ``T_base_flange``, or that of any part
             of the robot to which the camera is fixed.
-        field: (N, 3), three points or more in the plane, in the robot's frame, metres: those that
-            were touched. The plane must not move at these points.
+        field: (N, 3), three points or more in the plane, in the robot's frame, metres: the touched
+            ones. The plane must not move at these points.
         tolerance: largest distance that the plane may move out of itself at any point of the field,
             metres. A touch by hand is accurate to a fifth of a millimetre.
         max_lag: longest time between a pose of the robot and the image, seconds. At 250 mm/s the

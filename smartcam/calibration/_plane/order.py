@@ -1,4 +1,4 @@
-"""Find touches that belong to other marks than they were given for: exchanged or shifted ones.
+"""Find touches that were given for the wrong marks: exchanged or shifted ones.
 
 If the touches of two marks are exchanged, or all of them are shifted by one, least squares spread
 the mistake over all points. This module searches for the right order. It starts from the order as
@@ -134,7 +134,7 @@ class _Similarity:
     def _left(self, cross: Array) -> Array:
         """Return the sums of squares that similarities leave, from products (..., 3, 2)."""
         # If the squares of the marks add up to 1, the best scale is the sum of the singular values
-        # of C = sum p u^T, and its square is what the fit removes. (s1 + s2)^2 = tr C^T C + 2
+        # of C = sum p u^T, and the fit removes its square. (s1 + s2)^2 = tr C^T C + 2
         # sqrt(det C^T C). Source: Umeyama, Least-Squares Estimation of Transformation Parameters
         # (1991).
         inner = np.swapaxes(cross, -1, -2) @ cross

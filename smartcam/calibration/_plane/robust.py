@@ -6,9 +6,9 @@ map is the sum of the other points' squares, each counted up to a threshold. The
 fitted again to the points that agree with them, until those no longer change. A point is left out
 if noise alone would move any point so far from the others in only one of 100 calibrations.
 
-The maps are similarities, or homographies if noise does not explain by how much a similarity costs
-more. So the corners do not become outliers under a tilted camera, whichever model is used in the
-end.
+The maps are similarities, or homographies if noise does not explain the higher cost of a
+similarity. So the corners do not become outliers under a tilted camera, even if the final model is
+a similarity.
 
 The points are sorted first, and random subsets are drawn with a fixed seed, so the same points give
 the same answer in any order.
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MIN_POINTS = 6
-"""At least this many points are needed: with fewer, those that agree are hardly more than a map
+"""At least this many points are needed: with fewer, the agreeing ones are hardly more than a map
 needs."""
 
 MAX_SUBSETS_TRIED = 500
@@ -106,8 +106,8 @@ def agreeing(
 ) -> NDArray[np.bool_]:
     """Return the mask (N,) of points that agree with one another, more than half of them.
 
-    All points agree if no subset determines a map; ``check_samples`` then says what is wrong with
-    them. ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over the
+    All points agree if no subset determines a map; ``check_samples`` then reports the cause.
+    ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over the
     relative variance of each. ``touch_sigma``: standard deviation of one coordinate, metres; None:
     estimated from the points that agree. Without it up to about (N - 3) / 2 wrong points are found,
     with it any number below half of the points.
@@ -188,7 +188,7 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
 def _settle(
     name: ModelName, pairs: Pairs, mask: Mask, sigma: float | None, threshold: float
 ) -> _Agreement | None:
-    """Fit and judge in turn, until the points that agree are those that were fitted."""
+    """Fit and judge in turn, until exactly the fitted points agree."""
     fitted = None
     for _ in range(MAX_ROUNDS):
         if int(mask.sum()) < MODELS[name].least:
@@ -210,19 +210,19 @@ def _settle(
 def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     """Return a mask (N,) of the points that noise explains, each beside a fit of the others."""
     rows = element_derivatives(fitted.matrix, pairs.camera)
-    known = rows @ fitted.unit_covariance @ rows.swapaxes(1, 2)
+    by_map = rows @ fitted.unit_covariance @ rows.swapaxes(1, 2)
     # A fitted point has pulled the map towards itself: its residual has the variance I / w - J C
     # J^T. For any other point the variance of the map is added: I / w + J C J^T.
     signs = np.where(mask, -1.0, 1.0)[:, None, None]
-    variances = np.eye(3) / pairs.weights[:, None, None] + signs * known
+    variances = np.eye(3) / pairs.weights[:, None, None] + signs * by_map
     residuals = pairs.robot - apply_homography(fitted.matrix, pairs.camera)
     values, vectors = np.linalg.eigh(variances)
     along = np.einsum("nij,ni->nj", vectors, residuals)
-    told = values > MIN_VARIANCE_RATIO / pairs.weights[:, None]
-    squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
+    determined = values > MIN_VARIANCE_RATIO / pairs.weights[:, None]
+    squared = np.where(determined, along**2 / np.where(determined, values, 1.0), 0.0).sum(axis=1)
     if sigma is not None:
         return np.asarray(squared <= max(sigma, ROUNDING_RATIO) ** 2 * _limit(len(mask), None))
-    # An outlier would enlarge the sum of squares, so the point's own share is taken out: the sum
+    # An outlier would enlarge the sum of squares, so the point's own share is subtracted: the sum
     # falls by r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
     total, freedom = squares(fitted.residuals, pairs.weights[mask]), fitted.freedom
@@ -256,7 +256,7 @@ def _limit(count: int, freedom: int | None) -> float:
 
 
 def _scale(squared: Array, least: int) -> float:
-    """Return the sigma from the proposal that half of the points beside its own lie closest to.
+    """Return the sigma of the proposal with the least median of the other points' residuals.
 
     Source: Rousseeuw and Leroy, Robust Regression and Outlier Detection (1987), chapter 5: least
     median of squares, with their correction for few points.

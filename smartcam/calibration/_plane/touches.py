@@ -1,9 +1,9 @@
 """Fit a plane from the origin mark that the camera localizes, and touches of the sheet's rays.
 
 The sheet has an origin and two rays at right angles, A along its x and B along its y. The camera
-localizes the origin with its angle; the robot touches the origin, and each ray anywhere. The place
-along the ray is not known, so the scale comes from the user, and three touches leave only one
-number to check: the angle between the rays. If the camera sees more than one mark,
+localizes the origin with its angle; the robot touches the origin, and each ray at any place. This
+place is not known, so the scale comes from the user, and three touches leave only one number to
+check: the angle between the rays. If the camera sees more than one mark,
 :func:`~smartcam.calibration.fit_plane` gives a better calibration from as many touches.
 """
 

@@ -72,7 +72,7 @@ def read_pairs(
 
 
 class Distinct(NamedTuple):
-    """Points of which each counts once, however often it was touched."""
+    """Points that count once each, even if they were touched several times."""
 
     camera: Array  # (M, 2), camera's points
     robot: Array  # (M, 3), robot's points

@@ -167,11 +167,11 @@ def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
 def _pdf_circle(x: float, y: float, radius: float) -> str:
     parts = [f"{_pair(x + radius, y)} m"]
     for along, up in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-        before, behind, end = (
+        before, after, end = (
             _pair(x + radius * (along * a - up * b), y + radius * (up * a + along * b))
             for a, b in ((1, ARC_CONTROL_RATIO), (ARC_CONTROL_RATIO, 1), (0, 1))
         )
-        parts.append(f"{before} {behind} {end} c")
+        parts.append(f"{before} {after} {end} c")
     return " ".join([*parts, "h"])
 
 

@@ -65,11 +65,11 @@ AREA_REACH_SQUARES: Final = AREA_DISTANCE_SQUARES + AREA_DIAMETER_SQUARES / 2
 """Distance that the areas outside of a checkerboard's outer corners reach, in sides of a square."""
 
 AREA_GAP_MM: Final = 1.0
-"""Distance between a white area outside of a checkerboard and the things beyond it, mm."""
+"""Distance between a white area outside of a checkerboard and the parts beyond it, mm."""
 
 
 class PageLayout:
-    """The places of all things on a page.
+    """The places of all parts on a page.
 
     Args:
         box: rectangle around the target's pattern.
@@ -122,9 +122,9 @@ class PageLayout:
         return max(self._clear(RULER_SPAN_MM, edge) + TICK_MM[1], self._areas)
 
     def _clear(self, end: float, edge: float) -> float:
-        """Return the distance from the target of a thing that reaches from the origin to ``end``.
+        """Return the distance from the target of a part that reaches from the origin to ``end``.
 
-        The thing is placed between the areas at the corners, or beyond them if it does not fit.
+        The part is placed between the areas at the corners, or beyond them if it does not fit.
         """
         return self._quiet if end <= edge else max(self._quiet, self._areas + AREA_GAP_MM)
 
@@ -154,10 +154,10 @@ class PageLayout:
 def _along(
     pattern: tuple[float, float], bands: tuple[float, float], side: float
 ) -> tuple[float, float]:
-    """Return the origin's place along a side of the page, and the length which that side needs.
+    """Return the origin's place along a side of the page, and the least length of that side.
 
     ``pattern``: begin and end of the pattern, from its origin. ``bands``: space needed before and
-    behind the pattern.
+    after the pattern.
     """
     low, high = pattern
     needed = 2 * BORDER_MM + bands[0] + max(high - low + bands[1], RULER_SPAN_MM - low)

@@ -155,9 +155,7 @@ def outlines(cells: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
 def _corners(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the points of a loop at which it turns."""
     around = zip([loop[-1], *loop[:-1]], loop, [*loop[1:], loop[0]], strict=True)
-    return [
-        at for before, at, behind in around if behind[0] != before[0] and behind[1] != before[1]
-    ]
+    return [at for before, at, after in around if after[0] != before[0] and after[1] != before[1]]
 
 
 def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:

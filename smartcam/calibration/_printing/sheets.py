@@ -245,10 +245,10 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     """Return a target with its lengths as they are on paper.
 
     Args:
-        target: the target as it was to be printed.
+        target: the target with its nominal lengths.
         measured_ruler: measured lengths of the printed rulers along x and along y, mm. A target has
-            one scale, the mean of both. If the rulers differ by more than half a percent, that is
-            not a scale but a printer that pulls the paper unevenly.
+            one scale, the mean of both. If the rulers differ by more than half a percent, the
+            printer pulls the paper unevenly.
 
     Raises:
         CalibrationError: SCALE_MISMATCH: a ruler is more than 5 % off 100 mm, or the rulers differ

@@ -9,7 +9,7 @@
     )
     calibration.transform([[412.5, 300.0]])         # pixels, v down: metres of the robot
 
-The robot touches corners of the sheet, or its rays; the camera need not detect the touched points.
+The robot touches corners of the sheet, or its rays; the camera need not see the touched points.
 """
 
 from __future__ import annotations
@@ -238,9 +238,9 @@ class SheetCalibration(storage.SavedCalibration):
     def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
         flat = self.sheet.solve(Poses.of(parts)).put(parts)
-        told = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
-        if told and self.plane.touch_sigma is not None:
-            for n, sigma in zip(told, self._sigmas([parts[n] for n in told]), strict=True):
+        rows = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
+        if rows and self.plane.touch_sigma is not None:
+            for n, sigma in zip(rows, self._sigmas([parts[n] for n in rows]), strict=True):
                 flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
         return self.plane.to_robot(flat, tool_flip=flip)
 
@@ -326,7 +326,7 @@ def calibrate_sheet(
     """Calibrate the map from pixels to the robot.
 
     Args:
-        view: view of the target while the sheet lies where it is touched.
+        view: view of the target with the sheet at the place of the touches.
         plane: map from the sheet's metres to the robot: of :func:`fit_corners`, or of
             :func:`~smartcam.calibration.fit_touches` with the origin at (0, 0).
         camera: the lens, for images of the same size; None: a homography of the view's points.
@@ -395,7 +395,7 @@ def fit_corners(
     Args:
         target: target with its lengths as they are on paper.
         ids: (N,), numbers of the target's points that were touched, three at least.
-        touches: (N, 3), where the robot's tip was, metres.
+        touches: (N, 3), places of the robot's tip, metres.
         touch_sigma: standard deviation of one coordinate of a touch, metres, as in
             :func:`~smartcam.calibration.fit_plane`.
         tool_z: direction of the tool's axis, as in :func:`~smartcam.calibration.fit_plane`.

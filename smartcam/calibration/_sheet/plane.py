@@ -45,7 +45,7 @@ MAX_STEPS = 20
 
 SETTLED_SIGMAS = 1e-6
 """The fit ends when a step changes each element of the homography by less than this part of its
-standard deviation, the others held; the next step would change it a million times less."""
+standard deviation for fixed others; the next step would change it a million times less."""
 
 DIRECTION_STEP_PX = 0.5
 """The direction of a point on the sheet is computed from points this many pixels to both sides."""
@@ -117,7 +117,7 @@ class SheetPlane:
     def by_elements(self, flat: Array) -> Array:
         """Return the derivatives (N, 2, 9) of points (N, 2) of the sheet by the matrix' elements.
 
-        Each point is the one that its pixel shows.
+        Each pixel stays fixed.
         """
         # The pixel does not change: 0 = D dx + E dm, with the derivatives D by the point and E by
         # the elements, so dx = -D^-1 E dm.
@@ -295,5 +295,5 @@ def _scaling(points: Array) -> Array:
 def _no_fit(view: TargetView) -> CalibrationError:
     return Code.POOR_FIT.refusal(
         f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
-        "a plane before the camera",
+        "a plane in front of the camera",
     )

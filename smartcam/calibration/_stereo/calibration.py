@@ -110,7 +110,7 @@ class StereoCalibration(storage.SavedCalibration):
             pairs. NaN if there were too few pairs.
         held_out_epipolar: RMS distance from the epipolar lines of cameras fitted without the pair,
             pixels.
-        sheet: (T, 3), offsets of the target's points from where they were meant to be, metres; None
+        sheet: (T, 3), offsets of the target's points from their nominal places, metres; None
             if they are taken as exact.
         warnings: remarks to read before using the calibration.
     """
@@ -328,9 +328,9 @@ def calibrate_stereo(
             the same.
         sheet: ``auto``, ``exact`` or ``free``: whether the target's points are adjusted, too, as in
             :func:`~smartcam.calibration.calibrate_intrinsics`.
-        drop_bad: whether views that fit far worse than the others are left out (and named), at most
-            a third of them; else they are only named. In a pair whose views do not belong together
-            the right view is left out.
+        drop_bad: whether views that fit far worse than the others are left out, at most a third of
+            them; a warning names them in any case. In a pair whose views do not belong together the
+            right view is left out.
 
     Raises:
         CalibrationError: ``TOO_FEW``: fewer than 3 pairs, or than 2 if both lenses are known;
@@ -471,15 +471,15 @@ def _pair(found: _Found, number: int, without: Mapping[int, PairErrors]) -> Pair
     }
     pose = Transform(LEFT, TARGET, *found.adjusted.bundle.poses.taken(number))
     left, right = found.moments[number]
-    held = without.get(number)
+    errors = without.get(number)
     return PairFit(
         left=left,
         right=right,
         used=(0 in rms, 1 in rms),
         transform=pose if rms else None,
         rms=(rms.get(0, math.nan), rms.get(1, math.nan)),
-        held_out=_rms([held.spacing]) if held else math.nan,
-        epipolar=_rms([held.epipolar]) if held else math.nan,
+        held_out=_rms([errors.spacing]) if errors else math.nan,
+        epipolar=_rms([errors.epipolar]) if errors else math.nan,
     )
 
 

@@ -68,7 +68,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     for number, left, right in pairs:
         if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
             raise Code.COINCIDENT.refusal(
-                "stereo: expected what two cameras see, got the same image on both sides in "
+                "stereo: expected images of two cameras, got the same image on both sides in "
                 f"{label(left, number)}",
                 "two cameras",
                 number,
@@ -130,19 +130,19 @@ def examined(
     seen = list(_seen(found))
     fitted, used = [one.fitted for one in seen], [one.used for one in seen]
     names = [f"{label(one.fitted.view, one.pair)}, {SIDES[one.side]}" for one in seen]
-    said = list(view_remarks([one.view for one in fitted], names))
+    of_fit = list(view_remarks([one.view for one in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
             own = [one.fitted for one in seen if one.used and one.side == side]
-            said += lens_remarks(own, f"{name} lens", found.sigma**2)
+            of_fit += lens_remarks(own, f"{name} lens", found.sigma**2)
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
         for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
             sides[one.side][one.pair] = view
-        found, said = again(*sides), []  # check_fit says it of these views
+        found, of_fit = again(*sides), []  # remarked on by check_fit
     done = "was not used" if drop else "is used all the same"
     remarks = stray_remarks(off, names, done)
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))
 
 
 class _SeenFrom(NamedTuple):
@@ -197,6 +197,6 @@ def remark_sides(transform: Transform) -> list[Remark]:
     return [
         Code.SWAPPED_SIDES.remark(
             "left and right seem swapped: expected the right camera on the right of the left one, "
-            f"got it {1e3 * along[0]:.3g} mm on the left; where it is meant so, all is well"
+            f"got it {1e3 * along[0]:.3g} mm on the left; if that is intended, ignore this"
         )
     ]

@@ -97,17 +97,17 @@ def as_moments(
 
 
 class FirstGuess(NamedTuple):
-    """A first guess of all that is calibrated."""
+    """A first guess of lenses, transform and poses."""
 
     moments: list[Moment]  # the right views numbered as the left ones are
     bundle: Bundle  # lenses, transform and poses
     # moments whose views do not belong together, with the distance, pixels, of the right view from
-    # where the left view and the other pairs predict it; infinite if that is behind the camera
+    # its prediction by the left view and the other pairs; infinite behind the camera
     apart: dict[int, float]
 
 
 def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
-    """Return a first guess of all that is calibrated.
+    """Return a first guess of lenses, transform and poses.
 
     Raises ``POOR_FIT`` if no lens or no transform fits the views; ``INSUFFICIENT_ROTATION``;
     ``WRONG_SIZE`` if views are from another camera than the known one.

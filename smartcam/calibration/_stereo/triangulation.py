@@ -59,13 +59,13 @@ def triangulate(
             moved = np.linalg.norm(step, axis=1) > SETTLED_DEPTH_RATIO * np.abs(points[:, 2])
         if not moved.any():
             break
-    behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
-    points[behind] = np.nan
+    hidden = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
+    points[hidden] = np.nan
     points[~np.isfinite(points).all(axis=1)] = np.nan  # all weights are finite
     # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
     inverse = np.full_like(normal, np.nan)
-    inverse[~behind] = np.linalg.pinv(normal[~behind], hermitian=True)
+    inverse[~hidden] = np.linalg.pinv(normal[~hidden], hermitian=True)
     return Triangulated(points, inverse)
 
 
@@ -103,10 +103,10 @@ def _step(
     jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(off, axis=1)
     normal = jacobian.swapaxes(1, 2) @ jacobian
     right_side = jacobian.swapaxes(1, 2) @ residuals
-    known = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
+    finite = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
     step = np.full((len(points), 3), np.nan)
-    inverse = np.linalg.pinv(normal[known], hermitian=True)
-    step[known] = (inverse @ right_side[known])[..., 0]
+    inverse = np.linalg.pinv(normal[finite], hermitian=True)
+    step[finite] = (inverse @ right_side[finite])[..., 0]
     return normal, step
 
 

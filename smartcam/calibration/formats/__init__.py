@@ -74,7 +74,7 @@ __all__ = [
 
 
 def _arguments(title: str, compose: Callable[..., str], **options: bool) -> Format[Transform]:
-    """Return a format of command-line arguments; all of these are read alike."""
+    """Return a format of command-line arguments; all of them are read in the same way."""
     return Format(title, ".txt", named(ros.parse_arguments), partial(compose, **options))
 
 
@@ -132,7 +132,7 @@ TRANSFORMS: Mapping[str, Format[Transform]] = {
     ),
     "urdf": Format("origin of a joint in a robot's description", ".urdf", ros.parse_urdf),
 }
-"""Formats of one transform. Those that differ only in what they write are read alike."""
+"""Formats of one transform. Formats that differ only in writing are read in the same way."""
 
 SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
     "moveit": Format(
@@ -168,7 +168,7 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         most=MAX_FILE_BYTES,
     ),
 }
-"""Formats of poses over time; both are read alike, since the file's header decides."""
+"""Formats of poses over time; both are read in the same way, since the file's header decides."""
 
 _MATRIX: Format[PlaneMatrix] = Format(
     "matrix of a plane calibration",
@@ -304,9 +304,9 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         )
     transform, scale = plane_frame(calibration)
     for name in (transform.target, transform.source):
-        frame_name(name, "frame")  # in the comment, whatever the format can hold
-    said = (
+        frame_name(name, "frame")  # the comment must be able to hold it
+    comment = (
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"
     )
-    return wanted.head + said + wanted.text(transform)
+    return wanted.head + comment + wanted.text(transform)

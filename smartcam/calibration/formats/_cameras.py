@@ -247,8 +247,8 @@ def parse_camera_info(text: str, size: tuple[int, int] | None = None) -> CameraI
         projection = stored_matrix(data["projection_matrix"], "projection_matrix", (3, 4))
     coefficients = stored_matrix(data["distortion_coefficients"], "distortion_coefficients").ravel()
     model = _model(data["distortion_model"], coefficients)
-    said = [data[key] for key in ("image_width", "image_height") if key in data]
-    camera = _camera(_size(said, size), matrix, coefficients, model)
+    stated = [data[key] for key in ("image_width", "image_height") if key in data]
+    camera = _camera(_size(stated, size), matrix, coefficients, model)
     name = data.get("camera_name", "camera")
     if not isinstance(name, str):
         raise malformed("camera_name", "a text", name)
@@ -367,9 +367,9 @@ def parse_opencv(
     if extrinsics:
         data = {**_normal(load_storage(extrinsics)), **data}
     sides = next((ends for ends in _ENDS if _has(data, _MATRIX, ends[0])), None)
-    said = [data[key] for key in ("imagewidth", "imageheight") if key in data]
+    stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
     whole = _first(data, ("imagesize", "size"), "", [])
-    size = _size(said or sequence(whole, "image_size"), size)
+    size = _size(stated or sequence(whole, "image_size"), size)
     if sides is None:
         camera = _opencv_camera(data, size, "")
         return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")
@@ -423,13 +423,13 @@ def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> C
             raise malformed("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
     coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()
-    said = data.get("distortionmodel")
-    if said is None:
+    name = data.get("distortionmodel")
+    if name is None:
         many = len(coefficients) == 8 or coefficients[5:].any()
-        said = "rational_polynomial" if many else "plumb_bob"
+        name = "rational_polynomial" if many else "plumb_bob"
         if data.get("fisheyemodel") == "1":
-            said = "equidistant"
-    return _camera(size, matrix, coefficients, _model(said, coefficients))
+            name = "equidistant"
+    return _camera(size, matrix, coefficients, _model(name, coefficients))
 
 
 # ---------------------------------------------------------------------- all
@@ -489,17 +489,17 @@ def _cannot(form: str, expected: str, got: str) -> CalibrationError:
     )
 
 
-def _size(said: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, int]:
+def _size(stated: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, int]:
     """Return width and height, pixels, from those in the file and those that the user gives."""
-    if not said:
+    if not stated:
         if given is None:
             raise Code.WRONG_SIZE.refusal(
-                "file: expected width and height of the images, which it does not say; give them "
+                "file: expected width and height of the images, which it lacks; give them "
                 "as size=(width, height), pixels",
                 "size=(width, height)",
             )
         return int(given[0]), int(given[1])
-    width, height = (whole(one, "size of the images") for one in sequence([*said], "size", 2))
+    width, height = (whole(one, "size of the images") for one in sequence([*stated], "size", 2))
     if given is not None and (width, height) != tuple(given):
         raise Code.WRONG_SIZE.refusal(
             f"size: the file says {width} x {height}, got {given[0]} x {given[1]}",
@@ -509,13 +509,13 @@ def _size(said: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, in
     return width, height
 
 
-def _model(said: Plain, coefficients: Array) -> DistortionModel:
+def _model(name: Plain, coefficients: Array) -> DistortionModel:
     for model in COEFFICIENTS:
-        if model == said:
+        if model == name:
             return model
-    if not len(coefficients) and said in {"", "none"}:
+    if not len(coefficients) and name in {"", "none"}:
         return "plumb_bob"
-    raise malformed("distortion_model", ", ".join(COEFFICIENTS), said)
+    raise malformed("distortion_model", ", ".join(COEFFICIENTS), name)
 
 
 def _camera(

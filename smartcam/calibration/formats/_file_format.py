@@ -46,7 +46,7 @@ class Format(Generic[T]):
 
     title: str  # description for people
     suffix: str  # suffix of the files' names
-    # function that makes a value of a text and of further arguments: the size for cameras, else the
+    # function that parses a text to a value; further arguments: the size for cameras, else the
     # names of target and source if the format has none. It returns Measured if lengths may be in
     # any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`
@@ -84,14 +84,14 @@ class Format(Generic[T]):
 
     def _in_metres(self, found: T | Measured[T], unit: str | None) -> T:
         by_file = isinstance(found, Measured)
-        said = cast("Measured[T]", found).unit if by_file else "m"
+        stated = cast("Measured[T]", found).unit if by_file else "m"
         value = cast("Measured[T]", found).value if by_file else cast("T", found)
         motions = _motions(value)
         if not motions:
             return value
-        if unit is None and said is None:
+        if unit is None and stated is None:
             raise no_unit("lengths")
-        factor = metres_of(unit or said or "m", "lengths")
+        factor = metres_of(unit or stated or "m", "lengths")
         if unit is None and not by_file:
             for motion in motions:
                 distance = factor * float(np.linalg.norm(motion.translation))

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class ForeignLens(NamedTuple):
-    """A lens as it is in a file."""
+    """A lens in a file's own terms."""
 
     name: str
     size: Sequence[Plain] | None  # width and height, pixels; None if the file does not say it
@@ -110,19 +110,19 @@ MODELS: Final[Mapping[str, Mapping[str, _LensParameters]]] = {
 
 def _lens(
     program: str,
-    said: Plain,
+    name: Plain,
     values: Sequence[float],
     where: str,
     size: Sequence[Plain] | None,
 ) -> ForeignLens:
     """Return a lens from its parameters, which are in the order of the program's model."""
     models = MODELS[program]
-    if not (isinstance(said, str) and said in models):
-        raise malformed(f"{where}: lens model", f"one of {', '.join(models)}", said)
-    wanted = models[said]
+    if not (isinstance(name, str) and name in models):
+        raise malformed(f"{where}: lens model", f"one of {', '.join(models)}", name)
+    wanted = models[name]
     names = [*wanted.focal.split(), *wanted.coefficients.split()]
     if len(values) != len(names):
-        expected = f"{len(names)} parameters of {said} ({', '.join(names)})"
+        expected = f"{len(names)} parameters of {name} ({', '.join(names)})"
         raise malformed(where, expected, f"{len(values)}")
     given = dict(zip(names, values, strict=True))
     fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
@@ -252,8 +252,8 @@ def parse_basalt(text: str) -> Found:
     for place, one in enumerate(cameras):
         where = f"cam{place}"
         part = mapping(one, where, ["camera_type", "intrinsics"])
-        known = MODELS["basalt"].get(str(part["camera_type"]), _LensParameters(_FXFY))
-        names = [*known.focal.split(), *known.coefficients.split()]
+        parameters = MODELS["basalt"].get(str(part["camera_type"]), _LensParameters(_FXFY))
+        names = [*parameters.focal.split(), *parameters.coefficients.split()]
         given = mapping(part["intrinsics"], where, names)
         values = [number(given[name], f"{where}.{name}") for name in names]
         size = sequence(sizes[place], f"{where}: resolution", 2) if sizes else None

@@ -67,7 +67,7 @@ def read_lenses(
     :func:`read_cameras`, which explains ``size`` and ``unit``.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``: the file is none of these; ``WRONG_KIND``: the
+        CalibrationError: ``UNKNOWN_FORMAT``: the file has no known format; ``WRONG_KIND``: the
             calibration has no lens; and those of :func:`read_cameras` and of the calibrations'
             ``load``.
         MissingExtraError: PyYAML is not installed.

@@ -257,7 +257,7 @@ def rigid(
 
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right = np.linalg.svd(matrix)
-    # a reflection is not corrected, and so it is refused
+    # a reflection cannot be corrected: it is refused
     return np.asarray(left @ right, dtype=np.float64)
 
 

@@ -5,8 +5,8 @@
     pose_from("kuka", [400, 120, 35.5, 90, 0, 180])    # T_base_tool
     pose_to("ur", pose)                                # [x, y, z, rx, ry, rz]
 
-Each convention is a row of :data:`ROBOTS`: its numbers in their order, its unit of length, and how
-it writes an orientation. Angles are right-handed turns.
+Each convention is a row of :data:`ROBOTS`: its numbers in their order, its unit of length, and its
+form of an orientation. Angles are right-handed turns.
 
 Source: Universal Robots, Script Manual, module motion (m, axis-angle); Roboception, rc_visard
 manual, appendix "Pose formats", for ABB, FANUC, KUKA (published: ``r_z(R) r_y(P) r_x(W)``,
@@ -123,10 +123,10 @@ class PoseConvention(NamedTuple):
     """The convention by which a robot's poses are written."""
 
     numbers: tuple[str, ...]  # names of the numbers, in order
-    metre: float  # number of its units of length in a metre
-    # function that makes a rotation (3, 3) of the numbers after the position
+    metre: float  # number of length units in a metre
+    # function that converts the numbers after the position to a rotation (3, 3)
     rotation: Callable[[Array], Array]
-    orientation: Callable[[Transform], list[float]]  # function that makes those numbers of a pose
+    orientation: Callable[[Transform], list[float]]  # its inverse, from a pose
     title: str  # form of the orientation, in words
 
 

@@ -147,11 +147,11 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
 
 
 def _from_options(words: Sequence[str]) -> Transform:
-    known = [*_POSITION, *_QUATERNION, *_ANGLES, *_FRAMES]
+    options = [*_POSITION, *_QUATERNION, *_ANGLES, *_FRAMES]
     given: dict[str, str] = {}
     for option, value in zip(words[::2], [*words[1::2], None], strict=False):
-        if option not in known or option in given or value is None:
-            raise malformed("arguments", f"options {', '.join(known)}, each once", option)
+        if option not in options or option in given or value is None:
+            raise malformed("arguments", f"options {', '.join(options)}, each once", option)
         given[option] = value
     missing = [one for one in _FRAMES if one not in given]
     if missing or (given.keys() & _QUATERNION and given.keys() & _ANGLES):

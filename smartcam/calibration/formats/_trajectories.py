@@ -1,6 +1,6 @@
 """Read and write poses over time as CSV, with the columns of ASL's tools or of EuRoC's data sets.
 
-The header decides which: it names the columns, and with them the order of the quaternion and the
+The header decides: it names the columns, and with them the order of the quaternion and the
 unit of time. EuRoC has nanoseconds and the real part first, the others seconds and the real part
 last. A file without a header is refused: the rows of both are eight numbers.
 
@@ -94,8 +94,8 @@ def parse_csv(
 
 
 def _no_header(line: str) -> CalibrationError:
-    known = f"{_ASL_HEAD.strip()} or {_EUROC_HEAD.strip()}"
-    return malformed("header", f"{known}, the unit of time among them", line)
+    expected = f"{_ASL_HEAD.strip()} or {_EUROC_HEAD.strip()}"
+    return malformed("header", f"{expected}, the unit of time among them", line)
 
 
 def _header(line: str) -> _Columns | None:
@@ -108,10 +108,10 @@ def _header(line: str) -> _Columns | None:
             places = tuple(names.index(name) for name in columns)
             seconds = _SECONDS.get(units[places[0]] or unit)
             if seconds is not None:
-                said = {units[place] for place in places[1:4]}
-                if len(said) > 1:
+                found = {units[place] for place in places[1:4]}
+                if len(found) > 1:
                     raise malformed("header", "one unit of x, y and z", line)
-                return _Columns(places, len(cells), seconds, said.pop() or None)
+                return _Columns(places, len(cells), seconds, found.pop() or None)
     return None
 
 

@@ -1,4 +1,4 @@
-"""Make images and scenes whose truth is known, for tests."""
+"""Make images and scenes with known truth, for tests."""
 
 from __future__ import annotations
 

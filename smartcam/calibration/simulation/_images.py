@@ -1,9 +1,8 @@
 """Draw images of targets as a camera would take them, for tests with known truth.
 
 Each pixel is the mean, over its own square, of the image of a lens with a Gaussian blur. Edges are
-drawn by the part of each sample that they cover, so that nothing is rounded to a raster: a corner
-lies in the image where :meth:`~smartcam.calibration.CameraModel.project` puts it, to a few
-thousandths of a pixel.
+drawn by the part of each sample that they cover, without rounding to a raster: a corner is at its
+place by :meth:`~smartcam.calibration.CameraModel.project`, to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def render(
         black: grey level of the print.
         white: grey level of the paper.
         background: grey level around the paper.
-        random: source of the noise; None for one that is the same each time.
+        random: source of the noise; None for reproducible noise.
 
     Returns:
         (H, W).
@@ -134,7 +133,7 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
     seen, size = camera.project(rim), np.array(camera.size)
     low, high = np.floor(seen.min(axis=0) - more), np.ceil(seen.max(axis=0) + more)
     if (low < -size / 2).any() or (high > 1.5 * size).any():
-        # this far outside of the image a lens model may fold the rim back
+        # a lens model may fold points this far outside of the image back into it
         return 0, 0, *camera.size
     left, top = np.maximum(low, 0).astype(int).tolist()
     right, bottom = np.minimum(high + 1, size).astype(int).tolist()
@@ -148,7 +147,7 @@ def _sheet(
     flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     rays = np.column_stack([flat, np.ones(len(flat))])
     normal = pose.rotation[:, 2]
-    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon, so far away
+    slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon: far away
     seen = (rays * (normal @ pose.translation / slope)[:, None] - pose.translation) @ pose.rotation
     rows, columns = u.shape
     fine = (columns * SAMPLES_PER_SIDE, rows * SAMPLES_PER_SIDE)
@@ -287,7 +286,7 @@ def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
         places.append(place.clip(0, count - 1).astype(np.intp))
         parts.append(part / side)
         markers.append(inside * _share(np.minimum(part, side - part), grain))
-        # the nearer gap: before the marker, or behind it
+        # the nearer gap: before or after the marker
         near = np.where(part < side / 2, part + gap, part - side)
         whole = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
         between.append(whole * _share(np.minimum(near, gap - near), grain))

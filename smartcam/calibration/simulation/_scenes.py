@@ -140,7 +140,7 @@ class Bound(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandEyeScene:
-    """A robot, a camera and a target, as they really are.
+    """The true poses of a robot, a camera and a target.
 
     Attributes:
         setup: place of the camera.
@@ -187,19 +187,18 @@ class HandEyeScene:
             )
             for number, pose in enumerate(self.robot_poses)
         ]
-        said = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
-        return said, views
+        poses = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
+        return poses, views
 
     def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
         """Return the Cramer-Rao bound of the camera's pose.
 
-        The target's pose and the robot's true poses are unknown, too. A sigma of 0 means that there
-        is no noise, and that this is known.
+        The target's pose and the robot's true poses are unknown, too. A sigma of 0 means values
+        without noise, known to be exact.
         """
         # No unbiased estimate has a covariance below the inverse of Fisher's information, J^T C^-1
-        # J of what is seen; the robot's true poses are eliminated from it.
-        # Source: Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993),
-        # chapter 3.
+        # J of the pixels; the robot's true poses are eliminated from it. Source: Kay, Fundamentals
+        # of Statistical Signal Processing: Estimation Theory (1993), chapter 3.
         points = [self.target.points] * len(self.robot_poses)
         count = len(self.target.points)
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))

@@ -1,6 +1,6 @@
 """Keep the journal of a sequence: a line for each entry, on the disk before it counts.
 
-The first line says which wizard it belongs to, each other line is an entry. A line is written and
+The first line names the wizard, each other line is an entry. A line is written and
 synced before the next step is shown. A killed process leaves at most a part of a line, which the
 next process removes: the answer in it had not been confirmed yet.
 """

@@ -1,4 +1,4 @@
-"""List the calibrations of a folder: the date of each, how good it is, and its last check."""
+"""List the calibrations of a folder: the date of each, its error, and its last check."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def listing(folder: Folder) -> list[dict[str, Any]]:
 
     ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (RMS; None: not known)``,
     checked_at`` and ``stale`` of the last check (None without a check)``, problem`` (None without
-    one). A file that cannot be read has a ``problem`` and nothing else.
+    one). A file that cannot be read has only a ``problem``.
     """
     return [_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
 
@@ -41,7 +41,7 @@ def _row(folder: Folder, name: str) -> dict[str, Any]:
         row |= {"kind": document.kind, "written_at": document.written_at}
         row["held_out_mm"] = _held_out(document.kind, document.data)
         check = _last_check(folder.checks(name))
-        # a check before this calibration was written says nothing about it
+        # a check before this calibration was written does not count
         if check.get("calibration") == document.written_at:
             row |= {"checked_at": check.get("at"), "stale": check.get("stale")}
     except (CalibrationError, OSError) as exc:

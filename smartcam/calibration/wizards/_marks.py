@@ -33,7 +33,7 @@ class Mark:
     x: float  # x in the camera's unit; for a point of a sheet, metres on the sheet
     y: float  # y in the same unit
     theta: float  # angle, radians
-    number: int | None = None  # number of the point on its target; None for a mark of no target
+    number: int | None = None  # number of the point on its target; None for a mark without a target
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Mark:
@@ -106,7 +106,7 @@ class MarkCamera:
     def check_y_down(self, before: bool | None, what: str) -> None:
         """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
 
-        ``what``: name, for people, of the thing that was made before.
+        ``what``: name, for people, of the earlier picture or calibration.
         """
         if None not in {before, self.y_down} and before != self.y_down:
             raise Code.MIRRORED.refusal(

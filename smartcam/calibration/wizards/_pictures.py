@@ -57,7 +57,7 @@ MAX_PREVIEW_BYTES: Final = 700_000
 holds 1 MiB."""
 
 PICTURE_TIMEOUT: Final = 60.0
-"""Seconds that taking a picture and finding things in it may take."""
+"""Largest time, seconds, to take a picture and to search it."""
 
 MAX_PICTURE_BYTES: Final = 1 << 26
 """Largest number of bytes of a picture's file: 20 million pixels of colour in a bitmap."""
@@ -104,7 +104,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
 
 
 def how_to_take(awaited: str) -> str:
-    """Return the sentence at the end of a step's description that says how to take the picture."""
+    """Return the last sentence of a step's description, which explains how to take the picture."""
     if not awaited:
         return ""
     return f" Go on here first, then have the camera take its picture: {awaited}."
@@ -132,10 +132,10 @@ class PictureFolder:
 
     @property
     def awaited(self) -> str:
-        """Text, for people, that says which picture :meth:`take` waits for."""
+        """Text, for people, that describes the picture that :meth:`take` waits for."""
         return (
             f"the next file that comes into {self.path} counts, one that ends in "
-            f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
+            f"{', '.join(sorted(SUFFIXES))}; earlier files do not count. It is waited for "
             f"{self.deadline:g} s"
         )
 
@@ -183,13 +183,13 @@ class PictureFolder:
         return set()
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
-        """Return a note on files that came instead of a picture, and on those there before."""
-        said = [f"there before: {len(before)}"] if before else []
+        """Return a note on files that came instead of a picture, and on earlier ones."""
+        notes = [f"there before: {len(before)}"] if before else []
         came = sorted(self._names() - others)
         if came:
             more = f" and {len(came) - 3} more" if len(came) > 3 else ""
-            said.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
-        return f" ({'; '.join(said)})" if said else ""
+            notes.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
+        return f" ({'; '.join(notes)})" if notes else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:
         """Return the time of writing, ns, and the number of bytes of each picture."""

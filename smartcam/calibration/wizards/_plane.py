@@ -69,7 +69,7 @@ def plane_wizard(
         camera = MarkCamera(localize=localize, feature=feature, y_down=y_down)
         step = about_step(
             "The camera is fixed, and sees the plane that the robot works on. All touches are made "
-            "with one tool, held the same way: then what is wrong with its tip is the same in all "
+            "with one tool, held the same way: then the error of its tip is the same in all "
             "of them, and cancels out as long as parts are taken like that.",
             {
                 "marks": "each mark that the camera sees; 9 over the whole field are good",
@@ -156,7 +156,7 @@ class _MarkSource(PointSource):
             id="scale",
             title="Was the sheet printed true to size?",
             description="Printers scale. The camera took its metres from the sheet as it should "
-            "be, so what the ruler really measures is the scale.",
+            "be, so the ruler measures the scale.",
             inputs=(ruler("ruler"),),
         )
         return float((await ask(step))["ruler"]) / RULER_MM
@@ -164,8 +164,8 @@ class _MarkSource(PointSource):
     async def _seen(self, step: Step) -> Sequence[Mapping[str, Any]]:
         """Ask for a picture; remember the direction of its y axis."""
         rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
-        told = [row.get("y_down") for row in rows]
-        self.y_down = next((one for one in told if one is not None), self.y_down)
+        directions = [row.get("y_down") for row in rows]
+        self.y_down = next((one for one in directions if one is not None), self.y_down)
         return rows
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:

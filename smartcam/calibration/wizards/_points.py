@@ -1,4 +1,4 @@
-"""Calibrate a plane by touches, whatever source its points come from.
+"""Calibrate a plane by touches of points from any source.
 
 A :class:`PointSource` provides the points: marks that a camera localizes, or a sheet that is found
 in a picture. The robot touches any number of them, or the thesis' three: the origin and one point
@@ -174,7 +174,7 @@ class PointSource(Touches, ABC):
             Step(
                 id="review",
                 title="What came out",
-                description="Three touches fit any plane: nothing tells how good they were. To "
+                description="Three touches fit any plane: no test shows their quality. To "
                 f"know, touch {self.POINTS} instead.",
                 button="Accept",
                 notes=outcome.notes,
@@ -235,7 +235,7 @@ class PointSource(Touches, ABC):
         return plane, notes, judgement
 
     def _allowing(self, plane: PlaneCalibration) -> PlaneCalibration:
-        """Return a calibration with the error that the user allows set in it."""
+        """Return a calibration with the user's allowed error."""
         allowed = self.about["allowed"]
         return replace(plane, allowed_error=None if allowed is None else 1e-3 * allowed)
 
@@ -260,7 +260,7 @@ class PointSource(Touches, ABC):
         return refused(error.code or "", str(error))
 
     def _fits_without(self, index: int) -> bool:
-        """Return True if the touches fit without one of them, and one more is left to show it."""
+        """Return True if the touches fit without one of them, and another one is left as a test."""
         rest = copy.copy(self)
         rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
@@ -306,7 +306,7 @@ class PointSource(Touches, ABC):
         return review_step(options, point, notes, judgement, self._preview(plane))
 
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
-        """Return the data that a picture of the touches is drawn from."""
+        """Return the data for a picture of the touches."""
         if plane is None:
             return {**plain(self.touches), "choices": self._choices()}
         found = compared(
@@ -330,7 +330,7 @@ class PointSource(Touches, ABC):
 
 
 def _other_advice(judgement: Judgement, again: Collection[int], count: int) -> Judgement:
-    """Return a judgement that does not ask for the same touch again and again.
+    """Return a judgement that does not ask for the same touch repeatedly.
 
     ``again``: numbers of the points that were touched again already. ``count``: number of all
     points.
@@ -443,7 +443,7 @@ def calibrated_plane(
 ) -> Calibrated:
     """Return a plane's calibration with its figures, in mm, and its notes.
 
-    ``what``: what lies ``along`` (3,) some direction of the robot; None: as the camera's x axis.
+    ``what``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
     """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))

@@ -12,9 +12,9 @@ r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end 
 
 How it works: the coroutine awaits only :func:`ask`. Everything that uses a camera, a robot or a
 file is an *action* of a step: an async function that runs when the step is answered, and whose
-outcome is written into the journal together with the answers. So the state of the coroutine is only
-the list of its answers and outcomes. Undo runs the coroutine again with one entry less; resuming
-after a crash runs it again with all of them. Neither repeats an action.
+outcome is written into the journal together with the answers. So the list of its answers and
+outcomes is the whole state of the coroutine. Undo runs the coroutine again with one entry less;
+resuming after a crash runs it again with all of them. Neither repeats an action.
 
 After an error the step stays the same, whether the answer was wrong, the action failed, or the
 coroutine failed before its next step. Only an answer that the coroutine accepted is written.
@@ -60,7 +60,7 @@ class StepAnswer(dict[str, Any]):
     """Answers to a step by name, and the outcome of its action.
 
     Attributes:
-        outcome: what the action returned, as JSON has it (lists for tuples); None without one.
+        outcome: the action's result as JSON data (lists for tuples); None without an action.
     """
 
     def __init__(self, values: Mapping[str, Any], outcome: Any) -> None:
@@ -236,7 +236,7 @@ class WizardSession:
     def _told_of(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return facts about the resumed journal; None if there is nothing to resume.
 
-        They are shown because measurements may be old: touched things may have been moved since.
+        They are shown because measurements may be old: touched marks may have moved since.
         """
         if self.state != "asking" or not self._log.entries:
             return None
@@ -308,7 +308,7 @@ class WizardSession:
 
     @property
     def token(self) -> str:
-        """Word that a call must repeat, so that none counts twice: it changes with each entry."""
+        """Word that a call must repeat, so that no call counts twice; it changes at each entry."""
         return f"{self.flow}.{len(self._all)}"
 
     @property
@@ -580,7 +580,7 @@ def _named(header: Mapping[str, Any]) -> str:
 
 
 def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
-    """Return a value as it will be read, so that a resumed sequence sees what this one saw."""
+    """Return a value as it will be read, so that a resumed sequence has the same one."""
     try:
         read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:

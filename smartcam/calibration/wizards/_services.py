@@ -1,7 +1,7 @@
 """Offer calibration as services on one folder: start, go on, export, load, transform.
 
-A front-end needs nothing else: it starts a wizard under a name, shows its steps and sends the
-answers. Whatever it sends, no file outside of the folder is read or written.
+A front-end starts a wizard under a name, shows its steps and sends the answers. No request reads or
+writes a file outside of the folder.
 
 Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services.
 """
@@ -116,7 +116,8 @@ class CalibrationService:
             name: name of the calibration.
             wizard: kind of the wizard; each kind has a journal of its own for a name.
             parameters: parameters of the wizard's start; a resumed one has its own.
-            fresh: begin anew in any case. The journal of the run before is kept as an earlier one.
+            fresh: start from the first step in any case. The journal of the run before is kept as
+                an earlier one.
 
         Returns:
             The first step, or the one at which it was interrupted: :attr:`WizardSession.current`.
@@ -254,7 +255,7 @@ def _put_aside(path: Path) -> None:
     if not path.exists():
         return
     try:
-        Journal(path).close()  # nobody else writes this file
+        Journal(path).close()  # no other process writes this file
     except CalibrationError as exc:
         if exc.code != Code.BROKEN_FILE:
             raise

@@ -1,9 +1,9 @@
 """The wizard that calibrates a camera's pixels against a robot, by a picture of a printed sheet.
 
-It asks which target lies there and how long its rulers are, takes a picture and finds the target in
-it. Then the robot touches any number of the target's corners, or the origin and the rays A and B.
-The wizard knows no camera and no robot: it is given a function that takes a picture and, if the
-robot can be asked, one that reads its pose.
+It asks for the target and the lengths of its rulers, takes a picture and finds the target in it.
+Then the robot touches any number of the target's corners, or the origin and the rays A and B. The
+wizard knows no camera and no robot: it is given a function that takes a picture and, if the robot
+can be asked, one that reads its pose.
 
 Source: thesis 3.2.3.2 (published) for the origin that a camera finds in its image.
 """
@@ -179,7 +179,7 @@ class _SheetSource(PointSource):
         notes = [f"{len(view.ids)} of {len(self._target.points)} points of the target seen"]
         if view.margin is not None:
             notes.append(
-                f"the origin is told from the others by {view.margin:.0f} of 255 grey levels"
+                f"the origin differs from the others by {view.margin:.0f} of 255 grey levels"
             )
         svg, seen = self._svg, np.flatnonzero(view.ids == mark.number)
         if svg and len(seen):
@@ -241,8 +241,7 @@ class _SheetSource(PointSource):
     def _next(self) -> int:
         """Return the number of the point to touch next.
 
-        First come the outermost points that the picture shows, then those farthest from all touched
-        ones.
+        First come the outermost visible points, then the points farthest from all touched ones.
         """
         ids = self._view.ids
         places = self._target.points[ids, :2]
@@ -291,7 +290,7 @@ class _SheetSource(PointSource):
         if plane.touch_sigma is not None:
             errors = found.predicted_error(self._view.points)
             predicted = 1e3 * math.sqrt(float((errors**2).mean()))
-            unknown = "; what the lens distorts comes on top"
+            unknown = "; the lens' distortion comes on top"
             if found.camera is not None:
                 known = found.lens_covariance is not None
                 unknown = "" if known else "; the lens' own error, which is not known, comes on top"

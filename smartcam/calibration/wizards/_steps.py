@@ -1,7 +1,7 @@
 """Define the steps of a sequence: the texts to show, and the answers to ask for.
 
 A step is data. Its inputs have a JSON Schema, and check answers by the same rules, so a front-end
-needs to know nothing about any wizard.
+does not depend on any wizard.
 
 Source: thesis 2.2.1 and Figure 2.9 (published) for a step's parts and for the three lists of
 numbers, texts and options, which :func:`as_lists` and :func:`from_lists` derive.
@@ -66,7 +66,7 @@ class Input(ABC):
         return {"title": self.label, **self._schema()}
 
     def checked(self, value: object) -> Any:
-        """Return an answer in its internal form; raise ValueError with what was expected."""
+        """Return an answer in its internal form; raise ValueError with the expected form."""
         return self._checked(value)
 
     @abstractmethod
@@ -152,7 +152,7 @@ class Text(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Input):
-    """Input for one of some options; without a default the first one is preselected.
+    """Input for one of several options; without a default the first one is preselected.
 
     Attributes:
         options: texts for people, by the answer that each stands for.
@@ -198,14 +198,14 @@ class Step:
     Attributes:
         id: name of the step; the same one may come again.
         title: heading of one line.
-        description: what to do now.
+        description: the task of the user.
         button: text on the button that goes on.
         inputs: inputs to fill in; without any, only the button has to be pressed.
         notes: results so far, a line each; a warning begins with its code and a colon.
         verdict: verdict on the result; None without a result.
         preview: JSON data for a picture; None for no picture. ``choices`` in it are places that may
             be clicked: ``at`` (in the picture), ``label``, and the ``answers`` that a click gives.
-        waiting: text that says what the step waits for while its action runs.
+        waiting: text that names the awaited event while the step's action runs.
         timeout: seconds that the action of the button may take.
     """
 
@@ -269,8 +269,8 @@ class Step:
             except ValueError as exc:
                 errors[one.name] = str(exc)
         if given:
-            known = ", ".join(one.name for one in self.inputs) or "nothing"
-            errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {known}"
+            names = ", ".join(one.name for one in self.inputs) or "nothing"
+            errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {names}"
         if errors:
             raise _wrong(errors)
         return values

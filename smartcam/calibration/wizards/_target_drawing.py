@@ -111,9 +111,9 @@ def draw(
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:
-        residuals, said = canvas.residuals(view, _shaped(predicted, len(view.points)))
+        residuals, caption = canvas.residuals(view, _shaped(predicted, len(view.points)))
         lines += residuals
-        texts.append(said)
+        texts.append(caption)
     if view is not None:
         lines += canvas.points(view)
     if axes is not None:

@@ -1,4 +1,4 @@
-"""Ask which target is on a sheet, and how long its printed rulers are."""
+"""Ask for the target on a sheet, and for the lengths of its printed rulers."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
         name="kind",
         label="What is printed on the sheet",
         options={
-            "described": "what the description says",
+            "described": "the target of the description",
             "checkerboard": "a checkerboard",
             "charuco": "a ChArUco board: markers in the white squares",
             "circles": "dots in rows and columns",

@@ -1,6 +1,6 @@
 """Offer a camera's calibrations as the thesis' five services: one wizard, without tokens.
 
-The steps are those of the page and of the terminal, after a first step that asks for things without
+The steps are those of the page and of the terminal, after a first step that asks for facts without
 a field in the request: the name, the camera's place, the source of pictures. A request does not
 name its step, so only one call is answered at a time, and a sequence belongs to the client that
 started it until it ends, is aborted or is abandoned.
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 SMARTCAMERA: Final = "SMARTCAMERA"
-"""Text that stands in place of a topic for the smart camera itself."""
+"""Text, instead of a topic, for the smart camera itself."""
 
 ABANDONED_AFTER: Final = 1800.0
 """Seconds without a call after which a running calibration is given up; its journal stays."""
@@ -127,8 +127,8 @@ class CalibrationStart(NamedTuple):
     @property
     def topics(self) -> list[str]:
         """Topics with pictures that the request names, the preferred one first."""
-        said = (self.topic_image2, self.topic_image1)
-        return [one for one in said if one not in {"", SMARTCAMERA}]
+        named = (self.topic_image2, self.topic_image1)
+        return [one for one in named if one not in {"", SMARTCAMERA}]
 
     @property
     def source(self) -> str:
@@ -292,7 +292,7 @@ class ThesisCalibration:
 
         Args:
             asked: request with the answers.
-            camera: the camera, as it is reached for this call.
+            camera: the camera that this call uses.
 
         Raises:
             CalibrationError: ``NO_SEQUENCE``; ``NOT_POSSIBLE``: another call is running.
@@ -312,11 +312,11 @@ class ThesisCalibration:
             errors = await self._performed(sequence, asked)
         if sequence.aborted:
             return _fields(_ABORTED, f"{self._name}: another call has aborted the calibration")
-        return self._told(sequence, errors)
+        return self._reply(sequence, errors)
 
     @contextlib.contextmanager
     def _alone(self, what: str) -> Iterator[None]:
-        """Refuse a call while another one is running, whose reply nobody has seen yet."""
+        """Refuse a call while another call is running."""
         if self._busy:
             raise Code.NOT_POSSIBLE.refusal(
                 f"{self._name}: another call is under way; {what} was not done. Expected its "
@@ -339,7 +339,7 @@ class ThesisCalibration:
             if asked.repeat_last_step:
                 return await self._back(sequence)
             if first:
-                return _unasked(asked)
+                return _early_inputs(asked)
             return await self._answered(sequence, asked)
         except SmartCamError as exc:
             return {"base": str(exc)}
@@ -454,9 +454,9 @@ class ThesisCalibration:
             asked.tf_frame_robot_tcp, asked.tf_frame_robot_base, utc
         )
 
-    # ------------------------------------------------------------------ its end
+    # ------------------------------------------------------------------ the end
 
-    def _told(self, sequence: _Sequence, errors: Mapping[str, str]) -> dict[str, Any]:
+    def _reply(self, sequence: _Sequence, errors: Mapping[str, str]) -> dict[str, Any]:
         """Return the fields of a reply with the current step, or with the end."""
         error = "; ".join(
             text if name == "base" else f"{name}: {text}" for name, text in errors.items()
@@ -501,7 +501,7 @@ class ThesisCalibration:
         if sequence is not None:
             sequence.close()
 
-    # ------------------------------------------------------------------ the other three
+    # ------------------------------------------------------------------ other services
 
     def export(self, name: str, target: str) -> None:
         """Copy a calibration into the folder's ``exports``.
@@ -585,7 +585,7 @@ class CalibrationDesks:
 
 
 def _there(value: T | None) -> T:
-    """Return a value that earlier checks have made sure is not None."""
+    """Return a value that earlier checks found not to be None."""
     if value is None:
         raise Code.NOT_POSSIBLE.refusal(
             "the camera is not seen in ROS any more; expected it to come back, or abort"
@@ -641,7 +641,7 @@ def _start(
         service.start(name, wizard, parameters, fresh=True)
 
 
-def _unasked(asked: StepRequest) -> Mapping[str, str]:
+def _early_inputs(asked: StepRequest) -> Mapping[str, str]:
     """Return the error for answers to a step that was never returned to a client."""
     if asked.value_inputs or asked.text_inputs or asked.option_inputs:
         return {"base": "this step was not shown before; expected no inputs in the first call"}
@@ -651,8 +651,8 @@ def _unasked(asked: StepRequest) -> Mapping[str, str]:
 def _last_step(name: str, view: Mapping[str, Any]) -> Step:
     """Return a step that reports the result."""
     verdict, file = view["verdict"], view["result"]["file"]
-    said = "" if verdict is None else f"{verdict['text']} "
-    text = f"{said}It is in the file {file}, and loaded where it maps pixels."
+    verdict_text = "" if verdict is None else f"{verdict['text']} "
+    text = f"{verdict_text}It is in the file {file}, and loaded where it maps pixels."
     return Step(id="done", title=f"The calibration {name} is done", description=text, button="")
 
 

@@ -42,7 +42,7 @@ def plain(touches: Sequence[Touch]) -> dict[str, Any]:
 
 
 def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[str, Any] | None:
-    """Return touches with the ``marks`` of a picture and the one to be touched ``next``.
+    """Return touches with the ``marks`` of a picture and the mark to touch ``next``.
 
     None if no marks are given, since the camera does not see the next point.
     """

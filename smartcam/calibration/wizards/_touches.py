@@ -66,7 +66,7 @@ SIDES: Mapping[str, Vector | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-"""Directions of a tool's axis in the robot's base, by the words that people choose."""
+"""Directions of a tool's axis in the robot's base, by their names for people."""
 
 SIDE = Option(
     name="side",
@@ -86,7 +86,7 @@ class Touches:
             ``unit`` and ``side``.
         marks: marks of the last picture.
         camera_unit: unit of the camera's positions.
-        side: one of :data:`SIDES`, where the tool points, of robots whose pose is typed.
+        side: one of :data:`SIDES`, the direction of the tool, for robots whose pose is typed.
     """
 
     about: StepAnswer
@@ -141,7 +141,7 @@ class Touches:
     ) -> Touch:
         """Ask for a touch.
 
-        ``place``: text that says what to touch. ``mark``: mark that the camera sees there.
+        ``place``: text that names the place to touch. ``mark``: the camera's mark there.
         ``what``: attribute of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"

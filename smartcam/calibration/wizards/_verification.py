@@ -1,6 +1,6 @@
-"""The wizard that checks whether a calibration still holds: touch some marks again, and compare.
+"""Check whether a calibration still holds: touch some marks again, and compare.
 
-A camera that was knocked sees everything shifted, which a few touches show. Their offsets are
+A knocked camera sees all points shifted, which a few touches show. Their offsets are
 compared with the noise of the touches, both of the new ones and of those in the calibration.
 """
 
@@ -71,8 +71,8 @@ def drift_wizard(
     Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm,
     z, chance, needed, needed_at`` (at the best mark, see :func:`touches_needed`)``, file``.
 
-    Each finished check is a line of a file, whose first line names its format: so a drift can be
-    seen that is too slow for any single check. The calibration's own file is not changed. The file
+    Each finished check is a line of a file, whose first line names its format: so the file shows a
+    drift that is too slow for a single check. The calibration's own file is not changed. The file
     takes as many checks as a journal takes entries.
 
     Args:
@@ -100,16 +100,16 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
     """Return the number of touches of one mark that are needed to notice a knock.
 
     The result is None if :data:`MAX_TOUCHES` are not enough, since the calibration itself is too
-    uncertain there. ``camera_point`` (2,): place of the mark for the camera. Raises SHAPE or
+    uncertain at the mark. ``camera_point`` (2,): place of the mark for the camera. Raises SHAPE or
     NOT_FINITE; UNVERIFIED if the touches' sigma is not known; MissingExtraError: SciPy is not
     installed.
     """
-    known = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
+    own = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
-        variance = known + sigma**2 / count
+        variance = own + sigma**2 / count
         shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
         if (
             _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
@@ -140,8 +140,7 @@ def _about(name: str, *, typed: bool) -> Step:
         id="about",
         title=f"Is {name} still true?",
         description="Touch a mark or several again, with the same tool held the same way. Offsets "
-        "are compared with what the touches' noise explains, that of now and that of the "
-        "calibration.",
+        "are compared with the noise of the new touches and of the calibration's.",
         inputs=(UNIT, sigma) if typed else (sigma,),
     )
 
@@ -270,7 +269,7 @@ class _DriftCheck(Touches):
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
         needed = [touches_needed(self.calibration, point) for point in self._seen()]
-        known = [one for one in needed if one is not None]
+        enough = [one for one in needed if one is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),
@@ -279,8 +278,8 @@ class _DriftCheck(Touches):
             "expected_mm": 1e3 * drift.expected,
             "z": drift.z,
             "chance": drift.chance,
-            "needed": min(known, default=None),
-            "needed_at": 1 + needed.index(min(known)) if known else None,
+            "needed": min(enough, default=None),
+            "needed_at": 1 + needed.index(min(enough)) if enough else None,
         }
 
     async def _end(
@@ -331,8 +330,8 @@ def _notes(figures: Mapping[str, Any]) -> list[str]:
         f"(z = {figures['z']:.2f})",
         f"{knock} with {_touches(needed)} of the mark of touch {figures['needed_at']}"
         if needed is not None
-        else f"{knock} with no number of touches of these marks: the calibration is known too "
-        "badly there",
+        else f"{knock} with no number of touches of these marks: the calibration is too "
+        "uncertain there",
     ]
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Look(NamedTuple):
-    """A view that adds information to that of the others."""
+    """A view that adds information to the others."""
 
     text: str  # text for people
     # direction in the image about which the target is tilted, degrees from u towards v
@@ -120,7 +120,7 @@ def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
     placed = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
     focal, image = FOCAL_LENGTH_WIDTHS * size[0], np.array(size, dtype=np.float64)
     away = 10.0 * float(np.linalg.norm(half))
-    for _ in range(5):  # moving it a little nearer or farther changes the perspective slightly, too
+    for _ in range(5):  # the distance also changes the perspective
         seen = focal * placed[:, :2] / (placed[:, 2:] + away)
         away *= float((np.ptp(seen, axis=0) / image).max()) / look.fill
     seen = focal * placed[:, :2] / (placed[:, 2:] + away)

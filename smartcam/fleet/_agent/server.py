@@ -402,15 +402,15 @@ class FleetServer(Server):
         device = SoftwareDevice(camera)
         await stack.enter_async_context(device)
         drawn = bool(given.get("drawn", True))
-        make = functools.partial(judged_source, device.eyes, drawn=drawn)
+        make = functools.partial(judged_source, device.inspector, drawn=drawn)
         observers = Observers(self.observers)
         teller = JudgedResults(
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
             lambda result, judged: observers.picture(result, judged.marked_frame),
-            kept=0,
+            max_kept=0,
         )
-        device.eyes.viewers.add(teller.take)
+        device.inspector.viewers.add(teller.take)
         return device, FramesOf(make, masked(camera.frames), teller)
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:

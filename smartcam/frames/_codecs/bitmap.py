@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 FILE: Final = struct.Struct("<2sIHHI")
 INFO: Final = struct.Struct("<IiiHHIIiiII")
 MAX_PIXEL_BYTES: Final = 1 << 28
-"""A bitmap has at most this many bytes of pixels; no camera has more."""
+"""Largest number of bytes of a bitmap's pixels; no camera sends more."""
 
 
 def read_bitmap(data: bytes) -> NDArray[np.uint8]:
@@ -57,7 +57,7 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
 
 
 def _looked_up(pixels: NDArray[Any], palette: bytes) -> NDArray[np.uint8]:
-    """Return the colours of indices into a palette; an index beyond its end is black."""
+    """Return the palette's colours for indices; an index beyond the palette is black."""
     colours = np.zeros((256, 4), np.uint8)
     given = np.frombuffer(palette[: len(palette) // 4 * 4], np.uint8).reshape(-1, 4)[:256]
     colours[: len(given)] = given

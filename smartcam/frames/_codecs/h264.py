@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_HELD_FRAMES: Final = 32
+MAX_WAITING_FRAMES: Final = 32
 """A decoder keeps the data of at most this many encoded frames until their pictures come out."""
 
 
@@ -72,7 +72,7 @@ class H264Encoder:
             self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
         self._bitrate = bitrate
         self._turn = asyncio.Lock()
-        self._one = threading.Lock()  # the thread of a cancelled call may still be using it
+        self._in_use = threading.Lock()  # the thread of a cancelled call may still be using it
         self._codec: Any = None
         self._grey: Any = None  # frame of the last grey picture, of which x264 has made a copy
         self._kind: tuple[object, ...] = ()
@@ -100,7 +100,7 @@ class H264Encoder:
                 raise
 
     def _encode(self, frame: Frame, broken: int) -> Frame:
-        with self._one:
+        with self._in_use:
             if frame.format.name == "MJPEG":
                 frame = decoded(frame, "RGB8")
             video = to_video(frame, self._grey)
@@ -152,14 +152,14 @@ class H264Decoder:
         load("av")
         self._run, self._reorders, self._to = run, reorders, to
         self._turn = asyncio.Lock()
-        self._one = threading.Lock()
+        self._in_use = threading.Lock()
         self._codec: Any = None
         self._size = (0, 0)
         self._losses = self._losses_seen = 0
         # number of frames until the picture is whole; None: unknown
         self._missing: int | None = None
         self._begun = False  # whether something was decoded that a refresh can refer to
-        self._held: dict[int, Frame] = {}
+        self._waiting: dict[int, Frame] = {}
         self._count = 0
 
     @property
@@ -185,7 +185,7 @@ class H264Decoder:
                 after a loss.
 
         Raises:
-            FrameFormatError: the frame is damaged, or has another size than it says; that counts as
+            FrameFormatError: the frame is damaged, or its picture has another size; that counts as
                 a loss.
             LocalProtocolError: the codecs are closed.
 
@@ -199,7 +199,7 @@ class H264Decoder:
                 raise
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
-        with self._one:
+        with self._in_use:
             if self._size != (frame.width, frame.height):
                 self._begin(frame)
             if losses != self._losses_seen:
@@ -227,7 +227,7 @@ class H264Decoder:
             "max_pixels": str(room),
             "err_detect": "explode",  # half a picture must be refused
         } | ({} if self._reorders else {"flags": "low_delay"})
-        self._held.clear()
+        self._waiting.clear()
         self._missing, self._begun = None, False
 
     def _follow(self, data: bytes) -> int | None:
@@ -250,13 +250,13 @@ class H264Decoder:
         packet = load("av").Packet(frame.data)
         self._count += 1
         packet.pts = self._count
-        self._held[self._count] = frame
-        if len(self._held) > MAX_HELD_FRAMES:
-            del self._held[next(iter(self._held))]
+        self._waiting[self._count] = frame
+        if len(self._waiting) > MAX_WAITING_FRAMES:
+            del self._waiting[next(iter(self._waiting))]
         return packet
 
     def _made(self, picture: Any) -> Frame:
-        frame = self._held.pop(picture.pts)
+        frame = self._waiting.pop(picture.pts)
         picture = picture.reformat(format=self._to) if self._to else picture
         pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):

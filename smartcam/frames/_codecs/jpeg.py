@@ -133,6 +133,6 @@ def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Ex
 
 def _wrong(what: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
     return FrameFormatError(
-        f"{what}: expected a whole JPEG, got {len(data)} bytes that are none "
-        f"(they begin with {bytes(data[:4]).hex(' ')}): {exc}"
+        f"{what}: expected a whole JPEG, got {len(data)} bytes that "
+        f"begin with {bytes(data[:4]).hex(' ')}: {exc}"
     )

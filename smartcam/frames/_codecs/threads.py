@@ -22,12 +22,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_LOOP_TIME: Final = 0.002
-"""Seconds of CPU time that one picture of a stream may take in the event loop. A thread costs two
-wake-ups per picture, which take longer than a small picture."""
+"""Largest CPU time, seconds, of one picture in the event loop. For a small picture, the two
+wake-ups of a thread take longer than the work."""
 
-DECAY: Final = 0.8
-"""With each further picture, the longest time of a stream's pictures so far is multiplied by
-this."""
+LONGEST_TIME_DECAY: Final = 0.8
+"""Factor by which the remembered longest time shrinks with each picture."""
 
 
 def _checked(frame: Frame) -> Frame:
@@ -225,14 +224,14 @@ class Codecs:
         self._running.discard(under_way)
         self._free.release()
         if not under_way.cancelled():
-            under_way.exception()  # the caller may have gone
+            under_way.exception()  # mark the error as retrieved: the caller may be cancelled
 
 
 class StreamRuns:
-    """Runs the work of one stream in the event loop if its pictures are small, else in a thread.
+    """Run the work of one stream in the event loop if its pictures are small, else in a thread.
 
-    It begins in a thread, where the first picture shows how long others may take, and returns to
-    the thread as soon as one takes longer than :data:`MAX_LOOP_TIME`.
+    The first picture runs in a thread, which measures its time; later pictures run in the thread if
+    one takes longer than :data:`MAX_LOOP_TIME`.
 
     Args:
         codecs: threads for the work, not closed while it is used.
@@ -240,7 +239,7 @@ class StreamRuns:
 
     def __init__(self, codecs: Codecs) -> None:
         self._codecs = codecs
-        self._longest: float | None = None  # seconds of CPU time, mostly those of the last pictures
+        self._longest: float | None = None  # longest CPU time of recent pictures, seconds
 
     @property
     def short(self) -> bool:
@@ -251,7 +250,7 @@ class StreamRuns:
         """Run the work, and return its result."""
         if not self.short:
             return await self._codecs._run(partial(self._timed, work))  # noqa: SLF001
-        self._codecs._open_pool()  # noqa: SLF001 - what is closed runs nothing
+        self._codecs._open_pool()  # noqa: SLF001 - closed codecs run nothing
         return self._timed(work)
 
     def _timed(self, work: Callable[[], T]) -> T:
@@ -260,7 +259,7 @@ class StreamRuns:
             return work()
         finally:
             took = time.thread_time() - began
-            self._longest = max(took, DECAY * (self._longest or 0.0))
+            self._longest = max(took, LONGEST_TIME_DECAY * (self._longest or 0.0))
 
 
 def at_once(work: Coroutine[Any, Any, T]) -> T:
@@ -275,4 +274,4 @@ def at_once(work: Coroutine[Any, Any, T]) -> T:
         result: T = done.value
         return result
     work.close()
-    raise RuntimeError("it cannot be done without waiting")
+    raise RuntimeError("the coroutine waits; expected one that does not")

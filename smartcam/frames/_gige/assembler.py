@@ -1,16 +1,15 @@
-"""Assemble packets of a stream into frames, each of which is complete or counted as lost.
+"""Assemble packets of a stream into frames, and count incomplete frames as lost.
 
-There is no socket and no clock here: packets go in with their time; pictures come out in the order
-of their blocks, together with the packets that the camera should send again. At most
-:data:`MAX_OPEN_BLOCKS` blocks are kept.
+The module uses no socket and no clock: it gets packets with their time, and returns pictures in the
+order of their blocks, and requests for missing packets. At most :data:`MAX_OPEN_BLOCKS` blocks are
+kept.
 
-A block whose packets are missing waits for them while the camera is asked, and blocks behind it
-wait for it. It is lost when the camera says that it no longer has them, when it has not sent them
-after :data:`MAX_REQUESTS` requests, or when too many are missing to ask for.
+A block with missing packets waits while they are requested, and later blocks wait for it. The block
+is lost when the camera no longer has the packets, when they have not come after
+:data:`MAX_REQUESTS` requests, or when too many are missing.
 
-The camera's clock distinguishes ids that begin anew from late packets: the time of a late leader is
-before that of the newest block, that of a new one after it. Without a clock, a second of silence
-means that the ids begin anew.
+The camera's clock distinguishes restarted ids from late packets: the time of a late leader is
+before that of the newest block. Without a clock, a second of silence means that the ids restarted.
 """
 
 from __future__ import annotations
@@ -21,49 +20,47 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige.block import PACKET, Block
+from smartcam.frames._gige.block import PACKET_ID_BITS, Block
 from smartcam.frames._gige.gvcp import GvcpStatus
-from smartcam.frames._gige.gvsp import HEADER, PacketKind, decode_header
+from smartcam.frames._gige.gvsp import HEADER_BYTES, PacketKind, decode_header
 
 if TYPE_CHECKING:
     from smartcam.frames._gige.block import WholePicture
     from smartcam.frames._gige.gvsp import ImpliedPicture, PacketHeader
 
 MAX_OPEN_BLOCKS: Final = 4
-"""At most this many blocks wait for packets or for an earlier block: at 100 frames/s that is 40
-ms."""
+"""Largest number of blocks that wait for packets or an earlier block: 40 ms at 100 frames/s."""
 
 REORDER_GRACE: Final = 0.003
-"""Seconds that a packet may come after its successors before it is requested."""
+"""Seconds by which a packet may come after its successors before it is requested."""
 
 SILENCE_TIMEOUT: Final = 0.05
-"""Seconds without a packet in the middle of a block after which the rest counts as missing."""
+"""Seconds of silence in a block after which the rest counts as missing."""
 
 RESEND_INTERVAL: Final = 0.03
 """Seconds until missing packets are requested again."""
 
 MAX_REQUESTS: Final = 4
-"""The packets of one block are requested at most this many times."""
+"""Largest number of requests for the packets of one block."""
 
 MAX_MISSING_PACKETS: Final = 64
-"""Up to this many missing packets of a block are always requested; more only if they are less than
-a quarter."""
+"""Number of missing packets of a block that is always requested; more, only up to a quarter of the
+block."""
 
 MAX_GAPS_PER_BLOCK: Final = 1000
-"""A block with more gaps than this is lost, since each gap takes a request of its own."""
+"""Largest number of gaps in a block; each gap needs its own request."""
 
 LEADER_TIMEOUT: Final = 10.0
-"""Seconds that a leader waits for its pixels: some cameras send it before a long exposure."""
+"""Seconds after a leader until its pixels must come: some cameras send it before the exposure."""
 
 RESTART_TIMEOUT: Final = 1.0
-"""Seconds without a useful packet after which a leader with an old id begins a new count."""
+"""Seconds without a useful packet after which a leader with an old id restarts the count."""
 
-FASTEST: Final = 2000.0
-"""Highest plausible frame rate, frames per second: ids that advance faster show a new count, and no
-gap."""
+MAX_FRAME_RATE: Final = 2000.0
+"""Highest plausible frame rate, frames per second: ids that advance faster were restarted."""
 
-SHORT_IDS: Final = 65535
-"""Block ids of 16 bits: 1 to 65535."""
+MAX_SHORT_ID: Final = 65535
+"""Largest block id of 16 bits; the ids begin at 1."""
 
 _SHORT: Final = struct.Struct(">HHI")
 _GONE: Final = {
@@ -84,17 +81,17 @@ class Resend(NamedTuple):
 
 @dataclass(slots=True)
 class PacketCounts:
-    """Counts of packets and frames by what happened to them.
+    """Counts of packets and frames by their outcome.
 
     Attributes:
         pictures: complete pictures.
-        lost: frames that are lost, since packets are missing.
+        lost: frames lost because of missing packets.
         late: packets of blocks that were already finished.
-        doubled: packets that came a second time.
+        doubled: packets that came twice.
         malformed: datagrams that are no packets, or packets that do not fit their block.
-        refused: packets that the camera sent as an error code only.
+        refused: packets that only have an error code.
         requested: packets that were requested again.
-        restarts: times that the ids began anew.
+        restarts: number of restarts of the ids.
     """
 
     pictures: int = 0
@@ -114,9 +111,9 @@ class Assembler:
         payload_size: largest number of bytes of a frame, the camera's ``PayloadSize``.
         datagram: bytes of a full packet with its GVSP header, without IP and UDP.
         resend: whether missing packets are requested from the camera.
-        begins_low: whether blocks before the first one, if its id is low, count as lost; otherwise
-            they belong to an earlier stream, and must not be requested.
-        implied: picture of blocks that do not say its size; None: such blocks are an error.
+        begins_low: whether the ids begin at 1, so that blocks before the first received block count
+            as lost; otherwise they belong to an earlier stream.
+        implied: picture size for leaders without a size; None: such leaders are an error.
     """
 
     def __init__(
@@ -130,14 +127,13 @@ class Assembler:
     ) -> None:
         self.counts = PacketCounts()
         self.fault: MessageError | None = None
-        """Error for blocks that cannot be read at all, such as a payload type that is no
-        picture."""
+        """Error of unreadable blocks, such as a payload type that is no picture."""
         self._most, self._datagram, self._resend = payload_size, datagram, resend
         self._implied = implied
         self._blocks: dict[int, Block] = {}
         self._current: Block | None = None  # block of the last packet
         self._newest = self._closed = 0
-        self._offset = 0  # a number's distance from its id
+        self._offset = 0  # difference between a block's number and its id
         self._begun, self._begins_low = False, begins_low
         self._ticks = 0
         self._accepted = -math.inf
@@ -145,13 +141,13 @@ class Assembler:
         self._untold = 0
 
     def feed(self, data: memoryview, size: int, now: float, arrived: float) -> None:
-        """Take the packet in the first ``size`` bytes of ``data``; they are copied.
+        """Process the packet in the first ``size`` bytes of ``data``, which are copied.
 
         Args:
             data: buffer of at least ``size`` bytes.
             size: size of the packet.
             now: present time, seconds, on the clock of the deadlines.
-            arrived: time of arrival; that of its first packet becomes the picture's.
+            arrived: time of arrival; the first packet's becomes the picture's.
         """
         current = self._current
         if current is not None and size == self._datagram:
@@ -160,7 +156,7 @@ class Assembler:
                 word == current.expected
                 and block_id == current.block_id
                 and status == 0
-                and current.take_next(word & PACKET, data[HEADER:size], now)
+                and current.take_next(word & PACKET_ID_BITS, data[HEADER_BYTES:size], now)
             ):
                 self._accepted = now
                 return
@@ -175,26 +171,26 @@ class Assembler:
             self._put(block, header, data[header.size : size], now)
 
     def pictures(self) -> list[WholePicture]:
-        """Return the pictures that are complete, in order, each once."""
+        """Return new complete pictures in order."""
         done, self._pictures = self._pictures, []
         return done
 
     @property
     def untold(self) -> int:
-        """Lost frames that no picture has counted yet."""
+        """Number of lost frames that no picture has counted yet."""
         return self._untold
 
     def take_lost(self) -> int:
-        """Return the number of lost frames that no picture has counted, and forget it."""
+        """Return the number of lost frames that no picture has counted, and reset it."""
         lost, self._untold = self._untold, 0
         return lost
 
     def next_deadline(self) -> float | None:
-        """Return the time to call :meth:`handle_timeout`; None: only after a new packet."""
+        """Return the time at which to call :meth:`handle_timeout`; None: after the next packet."""
         return min(map(self._deadline, self._open_blocks()), default=None)
 
     def handle_timeout(self, now: float) -> list[Resend]:
-        """Give up packets that will not come any more; return the requests to send."""
+        """Drop overdue packets; return the requests to send."""
         wanted: list[Resend] = []
         for block in self._open_blocks():
             if self._deadline(block) <= now:
@@ -207,26 +203,26 @@ class Assembler:
         return [one for one in self._blocks.values() if not (one.complete or one.dead)]
 
     def _deadline(self, block: Block) -> float:
-        if block.evident < math.inf:
-            return max(block.evident + REORDER_GRACE, block.asked + RESEND_INTERVAL)
+        if block.missing_since < math.inf:
+            return max(block.missing_since + REORDER_GRACE, block.asked + RESEND_INTERVAL)
         if block.highest or block.trailer is not None:
             return block.progress + SILENCE_TIMEOUT
         return block.progress + LEADER_TIMEOUT
 
     def _overdue(self, block: Block, now: float, wanted: list[Resend]) -> None:
-        if block.evident == math.inf:
-            block.evident = now - REORDER_GRACE
+        if block.missing_since == math.inf:
+            block.missing_since = now - REORDER_GRACE
             block.over = True
             if not block.highest and block.trailer is None:
                 block.dead = True
                 return
         holes = block.holes(MAX_GAPS_PER_BLOCK + 1)
-        if not holes:  # the missing packets came; the rest of the block is still to come
-            block.evident = math.inf
+        if not holes:  # no gaps: only the rest of the block is missing
+            block.missing_since = math.inf
             return
         if not self._resend:
             block.dead = block.progress + SILENCE_TIMEOUT <= now
-            block.evident = block.progress + SILENCE_TIMEOUT
+            block.missing_since = block.progress + SILENCE_TIMEOUT
             return
         missing = sum(last - first + 1 for first, last in holes)
         too_many = (
@@ -237,7 +233,7 @@ class Assembler:
             block.dead = True
             return
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
-        # packets that are requested while others come are requested again later
+        # while other packets come, the next request is delayed
         block.tries += past
         block.asked = now
         wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
@@ -247,13 +243,13 @@ class Assembler:
     def _block_of(
         self, header: PacketHeader, data: memoryview, size: int, now: float
     ) -> Block | None:
-        """Return the block that a packet belongs to; None: its block is finished."""
-        extended = header.size != HEADER
+        """Return the block of a packet; None: the block is finished."""
+        extended = header.size != HEADER_BYTES
         if not self._begun:
             self._begun = True
             if (
                 not self._begins_low or header.block > MAX_OPEN_BLOCKS
-            ):  # otherwise the blocks before it were lost, or come later
+            ):  # otherwise blocks before were lost, or come later
                 self._newest = self._closed = header.block - 1
         number = self._number(header.block, extended)
         ahead = number - self._newest
@@ -261,7 +257,7 @@ class Assembler:
             number, bytes(data[header.size : size])
         ):
             number = self._restart(header.block)
-        elif ahead > MAX_OPEN_BLOCKS + FASTEST * min(now - self._accepted, 1e6):
+        elif ahead > MAX_OPEN_BLOCKS + MAX_FRAME_RATE * min(now - self._accepted, 1e6):
             if header.kind != PacketKind.LEADER:
                 self.counts.late += 1
                 return None
@@ -282,16 +278,16 @@ class Assembler:
         return block
 
     def _number(self, block_id: int, extended: bool) -> int:
-        """Return a block's number: its id, counted on past the wrap."""
+        """Return a block's number: its id with wraps counted."""
         if extended:
             return block_id + self._offset
-        ahead = (block_id + self._offset - self._newest) % SHORT_IDS
-        if ahead > SHORT_IDS // 2:
-            ahead -= SHORT_IDS
+        ahead = (block_id + self._offset - self._newest) % MAX_SHORT_ID
+        if ahead > MAX_SHORT_ID // 2:
+            ahead -= MAX_SHORT_ID
         return self._newest + ahead
 
     def _restarted(self, number: int, leader: bytes) -> bool:
-        """Return True if a leader shows that the camera began to count its blocks anew."""
+        """Return True if a leader shows that the camera restarted its block ids."""
         if len(leader) < 12:
             return False
         ticks = int.from_bytes(leader[4:12], "big")
@@ -301,7 +297,7 @@ class Assembler:
         return block is not None and block.leader is not None and block.leader.ticks != ticks
 
     def _restart(self, block_id: int) -> int:
-        """Begin to count anew, and return the block's number; open blocks are lost."""
+        """Restart the count, and return the block's number; open blocks are lost."""
         self.counts.restarts += 1
         self._lose(self._newest - self._closed)
         self._blocks.clear()
@@ -312,14 +308,14 @@ class Assembler:
         return block_id + self._offset
 
     def _open(self, number: int, extended: bool, now: float) -> Block:
-        """Open a block, and those before it of which no packet came yet."""
+        """Open a block, and earlier blocks of which no packet came."""
         for one in self._blocks.values():
             if one.number < number and not one.over:
                 one.over = True
-                one.evident = min(one.evident, now)
+                one.missing_since = min(one.missing_since, now)
         for missing in range(max(self._newest + 1, number - MAX_OPEN_BLOCKS + 1), number):
             self._make(missing, extended, now).over = True
-            self._blocks[missing].evident = now
+            self._blocks[missing].missing_since = now
         block = self._blocks.get(number) or self._make(number, extended, now)
         self._newest = max(self._newest, number)
         self._settle()
@@ -328,7 +324,7 @@ class Assembler:
     def _make(self, number: int, extended: bool, now: float) -> Block:
         block_id = number - self._offset
         if not extended:
-            block_id = (block_id - 1) % SHORT_IDS + 1
+            block_id = (block_id - 1) % MAX_SHORT_ID + 1
         block = Block(
             number,
             block_id,
@@ -342,7 +338,7 @@ class Assembler:
         return block
 
     def _put(self, block: Block, header: PacketHeader, payload: memoryview, now: float) -> None:
-        """Put a packet into its block."""
+        """Store a packet in its block."""
         packet = header.packet
         if block.dead or block.complete:
             self.counts.late += 1
@@ -360,8 +356,8 @@ class Assembler:
             self.counts.malformed += 1
             return
         block.progress = now
-        if packet > block.highest + 1 and block.evident == math.inf:
-            block.evident = now
+        if packet > block.highest + 1 and block.missing_since == math.inf:
+            block.missing_since = now
         block.highest = max(block.highest, packet)
         block.mark(packet)
         if block.complete:

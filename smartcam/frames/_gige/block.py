@@ -9,8 +9,8 @@ import numpy as np
 
 from smartcam.exceptions import MessageError
 from smartcam.frames._gige.gvsp import (
-    EXTENDED_HEADER,
-    HEADER,
+    EXTENDED_HEADER_BYTES,
+    HEADER_BYTES,
     PayloadType,
     bits_of,
     decode_leader,
@@ -20,25 +20,25 @@ from smartcam.frames._gige.gvsp import (
 if TYPE_CHECKING:
     from smartcam.frames._gige.gvsp import ImpliedPicture, Leader, Trailer
 
-PAYLOAD: Final = 0x03000000
-"""Kind of a payload packet in the second word of its header, above the id."""
+PAYLOAD_KIND: Final = 0x03000000
+"""Kind of a payload packet in the upper bits of its header's second word."""
 
-PACKET: Final = 0xFFFFFF
-"""Bits of the packet's id in that word."""
+PACKET_ID_BITS: Final = 0xFFFFFF
+"""Bits of the packet's id in the header's second word."""
 
 
 class WholePicture(NamedTuple):
-    """A frame whose packets have all come.
+    """A complete frame.
 
     Attributes:
-        number: number of the block, which counts on when the ids begin anew.
-        lost: frames lost before this one that no earlier picture counts.
+        number: number of the block, which continues when ids restart.
+        lost: number of frames lost before this frame that no earlier picture counts.
         leader: contents of the first packet.
         rows: number of rows that the camera sent.
         stride: number of bytes of a row.
-        data: ``stride * rows`` bytes, which nobody else holds.
-        arrived: time that the caller gave with the first packet.
-        payload: all bytes of the block if chunk data follows the picture; else None.
+        data: ``stride * rows`` bytes of its own.
+        arrived: time of the first packet's arrival.
+        payload: all bytes of the block if it has chunk data; else None.
         block_id: id of the block on the wire.
     """
 
@@ -54,7 +54,7 @@ class WholePicture(NamedTuple):
 
 
 def picture_bytes(leader: Leader, rows: int) -> int:
-    """Return the bytes that ``rows`` rows of a picture have."""
+    """Return the number of bytes of ``rows`` rows of a picture."""
     bits = bits_of(leader.pixel_format)
     if leader.padding_x:
         return ((leader.width * bits + 7) // 8 + leader.padding_x) * rows
@@ -62,16 +62,16 @@ def picture_bytes(leader: Leader, rows: int) -> int:
 
 
 class Block:
-    """The packets that came of one block. Memory is allocated with the first packet.
+    """The received packets of one block. Memory is allocated with the first packet.
 
     Args:
-        number: number of the block, counted on past the ids' wrap.
-        block_id: number of the block on the wire.
+        number: number of the block, with wraps of the ids counted.
+        block_id: id of the block in its packets.
         extended: whether the ids have 64 bits.
         datagram: bytes of a full packet with its header.
-        most: largest number of bytes of the payload.
+        most: largest size of the payload, bytes.
         now: present time, seconds.
-        implied: picture for a leader without a size.
+        implied: picture size for a leader without a size.
     """
 
     __slots__ = (
@@ -81,7 +81,6 @@ class Block:
         "buffer",
         "complete",
         "dead",
-        "evident",
         "expected",
         "extended",
         "full",
@@ -91,14 +90,15 @@ class Block:
         "implied",
         "last_size",
         "leader",
+        "missing_since",
         "number",
         "over",
         "packets",
         "progress",
-        "said",
         "seen",
         "short",
         "trailer",
+        "trailer_content",
         "tries",
     )
 
@@ -114,30 +114,30 @@ class Block:
         implied: ImpliedPicture | None = None,
     ) -> None:
         self.number, self.block_id, self.extended = number, block_id, extended
-        self.header = EXTENDED_HEADER if extended else HEADER
+        self.header = EXTENDED_HEADER_BYTES if extended else HEADER_BYTES
         self.full = datagram - self.header
         self.packets = -(-most // self.full)
         self.buffer: memoryview | None = None
         self.seen = bytearray(self.packets + 2)
         self.got = self.highest = 0
-        self.expected = PAYLOAD | 1  # second word of the header of the packet that is next in order
+        self.expected = PAYLOAD_KIND | 1  # second word of the next packet's header
         self.leader: Leader | None = None
         self.implied = implied
         self.trailer: int | None = None
-        self.said: Trailer | None = None  # contents of the trailer
+        self.trailer_content: Trailer | None = None  # contents of the trailer
         self.short: int | None = None
         self.last_size = self.full
         self.arrived: float | None = None
         self.progress = now
-        self.evident = math.inf  # time since when packets are known to be missing
+        self.missing_since = math.inf  # time from which packets are known to be missing
         self.asked, self.tries = -math.inf, 0
-        self.over = False  # whether the camera is past the block, or silent in the middle of it
+        self.over = False  # whether the camera has sent later blocks, or is silent
         self.complete = self.dead = False
 
     def take_next(self, packet: int, data: memoryview, now: float) -> bool:
-        """Take a full packet that is next in order and not the last; return whether it is one.
+        """Store a full packet if it is next in order and not the last; return whether it was.
 
-        Nearly all packets are such, so this is a short path; :meth:`take_payload` takes any packet.
+        This is the fast path of nearly all packets; :meth:`take_payload` stores any packet.
         """
         buffer = self.buffer
         if (
@@ -157,7 +157,7 @@ class Block:
         return True
 
     def take_payload(self, packet: int, data: memoryview) -> bool:
-        """Take the bytes of a payload packet; return whether they fit into the block."""
+        """Store the bytes of a payload packet; return whether they fit into the block."""
         size = len(data)
         past = self.trailer if self.trailer is not None else self.packets + 1
         if not (0 < packet < past and 0 < size <= self.full):
@@ -165,12 +165,12 @@ class Block:
         if size < self.full:
             least = self.highest if self.trailer is None else self.trailer - 1
             if self.short not in (None, packet) or packet < least:
-                return False  # only the last one may be short
+                return False  # only the last packet may be short
             self.short, self.last_size = packet, size
         elif self.short is not None and packet > self.short:
             return False
         if self.buffer is None:
-            # memory is allocated as it is written, so one packet does not cost a whole frame
+            # memory grows with the packets, so a single packet does not allocate a whole frame
             self.buffer = np.empty(self.packets * self.full, np.uint8).data
         begin = (packet - 1) * self.full
         self.buffer[begin : begin + size] = data
@@ -178,10 +178,10 @@ class Block:
         return True
 
     def take_leader(self, payload: bytes) -> None:
-        """Take the leader.
+        """Store the leader.
 
         Raises:
-            MessageError: the leader is not that of a picture, or the picture is too large.
+            MessageError: the leader is of no picture, or the picture is too large.
         """
         leader = decode_leader(payload, self.implied)
         need = picture_bytes(leader, leader.height)
@@ -194,27 +194,27 @@ class Block:
         self.leader = leader
 
     def take_trailer(self, packet: int, payload: bytes) -> bool:
-        """Take the trailer; return whether its id is after all packets that came."""
+        """Store the trailer; return whether its id is after all received packets."""
         if not self.highest < packet <= self.packets + 1:
             return False
         if self.short is not None and packet != self.short + 1:
             return False
-        self.said = decode_trailer(payload)
+        self.trailer_content = decode_trailer(payload)
         self.trailer = packet
         return True
 
     def mark(self, packet: int) -> None:
-        """Note that a packet has come."""
+        """Mark a packet as received."""
         self.seen[packet] = 1
-        if packet == self.expected & PACKET or (packet == 0 and self.highest == 0):
+        if packet == self.expected & PACKET_ID_BITS or (packet == 0 and self.highest == 0):
             following = self.seen.find(0, packet + 1 if packet else 1)
-            self.expected = PAYLOAD | (max(0, following))
+            self.expected = PAYLOAD_KIND | (max(0, following))
         self.complete = (
             self.trailer is not None and self.leader is not None and self.got == self.trailer - 1
         )
 
     def holes(self, most: int) -> list[tuple[int, int]]:
-        """Return the missing packets as ranges (first, last), at most ``most`` of these."""
+        """Return at most ``most`` ranges (first, last) of missing packets."""
         end = self.highest
         if self.trailer is not None:
             end = self.trailer
@@ -238,20 +238,20 @@ class Block:
         return max(self.highest, min(self.packets, -(-need // self.full)))
 
     def picture(self, lost: int) -> WholePicture | None:
-        """Return the complete frame; None if its bytes are too few."""
-        leader, said = self.leader, self.said
-        if leader is None or self.trailer is None or said is None:
+        """Return the complete frame; None if bytes are missing."""
+        leader, trailer_content = self.leader, self.trailer_content
+        if leader is None or self.trailer is None or trailer_content is None:
             return None
-        rows = min(said.rows or leader.height, leader.height)
+        rows = min(trailer_content.rows or leader.height, leader.height)
         need = picture_bytes(leader, rows)
         there = (self.trailer - 1) * self.full
         if self.trailer > 1 and self.seen[self.trailer - 1]:
             there += self.last_size - self.full
-        there = min(there, said.length or there)
+        there = min(there, trailer_content.length or there)
         if not rows or not leader.width or self.buffer is None:
             return None
         if need > there and leader.payload_type != PayloadType.CHUNK:
-            # for chunk data the features gave the size: such a fault is reported, not counted as
+            # for chunk data the size is from the features: a wrong size is reported, not counted as
             # lost
             return None
         stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x

@@ -1,7 +1,7 @@
-"""Run the control channel of one camera: requests with their answers, and the heartbeat.
+"""Run the control channel of one camera: requests, answers, and the heartbeat.
 
-Only one request is pending at a time. A request without an answer is sent again with the same id,
-so that the camera recognizes it; an answer that comes late, or has another id, is dropped.
+One request is pending at a time. A request without an answer is sent again with the same id, so
+that the camera recognizes it; answers that are late or have another id are dropped.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.assembler import Resend
 
 ANSWER_TIMEOUT: Final = 0.3
-"""Seconds for an answer: the standard lets a camera take 200 ms before it says "pending"."""
+"""Seconds for an answer: by the standard, a camera answers or says "pending" within 200 ms."""
 
 TRIES: Final = 3
 
@@ -44,7 +44,7 @@ IP_MTU: Final = 14
 """Socket option for the MTU of the path of a connected socket, from linux/in.h."""
 
 MAX_PENDING_TIME: Final = 30.0
-"""Seconds for which a camera may put off a request in all."""
+"""Longest time, seconds, for which a camera may delay the answer to a request."""
 
 
 class ControlChannel(asyncio.DatagramProtocol):
@@ -66,10 +66,10 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @classmethod
     async def connect(cls, host: str, port: int, source: str) -> ControlChannel:
-        """Return a channel to a camera; nothing is sent.
+        """Return a channel to a camera, without sending.
 
         Raises:
-            FrameSourceError: the host's name is unknown, or no way leads there.
+            FrameSourceError: the host's name is unknown, or there is no route.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -86,7 +86,7 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @property
     def local_address(self) -> str:
-        """Address of this host that the camera sends to."""
+        """This host's address for the camera."""
         return str(self._name("sockname")[0])
 
     @property
@@ -96,7 +96,7 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @property
     def path_mtu(self) -> int:
-        """Bytes of the largest IP packet on the path, as far as the system knows; else 1500."""
+        """Size of the largest IP packet on the path, bytes, as the system knows it; else 1500."""
         if self._transport is None or sys.platform != "linux":
             return 1500
         inside = self._transport.get_extra_info("socket")
@@ -120,12 +120,12 @@ class ControlChannel(asyncio.DatagramProtocol):
         return int.from_bytes(payload[:4], "big")
 
     async def write_register(self, address: int, value: int) -> None:
-        """Write a register; the errors are those of :meth:`read_register`."""
+        """Write a register; errors as in :meth:`read_register`."""
         what = f"{address:#06x} = {value:#x}"
         await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, what)
 
     async def read(self, address: int, length: int) -> bytes:
-        """Return bytes of the camera's memory; the errors are those of :meth:`read_register`."""
+        """Return bytes of the camera's memory; errors as in :meth:`read_register`."""
         if length == 4 and address % 4 == 0:
             return (await self.read_register(address)).to_bytes(4, "big")
         begin = address & ~3
@@ -140,7 +140,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         return b"".join(parts)[address - begin :][:length]
 
     async def write(self, address: int, data: bytes) -> None:
-        """Write into the camera's memory; the errors are those of :meth:`read_register`."""
+        """Write into the camera's memory; errors as in :meth:`read_register`."""
         if len(data) == 4 and address % 4 == 0:
             await self.write_register(address, int.from_bytes(data, "big"))
             return
@@ -156,7 +156,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             )
 
     def resend(self, wanted: Resend) -> None:
-        """Request packets again; the only answer to that are the packets."""
+        """Request packets again; the camera answers only by the packets."""
         if self._transport is not None and not self._transport.is_closing():
             data = encode_resend(
                 self._next_id(), wanted.block, wanted.first, wanted.last, extended=wanted.extended
@@ -257,11 +257,11 @@ class ControlChannel(asyncio.DatagramProtocol):
     # asyncio calls these
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the transport."""
+        """Store the transport."""
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
-        """Take a datagram if it answers the pending request."""
+        """Accept a datagram if it answers the pending request."""
         try:
             ack = decode_ack(data)
         except MessageError:
@@ -304,15 +304,15 @@ async def heartbeat(
         lost: function that is called once, at the end, with the error.
     """
     loop = asyncio.get_running_loop()
-    heard = loop.time()
+    answered = loop.time()
     while True:
         await asyncio.sleep(timeout / 3)
         try:
             privilege = await control.read_register(Register.CONTROL_PRIVILEGE)
         except FrameSourceError as exc:
-            if loop.time() - heard >= timeout:
+            if loop.time() - answered >= timeout:
                 error = FrameSourceError(
-                    f"{source}: it has not answered for {loop.time() - heard:.1f} s: {exc}",
+                    f"{source}: no answer for {loop.time() - answered:.1f} s: {exc}",
                     source=source,
                 )
                 error.__cause__ = exc
@@ -322,10 +322,10 @@ async def heartbeat(
         if not privilege & (CONTROL | EXCLUSIVE):
             lost(
                 FrameSourceError(
-                    f"{source}: control of it was lost: it restarted, or heard no heartbeat for "
+                    f"{source}: control was lost: the camera restarted, or got no heartbeat for "
                     f"{timeout:g} s",
                     source=source,
                 )
             )
             return
-        heard = loop.time()
+        answered = loop.time()

@@ -1,7 +1,7 @@
 """Locate, unpack and parse the GenICam description of a camera.
 
-It comes over the network, so its sizes and depth are bounded, and a document type, which could
-define entities, is refused.
+A description comes over the network, so its size and depth are bounded, and a document type, which
+could define entities, is refused.
 
 Source: GigE Vision 2.0, chapter 12.1 (URLs, ZIP); GenApi 2.0, chapter 2.8 (XML).
 """
@@ -18,18 +18,17 @@ from xml.parsers import expat
 from smartcam.exceptions import MessageError
 
 MAX_PLAIN_BYTES: Final = 16 << 20
-"""An unpacked description has at most this many bytes; those of large cameras have 2 MB."""
+"""Largest size of an unpacked description, bytes; those of large cameras have 2 MB."""
 
 MAX_PACKED_BYTES: Final = 4 << 20
-"""The ZIP archive of a description has at most this many bytes: 2 MB of XML take 0.2 MB. Every 46
-bytes can be one more file in it, which takes 8 us."""
+"""Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. Each 46 bytes can
+declare a file, which takes 8 us."""
 
 MAX_LEVELS: Final = 32
-"""Elements of a description are nested at most this deep."""
+"""Largest depth of nested elements of a description."""
 
 MAX_ELEMENTS: Final = 400_000
-"""A description has at most this many elements; those of a ``StructReg`` count again for each
-entry."""
+"""Largest number of elements of a description; those of a ``StructReg`` count for each entry."""
 
 
 class Location(NamedTuple):
@@ -101,7 +100,7 @@ def locate(url: str) -> Location:
 
 
 def unpack(data: bytes) -> bytes:
-    """Return a description's text; from a ZIP archive the first XML file is unpacked.
+    """Return a description's text, from a ZIP archive the text of its first XML file.
 
     Raises:
         MessageError: the archive cannot be unpacked, has more than :data:`MAX_PLAIN_BYTES`, or uses

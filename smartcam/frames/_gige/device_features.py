@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.features import GenicamFeatures
 
 DONE_INTERVAL: Final = 0.02
-"""Seconds between two polls whether a command is done."""
+"""Seconds between two polls of a command's state."""
 
 
 class GigEFeatures(DeviceFeatures):
     """The features that the camera's GenICam description lists.
 
     Args:
-        present: coroutine function that returns the features of the session that is open.
+        present: coroutine function that returns the features of the open session.
         changed: coroutine function that is called after a feature was set.
         lock: lock held while several related features are set.
     """
@@ -46,7 +46,7 @@ class GigEFeatures(DeviceFeatures):
         return await (await self._present()).get(name)
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the camera has afterwards."""
+        """Set a feature; return the camera's new value."""
         async with self._lock:
             features = await self._present()
             features.check_command(name, expected=False)
@@ -56,7 +56,7 @@ class GigEFeatures(DeviceFeatures):
         return value if described.value is None else described.value
 
     async def execute(self, name: str) -> None:
-        """Execute a command, and wait until the camera has done it."""
+        """Execute a command, and wait until it is done."""
         async with self._lock:
             features = await self._present()
             features.check_command(name)

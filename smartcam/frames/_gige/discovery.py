@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 ANSWER_WAIT: Final = 0.5
-"""Seconds to wait for answers; the standard requires them within 200 ms."""
+"""Seconds to wait for answers; by the standard, cameras answer within 200 ms."""
 
 MAX_CAMERAS: Final = 256
 
 MAX_ANSWERS_OF_ONE_ADDRESS: Final = 16
-"""At most this many answers are taken from one address, so that one host cannot fill the list."""
+"""Largest number of answers from one address, so that one host cannot fill the list."""
 
 _REQUEST_ID: Final = 1
 _SIOCGIFADDR: Final = 0x8915
@@ -132,7 +132,7 @@ class _Asking(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
         self.found: list[AnsweringCamera] = []
-        self._answers = Counter[str]()  # by the address that the answers come from
+        self._answers = Counter[str]()  # number of answers by address
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         try:

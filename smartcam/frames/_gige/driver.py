@@ -22,7 +22,7 @@ from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._gige.device_features import GigEFeatures
 from smartcam.frames._gige.discovery import find, networks
 from smartcam.frames._gige.gvcp import GvcpStatus, Register
-from smartcam.frames._gige.gvsp import IP_UDP, ImpliedPicture, PayloadType
+from smartcam.frames._gige.gvsp import IP_UDP_BYTES, ImpliedPicture, PayloadType
 from smartcam.frames._gige.messages import in_doubt
 from smartcam.frames._gige.places import found, place, wanted
 from smartcam.frames._gige.session import GigESession
@@ -60,38 +60,38 @@ if TYPE_CHECKING:
     from smartcam.frames._trigger import AwaitedTrigger
 
 MAX_SETTLING_TIME: Final = 30.0
-"""After a failed trigger, the stream waits at most this many seconds for its picture (exposure and
-readout, as the camera states them) before it is restarted."""
+"""Longest time, seconds, that the stream waits for the picture of a failed trigger before it is
+restarted."""
 
 
 class GigEDriver(FrameDriver):
     """A camera that speaks GigE Vision: ``gige://192.168.0.10?format=Mono8&fps=25``.
 
     The driver controls the camera from opening to closing. A heartbeat keeps control: a register is
-    read three times within the camera's own timeout, even while nobody reads frames.
+    read three times within the camera's own timeout, even while there are no readers.
 
     A frame's ``captured`` is the time at which its first packet was read, so ``moment`` is
     ``ARRIVAL``. Its ``duration`` is the exposure time plus one frame time for the readout, as far
-    as the camera states them. If the camera chooses the exposure time, it is the one that came with
-    the frame (``ChunkExposureTime``), or else the longest possible one. ``device_time`` is the
-    camera's own clock.
+    as the camera states them. If the camera chooses the exposure time, it is the frame's
+    ``ChunkExposureTime``, or else the longest possible one. ``device_time`` is the camera's own
+    clock.
 
-    The URL's parameters are carried out in their order:
+    The URL's parameters are applied in their order:
 
-    - ``format``: a pixel format of the camera, by its name there, in PFNC or in V4L2.
+    - ``format``: a pixel format, by its name in the camera, in PFNC or in V4L2.
     - ``size``: ``WIDTHxHEIGHT``.
     - ``fps``: frames per second, by ``AcquisitionFrameRate``.
-    - ``feature.NAME``: the value of any feature, both as in GenICam.
+    - ``feature.NAME``: the value of any GenICam feature.
 
-    and, at any place:
+    and, anywhere in the URL:
 
-    - ``serial``: the camera's serial number, instead of an address: it is looked for. Without
-      either it is the only camera there is.
-    - ``packet_size``: bytes of the stream's IP packets, 576 to 16384; ``auto``, as it is: the
-      largest that comes through in a test, or the camera's own where it sends no test packets.
-    - ``resend=off``: packets that are missing are not asked for.
-    - ``trigger``: source of the triggers, such as ``Software`` or ``Line1``, each of which causes
-      one picture; ``off``: it streams by itself. It is set after all others.
+    - ``serial``: the camera's serial number, instead of an address. Without both, the only camera
+      on the networks is used.
+    - ``packet_size``: bytes of the stream's IP packets, 576 to 16384; ``auto`` (default): the
+      largest that passes a test, or the camera's own if it sends no test packets.
+    - ``resend=off``: missing packets are not requested.
+    - ``trigger``: source of triggers, such as ``Software`` or ``Line1``, each of which causes one
+      picture; ``off``: the camera streams freely. It is applied last.
 
     Args:
         address: parts of the URL.
@@ -104,17 +104,17 @@ class GigEDriver(FrameDriver):
         self._shape: StreamShape | None = None
         self._stream: Stream | None = None
         self._sink: FrameSink | None = None
-        self._packet_size = 0  # packet size that was found to come through
+        self._packet_size = 0  # packet size that passed the test
         self._setting = asyncio.Lock()  # held while related features are set
         self._opening = asyncio.Lock()
         self._features = GigEFeatures(self._present, self._feature_changed, self._setting)
         self._triggers: list[TriggerSetting] = []
         self._armed: ArmedTrigger | None = None
         self._busy_until = 0.0  # on the clock of time.monotonic()
-        self._is_wanted = False  # whether it was opened, and not closed since
-        self._is_changed = False  # whether a feature was set while it streamed
-        # duration of frames that may have been in progress when a feature was set, and the time
-        # until which they may come
+        self._is_wanted = False  # whether the driver is open
+        self._is_changed = False  # whether a feature was set during the stream
+        # duration of frames in progress when a feature was set, and the time until which they may
+        # come
         self._before = 0.0, 0.0
         self.counts: PacketCounts | None = None
         """Packet counts of the running stream, or of the last one."""
@@ -130,7 +130,7 @@ class GigEDriver(FrameDriver):
         return self.address.shown if self._session is None else self._session.label
 
     async def open(self) -> StreamFormat:
-        """Take control of the camera and set it."""
+        """Take control of the camera, and apply the URL's settings."""
         self._is_wanted = True
         return (await self._opened())[1].format
 
@@ -151,7 +151,7 @@ class GigEDriver(FrameDriver):
                     self.form = self._shape.format
                     await self._read_triggers(session)
                     if not self._is_wanted:
-                        raise FrameSourceError(f"{self.name}: it was closed", source=self.name)
+                        raise FrameSourceError(f"{self.name}: closed meanwhile", source=self.name)
                 except BaseException:
                     await session.close()
                     raise
@@ -159,7 +159,7 @@ class GigEDriver(FrameDriver):
             return self._session, self._shape
 
     async def start(self, sink: FrameSink) -> None:
-        """Start the stream, and open the camera if it is not open."""
+        """Start the stream, and open the camera if needed."""
         self._is_wanted = True
         session, shape = await self._opened()
         self._sink = sink
@@ -186,7 +186,7 @@ class GigEDriver(FrameDriver):
             await session.features.execute("AcquisitionStop")
             await lock(session.features, False)
             await session.control.write_register(Register.STREAM_PORT, 0)
-        except FrameSourceError as exc:  # the camera is gone; the next start opens it anew
+        except FrameSourceError as exc:  # the camera is gone; the next start opens it again
             session.lost = exc
 
     async def close(self) -> None:
@@ -195,7 +195,7 @@ class GigEDriver(FrameDriver):
         await self._drop()
 
     async def _drop(self) -> None:
-        """Stop the stream and give up control of the camera; it may be opened anew."""
+        """Stop the stream and give up control of the camera, which may be opened again."""
         try:
             await self.stop()
         finally:
@@ -214,7 +214,7 @@ class GigEDriver(FrameDriver):
         return (await self._opened())[0].features
 
     async def _feature_changed(self) -> None:
-        """Read what a feature may have changed: the format, and how the camera is triggered."""
+        """Read the format and the trigger settings, which a feature may have changed."""
         session, shape = await self._opened()
         if self._stream is not None:
             exposure = await read_exposure(session.features)
@@ -228,7 +228,7 @@ class GigEDriver(FrameDriver):
             await self._read_shape(session)
 
     def _longest(self, shape: StreamShape, arrived: float) -> float:
-        """Return the longest time, seconds, that a frame arriving at a time may have taken."""
+        """Return the longest possible duration, seconds, of a frame that arrived at a time."""
         before, until = self._before
         return max(shape.exposure.duration, before if arrived < until else 0.0)
 
@@ -247,7 +247,7 @@ class GigEDriver(FrameDriver):
         """Trigger one picture by the command TriggerSoftware, or by ``fire``."""
         session, stream = self._session, self._stream
         if session is None or stream is None:
-            raise FrameSourceError(f"{self.name}: it does not stream", source=self.name)
+            raise FrameSourceError(f"{self.name}: the camera does not stream", source=self.name)
         async with self._setting:
             setting = await one_setting(
                 self._triggers, session.features, fire is not None, self.name
@@ -281,7 +281,7 @@ class GigEDriver(FrameDriver):
             pending.refused()
             if exc.status != GvcpStatus.BUSY:
                 raise
-            raise CameraBusyError(f"{self.name}: it takes no trigger now: {exc}") from exc
+            raise CameraBusyError(f"{self.name}: the camera accepts no trigger now: {exc}") from exc
 
     def disarm(self) -> None:
         """Assign no more pictures to the last trigger."""
@@ -301,7 +301,7 @@ class GigEDriver(FrameDriver):
         if doubt := armed.doubt(picture, ids_agree=session.ids_agree):
             self.disarm()
             return FrameLostError(
-                f"{self.name}: whose picture block {picture.block_id} is cannot be known: {doubt}"
+                f"{self.name}: the trigger of block {picture.block_id} is uncertain: {doubt}"
             )
         self._armed = None
         session.ids_agree = session.ids_agree or picture.block_id in armed.exposed
@@ -313,7 +313,7 @@ class GigEDriver(FrameDriver):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have the camera report events through its message channel."""
+        """Start reports of the camera's events through its message channel."""
         async with self._setting:
             session, _ = await self._opened()
             end = await session.events.watch(names, take, ended)
@@ -325,7 +325,7 @@ class GigEDriver(FrameDriver):
         return stop
 
     async def _watch_exposures(self, session: GigESession) -> None:
-        """Have the camera report the events about triggers that it supports."""
+        """Start reports of the supported events about triggers."""
         if session.watches_exposures:
             return
         session.watches_exposures = True
@@ -347,12 +347,12 @@ class GigEDriver(FrameDriver):
             )
 
     async def _listen(self, session: GigESession, shape: StreamShape) -> Stream:
-        """Have the camera send its stream to a new socket."""
+        """Direct the camera's stream to a new socket."""
         try:
             where = StreamSocket(session.control.local_address, session.control.camera_address)
         except OSError as exc:
             raise FrameSourceError(
-                f"{self.name}: no socket for it: {exc}", source=self.name
+                f"{self.name}: no socket for the stream: {exc}", source=self.name
             ) from exc
         try:
             asked = self._wanted.packet_size or self._packet_size
@@ -360,7 +360,7 @@ class GigEDriver(FrameDriver):
             resend = session.can_resend and self._wanted.resend
             assembler = Assembler(
                 shape.payload,
-                size - IP_UDP,
+                size - IP_UDP_BYTES,
                 resend=resend,
                 begins_low=not self._triggers and not session.streamed,
                 implied=ImpliedPicture(shape.number, shape.format.width, shape.format.height),
@@ -391,7 +391,7 @@ class GigEDriver(FrameDriver):
             sink.ended(error)
 
     def _take(self, pictures: list[WholePicture]) -> None:
-        """Take the stream's pictures; a receiver of a frame may close the stream."""
+        """Deliver the stream's pictures; a receiver of a frame may close the stream."""
         stream = self._stream
         sink = None if pictures or self._armed is None else self._sink
         if sink is not None and stream is not None and (lost := stream.assembler.take_lost()):
@@ -400,7 +400,7 @@ class GigEDriver(FrameDriver):
             sink.trigger_failed(
                 FrameLostError(
                     f"{self.name}: {lost} picture{'s' if lost > 1 else ''} came incomplete while "
-                    "that of a trigger was waited for"
+                    "a trigger waited for its picture"
                 )
             )
         for picture in pictures:

@@ -1,7 +1,7 @@
 """Receive the events of a GigE Vision camera by its message channel, each exactly once.
 
 The data of an event are the bytes of its item, as EMVA's GenApi passes them to the description's
-event port: address 0 is the item's size, 2 its number, and its own data follow the timestamp.
+event port: the item's size at address 0, its number at 2, and its data after the timestamp.
 
 Source: GigE Vision 2.0, chapters 17 (EVENT, EVENTDATA) and 28 (message channel's registers); SFNC
 2.7, chapter 12 (``EventSelector``, ``EventNotification``).
@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 
     from smartcam.frames._gige.session import GigESession
 
-KEPT_REQUESTS: Final = 256
-"""Number of request ids that are remembered, so that an event that is sent again is taken only
-once."""
+MAX_KEPT_REQUESTS: Final = 256
+"""Number of remembered request ids, so that an event that is sent again counts once."""
 
 MAX_EVENTS_IN_MESSAGE: Final = 100
 
@@ -44,9 +43,9 @@ _REQUEST: Final = struct.Struct(">BBHHH")
 _ITEM: Final = struct.Struct(">HHHHQ")
 _LONG_ITEM: Final = struct.Struct(">HHHHQQ")
 _KEY: Final = 0x42
-_ON: Final = ("On", "GigEVisionEvent", "GenICamEvent")
-"""Entries of EventNotification that switch an event on: that of today's SFNC, then those of its
-first versions."""
+_ON_ENTRIES: Final = ("On", "GigEVisionEvent", "GenICamEvent")
+"""Entries of EventNotification that switch an event on: of today's SFNC, then of its first
+versions."""
 
 
 class EventItem(NamedTuple):
@@ -155,7 +154,7 @@ class EventChannel(asyncio.DatagramProtocol):
         self._names: dict[int, str] = {}
         self._numbers: dict[str, int] = {}
         self._messages: MessageFeatures | None = None
-        self._taken: collections.deque[int] = collections.deque(maxlen=KEPT_REQUESTS)
+        self._recent_requests: collections.deque[int] = collections.deque(maxlen=MAX_KEPT_REQUESTS)
         self.dropped = 0
         """Number of datagrams that were no events, or came from other hosts."""
 
@@ -172,7 +171,7 @@ class EventChannel(asyncio.DatagramProtocol):
         take: Callable[[FrameEvent], None],
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
-        """Have events reported; return the coroutine function that stops that.
+        """Start reports of events; return the coroutine function that stops them.
 
         Raises:
             UnsupportedError: the camera reports no events.
@@ -181,7 +180,7 @@ class EventChannel(asyncio.DatagramProtocol):
         known = await self.names()
         label = self._session.label
         if not known:
-            raise UnsupportedError(f"{label}: it tells no events: it has no EventSelector")
+            raise UnsupportedError(f"{label}: it reports no events: it has no EventSelector")
         for name in names:
             if name not in known:
                 raise FrameSourceError(
@@ -219,7 +218,7 @@ class EventChannel(asyncio.DatagramProtocol):
                             await self._switch(name, on=False)
 
     async def _open(self) -> None:
-        """Have the camera's message channel send to a new socket."""
+        """Direct the camera's message channel to a new socket."""
         if self._transport is not None:
             return
         control = self._session.control
@@ -242,7 +241,7 @@ class EventChannel(asyncio.DatagramProtocol):
                 (Register.MESSAGE_TIMEOUT, RESEND_TIMEOUT_MS),
                 (Register.MESSAGE_RETRIES, RETRIES),
             ):
-                with contextlib.suppress(RequestRefusedError):  # not all can send events again
+                with contextlib.suppress(RequestRefusedError):  # not all cameras resend events
                     await control.write_register(register, value)
             if self._messages is None:
                 self._messages = MessageFeatures(self._session.features, "EventID")
@@ -252,7 +251,7 @@ class EventChannel(asyncio.DatagramProtocol):
         self._transport = transport
 
     async def _number(self, name: str) -> None:
-        """Return the number of an event: that of its port, or the value of its feature."""
+        """Return the number of an event from its port or its feature."""
         if self._messages is None or name in self._numbers:
             return
         number: float | None = self._messages.number_of(f"Event{name}")
@@ -271,11 +270,11 @@ class EventChannel(asyncio.DatagramProtocol):
         features = self._session.features
         await features.set("EventSelector", name)
         entries = await features.entries("EventNotification")
-        said = next((one for one in _ON if one in entries), "On") if on else "Off"
-        await features.set("EventNotification", said)
+        entry = next((one for one in _ON_ENTRIES if one in entries), "On") if on else "Off"
+        await features.set("EventNotification", entry)
 
     def end(self, error: FrameSourceError | None) -> None:
-        """Tell all watchers that no events come any more."""
+        """End all watchers, since no more events come."""
         watchers, self._watchers = self._watchers, []
         for watcher in watchers:
             watcher.ended(error)
@@ -293,11 +292,11 @@ class EventChannel(asyncio.DatagramProtocol):
     # asyncio calls these
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the transport here, since acknowledgements may be needed at once."""
+        """Store the transport, since acknowledgements may be needed at once."""
         self._acks = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Take events, and acknowledge them."""
+        """Acknowledge events, and report them."""
         if addr[0] != self._session.control.camera_address:
             self.dropped += 1
             return
@@ -308,13 +307,13 @@ class EventChannel(asyncio.DatagramProtocol):
             return
         if request.wants_ack:
             self._acks.sendto(encode_event_ack(request.command, request.request_id), addr)
-        if request.request_id in self._taken:
+        if request.request_id in self._recent_requests:
             return
-        self._taken.append(request.request_id)
+        self._recent_requests.append(request.request_id)
         for item in request.items:
-            self._tell(item)
+            self._report(item)
 
-    def _tell(self, item: EventItem) -> None:
+    def _report(self, item: EventItem) -> None:
         name = self._names.get(item.number)
         if name is None or self._messages is None:
             return

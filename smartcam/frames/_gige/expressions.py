@@ -23,13 +23,13 @@ Number: TypeAlias = "int | float"
 Tree: TypeAlias = "tuple[str, tuple[Tree, ...]] | int | float | str"
 
 MAX_FORMULA_CHARACTERS: Final = 8192
-"""A formula has at most this many characters."""
+"""Largest number of characters of a formula."""
 
 MAX_NAMES_SHOWN: Final = 20
-"""An error shows at most this many names of variables."""
+"""Largest number of names of variables in an error."""
 
 MAX_LEVELS: Final = 150
-"""The tree of a formula has at most this many levels."""
+"""Largest depth of a formula's tree."""
 
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<hex>0[xX][0-9a-fA-F]+)"
@@ -60,8 +60,8 @@ _LEVELS_OF_EMVA: Final = (
     ("<<", ">>"),
     ("&", "|", "^"),
 )
-"""Binary operators by the precedence of EMVA's own GenApi, the lowest first, which was found out by
-its results (genicam 1.6.0)."""
+"""Binary operators by the precedence of EMVA's GenApi, the lowest first, measured by its results
+(genicam 1.6.0)."""
 
 
 _TIGHTER_THAN_NOT: Final = frozenset({"&", "|", "^", "<<", ">>", "**"})
@@ -103,7 +103,7 @@ def _power(left: Number, right: Number) -> Number:
         return int(left**right)
     power = float(left) ** float(right)
     if isinstance(power, complex):
-        raise ValueError("a root of a negative number")  # noqa: TRY004 - as math's functions say it
+        raise ValueError("a root of a negative number")  # noqa: TRY004 - like math's functions
     return float(power)
 
 
@@ -168,8 +168,8 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
     """Evaluate a formula.
 
     EMVA's GenApi, with which makers test their descriptions, gives operators another precedence
-    than C; other programs use that of C. If the two readings give different values, nobody knows
-    which one the maker means.
+    than C; other programs use C's. If the two give different values, the maker's intention is
+    unknown.
 
     Args:
         formula: text of the formula in the description.
@@ -243,7 +243,7 @@ def _parsed(formula: str) -> tuple[Tree, Tree]:
 
 
 class _FormulaParser:
-    """Parses a formula by C's precedence."""
+    """Parser of formulas with C's precedence."""
 
     strength = _OF_C
 
@@ -363,7 +363,7 @@ class _FormulaParser:
 
 
 class _EmvaParser(_FormulaParser):
-    """Parses a formula as EMVA's GenApi does.
+    """Parser of formulas that reads them like EMVA's GenApi.
 
     A sign before a name or a number binds tighter than any operator. A minus before a parenthesis
     or a function applies to everything after it, and is misread except at the start. In nested
@@ -406,12 +406,12 @@ class _EmvaParser(_FormulaParser):
 
     def _misread(self, before: str, sign: str) -> MessageError:
         return MessageError(
-            f"formula {self._formula[:80]!r}: expected a value behind {before}, got {sign}, which "
+            f"formula {self._formula[:80]!r}: expected a value after {before}, got {sign}, which "
             "EMVA's GenApi misreads there"
         )
 
     def _is_whole(self, at: int) -> bool:
-        """Return True if a parenthesis or a function begins there."""
+        """Return True if a parenthesis or a function begins at a token."""
         following = self._tokens[at + 1] if at + 1 < len(self._tokens) else ("", "")
         return self._tokens[at][1] == "(" or following == ("operator", "(")
 

@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.description import Element
 
 MAX_LINKED_NODES: Final = 64
-"""Nodes may refer to each other in a chain of at most this length: a longer one is a circle."""
+"""Largest length of a chain of references between nodes: a longer chain is a circle."""
 
 MAX_NODES_VISITED: Final = 5000
-"""At most this many nodes are visited for one value."""
+"""Largest number of nodes that are visited for one value."""
 
 MAX_ELEMENTS_VISITED: Final = 500_000
-"""At most this many elements of nodes and characters of formulas are examined for one value, which
-takes about a second. A node may be needed again and again, and counts each time."""
+"""Largest number of elements of nodes and characters of formulas that are examined for one value,
+which takes about a second. A node counts each time it is needed."""
 
 MAX_REGISTER_BYTES: Final = 4096
-"""A register has at most this many bytes."""
+"""Largest size of a register, bytes."""
 
 _REGISTERS: Final = ("IntReg", "MaskedIntReg", "StructEntry")
 _KNIVES: Final = ("SwissKnife", "IntSwissKnife")
@@ -51,16 +51,16 @@ _KINDS: Final[Mapping[str, FeatureKind]] = {
     "Enumeration": "enumeration",
     "Command": "command",
 }
-"""Kinds of features, for users, by the kind of node."""
+"""Kinds of features by the kind of node."""
 
-LONGEST_TEXT: Final = 1000
-"""Number of characters of a feature's description that are kept."""
+MAX_DESCRIPTION_CHARACTERS: Final = 1000
+"""Largest number of characters of a feature's description; the rest is cut."""
 
 T = TypeVar("T")
 
 
 class NoLimitError(MessageError):
-    """The description gives no limit for a node, nor for the node that holds its value."""
+    """Error for a node whose limits the description does not give."""
 
 
 class DeviceMemory(Protocol):
@@ -78,7 +78,7 @@ class DeviceMemory(Protocol):
 class GenicamFeatures:
     """The features of a camera, to read and to set.
 
-    Between two calls nothing is kept except values that the description itself holds.
+    No value is kept between two calls, except values that the description itself holds.
 
     Args:
         nodes: named elements of the camera's description.
@@ -88,18 +88,18 @@ class GenicamFeatures:
 
     def __init__(self, nodes: Mapping[str, Element], port: DeviceMemory, source: str) -> None:
         self._nodes, self._port, self._source = nodes, port, source
-        self._held: dict[str, FeatureValue] = {}  # values that nodes with a <Value> were set to
+        self._own_values: dict[str, FeatureValue] = {}  # values set for nodes with a <Value>
         self._read: dict[tuple[str, int, int], bytes] = {}
         self._steps = self._work = 0
         self._writing: Callable[[], None] | None = None
-        self._lock = asyncio.Lock()  # caches that one call fills
+        self._lock = asyncio.Lock()  # guards the caches of a call
         self._spellings = {spelled(name): name for name in nodes}
         self._selectors: dict[str, tuple[str, ...]] | None = None
 
     def share(self, other: GenicamFeatures) -> None:
-        """Use the same description as another object, with the values that were set there."""
+        """Share the description and the set values of another object."""
         GenicamFeatures.__init__(self, other._nodes, other._port, other._source)
-        self._held = other._held
+        self._own_values = other._own_values
 
     def __contains__(self, name: object) -> bool:
         """Return True if the description has a node of this name."""
@@ -129,12 +129,12 @@ class GenicamFeatures:
         async with self._lock:
             node = await self._begin(name)
             try:
-                return await self._shown(node)
+                return await self._as_user_value(node)
             except MessageError as exc:
                 raise self._wrong(name, str(exc)) from exc
 
     async def number(self, name: str) -> float | None:
-        """Return a feature's number; None if it has none, or is not available now."""
+        """Return a feature's number; None if it is no number, or not available now."""
         if name not in self._nodes:
             return None
         async with self._lock:
@@ -168,7 +168,8 @@ class GenicamFeatures:
             writing: function that is called right before the camera's register is written.
 
         Raises:
-            FrameFeatureError: there is no such feature, or it cannot be set, or not to that value.
+            FrameFeatureError: there is no such feature, it cannot be set, or the value is out of
+                range.
         """
         async with self._lock:
             node = await self._begin(name)
@@ -176,7 +177,7 @@ class GenicamFeatures:
             try:
                 if await self._condition(node, "pIsLocked", False, 0):
                     raise self._wrong(name, "it is locked now")
-                await self._set(node, await self._meant(node, value), 0)
+                await self._set(node, await self._as_node_value(node, value), 0)
             except MessageError as exc:
                 raise self._wrong(name, str(exc)) from exc
             finally:
@@ -195,11 +196,10 @@ class GenicamFeatures:
         await self.set(name, 1, writing=writing)
 
     def check_command(self, name: str, *, expected: bool = True) -> None:
-        """Raise unless a name is that of a command, or with ``expected`` False, if it is one.
+        """Raise unless a name belongs to a command; with ``expected`` False, raise if it does.
 
         Raises:
-            FrameSourceError: the name is not that of a command, or there is no feature of that
-                name.
+            FrameSourceError: the feature is no command, or there is no such feature.
         """
         node = self._named(name)
         if (node.kind == "Command") != expected:
@@ -207,9 +207,9 @@ class GenicamFeatures:
             raise self._wrong(node.name, f"it is {is_not}")
 
     async def is_done(self, name: str) -> bool:
-        """Return True if a command is done: its register no longer has the command's value.
+        """Return True if a command is done, so that its register has changed.
 
-        A command whose register cannot be read was done when the camera answered the write.
+        A command with an unreadable register is done when the camera answers the write.
 
         Raises:
             FrameSourceError: the camera does not answer.
@@ -218,7 +218,7 @@ class GenicamFeatures:
             node = await self._begin(name)
             try:
                 command = await self._field(node, "CommandValue", 0, 1)
-                return await self._get_held(node, 0) != command
+                return await self._get_own_value(node, 0) != command
             except MessageError:
                 return True
 
@@ -260,14 +260,14 @@ class GenicamFeatures:
     async def _begin(self, name: str) -> Element:
         node = self._named(name)
         try:
-            there = await self._there(node, 0)
+            there = await self._is_available(node, 0)
         except MessageError as exc:
             raise self._wrong(name, str(exc)) from exc
         if not there:
             raise self._wrong(name, "it is not available now")
         return node
 
-    async def _there(self, node: Element, depth: int) -> bool:
+    async def _is_available(self, node: Element, depth: int) -> bool:
         implemented = await self._condition(node, "pIsImplemented", True, depth)
         return implemented and await self._condition(node, "pIsAvailable", True, depth)
 
@@ -279,11 +279,11 @@ class GenicamFeatures:
         return {
             entry.name: _whole(entry.text_of("Value"))
             for entry in node.all("EnumEntry")
-            if await self._there(entry, 0)
+            if await self._is_available(entry, 0)
         }
 
-    async def _shown(self, node: Element) -> FeatureValue:
-        """Return a node's value in the form for users."""
+    async def _as_user_value(self, node: Element) -> FeatureValue:
+        """Return a node's value in the user's form."""
         value = await self._get(node, 0)
         if node.kind == "Enumeration":
             return next((name for name, one in _entries(node).items() if one == value), value)
@@ -291,17 +291,17 @@ class GenicamFeatures:
             return value == _on(node)
         return value
 
-    async def _meant(self, node: Element, value: FeatureValue) -> FeatureValue:
-        """Check that a node can have a value, and return the node's own form of it."""
+    async def _as_node_value(self, node: Element, value: FeatureValue) -> FeatureValue:
+        """Convert a user's value to the node's form; raise if the node cannot have it."""
         if node.kind == "Command":
             return int(await self._field(node, "CommandValue", 0, 1))
         if node.kind in _TEXTS:
             return str(value)
         if node.kind == "Boolean":
-            said = str(value).lower()
-            if said not in ("0", "1", "true", "false", "on", "off"):
+            text = str(value).lower()
+            if text not in ("0", "1", "true", "false", "on", "off"):
                 raise self._wrong(node.name, f"expected true or false, got {value!r}")
-            return _on(node) if said in ("1", "true", "on") else _off(node)
+            return _on(node) if text in ("1", "true", "on") else _off(node)
         if node.kind == "Enumeration":
             entries = await self._entries_now(node)
             if str(value) not in entries:
@@ -334,7 +334,7 @@ class GenicamFeatures:
     # values
 
     async def _numbered(self, name: str, depth: int) -> int | float:
-        """Return the number of the node of a name."""
+        """Return the number of a named node."""
         node = self._nodes.get(name)
         if node is None:
             raise MessageError(f"the description has no node {name[:80]!r}")
@@ -346,7 +346,7 @@ class GenicamFeatures:
     async def _field(
         self, node: Element, kind: str, depth: int, default: float | None = None
     ) -> int | float:
-        """Return the number in ``<kind>``, or that of the node that ``<pKind>`` names."""
+        """Return the number in ``<kind>``, or of the node named in ``<pKind>``."""
         for one in node.children:
             if one.kind == kind:
                 return _number(one.text)
@@ -357,14 +357,14 @@ class GenicamFeatures:
         return default
 
     def _step(self, node: Element, depth: int) -> None:
-        """Count a visited node; raise MessageError if it is too deep or one too many."""
+        """Count a visited node; raise MessageError beyond the limits of depth and number."""
         self._steps += 1
         if depth > MAX_LINKED_NODES or self._steps > MAX_NODES_VISITED:
             raise MessageError(f"node {node.name}: its description goes in a circle")
         self._spend(node, len(node.children))
 
     def _spend(self, node: Element, work: int) -> None:
-        """Count examined elements or characters; raise MessageError if they are too many."""
+        """Count examined elements or characters; raise MessageError beyond the limit."""
         self._work += work
         if self._work > MAX_ELEMENTS_VISITED:
             raise MessageError(
@@ -383,7 +383,7 @@ class GenicamFeatures:
             raw = await self._field(node, "Value", depth)
             return await self._worked_out(node, node.text_of("FormulaFrom"), {"TO": raw}, depth)
         if node.kind in _HOLDERS:
-            return await self._get_held(node, depth)
+            return await self._get_own_value(node, depth)
         data = await self._bytes(node, *await self._place(node, depth))
         if node.kind == "StringReg":
             return text(data)
@@ -391,9 +391,9 @@ class GenicamFeatures:
             return _float(node, data)
         return _bits(node, data)
 
-    async def _get_held(self, node: Element, depth: int) -> FeatureValue:
-        if node.name in self._held:
-            return self._held[node.name]
+    async def _get_own_value(self, node: Element, depth: int) -> FeatureValue:
+        if node.name in self._own_values:
+            return self._own_values[node.name]
         target = await self._target(node, depth)
         if target is not None:
             value = await self._get(target, depth + 1)
@@ -413,7 +413,7 @@ class GenicamFeatures:
         return value
 
     async def _indexed(self, node: Element, depth: int) -> int | float:
-        """Return the number in the description for the value of an index."""
+        """Return the description's number for the value of an index."""
         wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
         for one in node.all("ValueIndexed"):
             if _number(one.attributes.get("Index", "-1")) == wanted:
@@ -421,7 +421,7 @@ class GenicamFeatures:
         return await self._field(node, "ValueDefault", depth)
 
     async def _target(self, node: Element, depth: int) -> Element | None:
-        """Return the node that holds a node's value; None: the node holds it itself."""
+        """Return the node that holds a node's value; None: the node itself."""
         found = node.first("pValue")
         index = node.first("pIndex")
         if index is not None and node.kind in ("Integer", "Float"):
@@ -459,7 +459,7 @@ class GenicamFeatures:
         return evaluate(formula, variables, whole=whole)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
-        """Return the value of a formula's variable: that of its node, or of its part ``.NAME``."""
+        """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
         _, _, what = variable.name.partition(".")
         if what in ("", "Value"):
             return await self._numbered(variable.text, depth + 1)
@@ -479,20 +479,20 @@ class GenicamFeatures:
             return entries[entry]
         raise MessageError(
             f"variable {variable.name[:80]!r}: expected .Value, .Min, .Max, .Inc or .Entry.NAME "
-            "behind its name"
+            "after its name"
         )
 
     async def _limit(self, node: Element, what: str, depth: int) -> int | float:
         """Return the smallest or largest value of a node, or its step.
 
-        A node without limits has those of the node that holds its value; if that has none, they
+        A node without limits has the limits of the node that holds its value; without these, they
         follow from its bits (GenApi 2.0, 2.8.4 and 2.8.6).
         """
         self._step(node, depth)
         if node.first(what, "p" + what) is not None:
             return await self._field(node, what, depth)
-        held = node.kind in ("Integer", "Float", "Enumeration")
-        target = await self._target(node, depth) if held else None
+        has_own_value = node.kind in ("Integer", "Float", "Enumeration")
+        target = await self._target(node, depth) if has_own_value else None
         if target is not None:
             return await self._limit(target, what, depth + 1)
         if what == "Inc" and node.kind in _WHOLE:
@@ -522,7 +522,7 @@ class GenicamFeatures:
             return
         target = await self._target(node, depth)
         if target is None:
-            self._held[node.name] = value
+            self._own_values[node.name] = value
             return
         if target.kind in _WHOLE and isinstance(value, float):
             value = round(value)
@@ -540,14 +540,14 @@ class GenicamFeatures:
     async def _described(self, node: Element) -> Feature:
         kind = _KINDS.get(node.kind)
         if kind is None:
-            raise self._wrong(node.name, f"a {node.kind} is nothing to read or set")
+            raise self._wrong(node.name, f"a {node.kind} cannot be read or set")
         more = node.text_of("Description") or node.text_of("ToolTip")
         basis = Feature(
             node.name,
             kind,
             "",
             selectors=self._selected_by(node.name),
-            description=" ".join(more.split())[:LONGEST_TEXT],
+            description=" ".join(more.split())[:MAX_DESCRIPTION_CHARACTERS],
         )
         problems: list[str] = []
         try:
@@ -558,22 +558,22 @@ class GenicamFeatures:
             return replace(basis, problem=str(exc))
         parts: dict[str, Any] = {"access": access, "unit": await self._unit(node, problems)}
         if kind == "enumeration":
-            parts["entries"] = tuple(await self._told(self._entries_now(node), problems) or ())
+            parts["entries"] = tuple(await self._noted(self._entries_now(node), problems) or ())
         elif kind in ("integer", "float"):
             for part, what in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
                 if what == "Inc" and kind == "float":
                     continue
-                limit = await self._told(self._limit(node, what, 0), problems)
+                limit = await self._noted(self._limit(node, what, 0), problems)
                 endless = limit is None or abs(limit) >= (
                     sys.float_info.max if kind == "float" else (1 << 63) - 1
                 )
                 parts[part] = None if endless else limit
         if kind != "command" and access != "wo":
-            parts["value"] = await self._told(self._shown(node), problems)
+            parts["value"] = await self._noted(self._as_user_value(node), problems)
         return replace(basis, **parts, problem="; ".join(dict.fromkeys(problems)))
 
-    async def _told(self, work: Coroutine[Any, Any, T], problems: list[str]) -> T | None:
-        """Return the result of some work; None if it fails, and the reason is noted."""
+    async def _noted(self, work: Coroutine[Any, Any, T], problems: list[str]) -> T | None:
+        """Return the result of ``work``; if it fails, note the problem and return None."""
         self._steps = self._work = 0
         try:
             return await work
@@ -587,7 +587,7 @@ class GenicamFeatures:
 
     async def _access_now(self, node: Element) -> Literal["rw", "ro", "wo", ""]:
         """Return the present access to a feature."""
-        if not await self._there(node, 0):
+        if not await self._is_available(node, 0):
             return ""
         readable, writable = True, not await self._condition(node, "pIsLocked", False, 0)
         for depth in range(MAX_LINKED_NODES):
@@ -600,7 +600,7 @@ class GenicamFeatures:
             if found is None:
                 break
             node = found
-            if not await self._there(node, depth):
+            if not await self._is_available(node, depth):
                 return ""
             writable = writable and not await self._condition(node, "pIsLocked", False, depth)
         return ("rw" if writable else "ro") if readable else "wo" if writable else ""
@@ -611,7 +611,7 @@ class GenicamFeatures:
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
-            found = await self._told(self._target(node, depth), problems)
+            found = await self._noted(self._target(node, depth), problems)
             if found is None:
                 return ""
             node = found
@@ -659,7 +659,7 @@ class GenicamFeatures:
         return int(offset * await self._numbered(index.text, depth + 1))
 
     def _memory(self, node: Element) -> DeviceMemory:
-        """Return the memory that a register is read from."""
+        """Return the memory of a register."""
         port = self._nodes.get(node.text_of("pPort"))
         if port is not None and port.first("ChunkID", "pChunkID") is not None:
             raise MessageError(f"{node.name} is sent with each frame only")
@@ -668,7 +668,7 @@ class GenicamFeatures:
         return self._port
 
     async def _bytes(self, node: Element, address: int, length: int) -> bytes:
-        """Read a register, at most once per call from outside."""
+        """Read a register, at most once per public call."""
         key = node.text_of("pPort"), address, length
         if key not in self._read:
             self._read[key] = await self._memory(node).read(address, length)
@@ -690,7 +690,7 @@ class GenicamFeatures:
             shift, bits = _span(node, length)
             least = -(1 << bits - 1) if _signed(node) else 0
             if not least <= whole < least + (1 << bits):
-                raise MessageError(f"{whole} has no room in {bits} bits")
+                raise MessageError(f"{whole} does not fit into {bits} bits")
             order = _order(node)
             if bits < 8 * length:
                 before = int.from_bytes(await self._bytes(node, address, length), order)
@@ -704,28 +704,28 @@ class GenicamFeatures:
         await memory.write(address, data)
 
 
-def _number(said: str) -> int | float:
+def _number(text: str) -> int | float:
     try:
-        return _whole(said)
+        return _whole(text)
     except MessageError:
         pass
     try:
-        number = float(said)
+        number = float(text)
     except ValueError:
         number = math.nan
     if math.isnan(number):
-        raise MessageError(f"expected a number, got {said[:40]!r}")
+        raise MessageError(f"expected a number, got {text[:40]!r}")
     return number
 
 
-def _whole(said: str) -> int:
-    digits = said.strip()
+def _whole(text: str) -> int:
+    digits = text.strip()
     try:
         if len(digits) > 24:
             raise ValueError("too long")
         number = int(digits, 16 if digits.lower().startswith("0x") else 10)
     except ValueError as exc:
-        raise MessageError(f"expected a whole number, got {said[:40]!r}") from exc
+        raise MessageError(f"expected a whole number, got {text[:40]!r}") from exc
     return number
 
 
@@ -734,7 +734,7 @@ def _entries(node: Element) -> dict[str, int]:
 
 
 def _access(node: Element) -> tuple[str, str]:
-    """Return the access mode of a node itself, and the one that the description imposes on it."""
+    """Return the access mode of a node, and the mode that the description imposes."""
     return node.text_of("AccessMode"), node.text_of("ImposedAccessMode")
 
 
@@ -763,7 +763,7 @@ def _span(node: Element, length: int) -> tuple[int, int]:
     low, high = min(ends), max(ends)
     if not 0 <= low <= high < 8 * length:
         raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")
-    if _order(node) == "big":  # descriptions whose bit 0 is the highest one
+    if _order(node) == "big":  # bit 0 is the highest bit
         low = 8 * length - 1 - high
     return low, abs(ends[1] - ends[0]) + 1
 

@@ -1,7 +1,7 @@
-"""Give a GigE Vision camera another IP address until it is switched off, by its hardware address.
+"""Set a GigE Vision camera's IP address by its hardware address, until it is switched off.
 
-A camera whose address fits no network of this machine can be found and given another one, but not
-opened. The camera accepts that only while nobody controls it.
+A camera whose address fits no network of this machine can be found, but not opened, until it gets
+another address. The camera accepts an address only while no application controls it.
 
 Source: GigE Vision 2.0, chapter 14.2 (FORCEIP).
 """
@@ -60,18 +60,18 @@ async def force_address(
     places: Sequence[Network] | None = None,
     port: int = PORT,
 ) -> FoundSource:
-    """Give a camera an IP address until it is switched off; return the camera as found afterwards.
+    """Set a camera's IP address until it is switched off; return the camera as then found.
 
     Args:
         mac: hardware address of the camera, ``00:11:22:33:44:55``.
-        address: IP address with the length of its network's prefix, ``192.168.0.20/24``.
+        address: IP address with its prefix length, ``192.168.0.20/24``.
         gateway: default gateway of the camera; ``0.0.0.0``: none.
         places: networks to search; None: all networks of this machine.
         port: UDP port that cameras listen at.
 
     Raises:
         ConfigurationError: the address is not valid, or another camera has it.
-        FrameSourceError: there is no such camera, it refuses, or does not answer by its new
+        FrameSourceError: there is no such camera, it refuses, or it does not answer at its new
             address.
 
     Cancellation: the camera may have the new address.
@@ -154,11 +154,11 @@ def _of_mac(there: list[AnsweringCamera], mac: str) -> AnsweringCamera:
 async def _sent(
     payload: bytes, places: Sequence[Network], port: int, camera: AnsweringCamera
 ) -> None:
-    """Send the request into all networks until it is answered.
+    """Broadcast the request in all networks until it is answered.
 
     Raises:
         FrameSourceError: the request is refused.
-        FrameTimeoutError: nothing answers.
+        FrameTimeoutError: no answer came.
     """
     loop = asyncio.get_running_loop()
     answered: asyncio.Future[int] = loop.create_future()
@@ -183,7 +183,7 @@ async def _sent(
         else:
             raise FrameTimeoutError(
                 f"{camera.info.label}: no answer to FORCEIP in {TRIES} x {ANSWER_TIMEOUT:g} s: a "
-                "camera that somebody controls does not answer"
+                "camera controlled by another application does not answer"
             )
     finally:
         for transport, _ in opened:
@@ -201,7 +201,7 @@ async def _appeared(mac: str, address: str, places: Sequence[Network], port: int
                 return found(camera._replace(address=address))
         if loop.time() >= end:
             raise FrameTimeoutError(
-                f"{mac}: it took the address {address}, and does not answer a search by it within "
+                f"{mac}: it accepted the address {address}, but does not answer at it within "
                 f"{APPEAR_TIMEOUT:g} s"
             )
 

@@ -1,6 +1,6 @@
 """Encode and decode GVCP, the control protocol of GigE Vision: packets, registers, status codes.
 
-A request has an eight-byte header (key 0x42, flags, command, length, request id), an answer one of
+A request has an eight-byte header (key 0x42, flags, command, length, request id), an answer too:
 status, command, length, and the id of its request. All numbers are big-endian.
 
 Source: GigE Vision 2.0, chapters 14 to 16 (messages), 19 (status codes), 28 (bootstrap registers).
@@ -18,8 +18,8 @@ PORT: Final = 3956
 """UDP port that cameras listen at."""
 
 MAX_BYTES_PER_REQUEST: Final = 512
-"""Number of bytes, a multiple of four, that one READMEM or WRITEMEM transfers; the standard's limit
-is 536."""
+"""Largest number of bytes of one READMEM or WRITEMEM, a multiple of four; the standard's limit is
+536."""
 
 ACK_REQUIRED: Final = 0x01
 BROADCAST_ACK: Final = 0x10
@@ -34,7 +34,7 @@ _WORD: Final = struct.Struct(">I")
 
 
 class GvcpCommand(IntEnum):
-    """The command of a packet; that of an answer is one above its request's."""
+    """The command of a packet; an answer's is its request's plus one."""
 
     DISCOVERY = 0x0002
     FORCEIP = 0x0004
@@ -117,16 +117,16 @@ LATCH: Final = 0x2
 FIRE_TEST_PACKET: Final = 0x80000000
 DO_NOT_FRAGMENT: Final = 0x40000000
 PACKET_SIZE_MASK: Final = 0xFFFF
-"""Bits of STREAM_PACKET_SIZE; the size they hold is that of the IP packet, in bytes."""
+"""Bits of STREAM_PACKET_SIZE with the size of the IP packets, in bytes."""
 
 
 class Ack(NamedTuple):
     """The acknowledgement of a request.
 
     Attributes:
-        status: member of :class:`GvcpStatus`, or a maker's own.
+        status: member of :class:`GvcpStatus`, or a maker's code.
         command: member of :class:`GvcpCommand`, plus one; or PENDING_ACK.
-        request_id: id of the request that it answers.
+        request_id: id of the answered request.
         payload: bytes after the header.
     """
 
@@ -159,7 +159,7 @@ class DeviceInfo(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name of the device for people."""
+        """Display name of the device."""
         names = (f'"{self.user_name}"' if self.user_name else "", self.manufacturer, self.model)
         serial = f"({self.serial})" if self.serial else ""
         return " ".join(part for part in (*names, serial) if part)
@@ -194,7 +194,7 @@ def text(data: bytes) -> str:
 
 
 def status_text(status: int) -> str:
-    """Return the text of a status code for people."""
+    """Return the text of a status code."""
     try:
         return f"{GvcpStatus(status).name} ({status:#06x})"
     except ValueError:

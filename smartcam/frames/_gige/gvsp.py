@@ -1,12 +1,11 @@
 """Decode GVSP, the stream protocol of GigE Vision: packet headers, leader and trailer.
 
-A frame is a *block*: a leader, the payload cut into packets of one size, the last one shorter, and
-a trailer. Packet ids count from 0, that of the leader. Block ids have 16 bits, go from 1 to 65535
-and continue at 1; or they have 64 bits if the camera sends extended ids, as a bit of each header
-says.
+A frame is a *block*: a leader, the payload in packets of one size, with a shorter last packet, and
+a trailer. Packet ids count from the leader's 0. Block ids have 16 bits, go from 1 to 65535 and
+continue at 1; or they have 64 bits if a bit of each header announces extended ids.
 
 Chunk data of the standard's first version (payload type 4) has a leader without the picture's size,
-which only the camera's features give. The payload begins with a chunk of the picture's length.
+which is in the camera's features. Its payload begins with the picture's chunk.
 
 Source: GigE Vision 2.0, chapters 23 to 25.
 """
@@ -19,14 +18,14 @@ from typing import Final, NamedTuple
 
 from smartcam.exceptions import MessageError
 
-IP_UDP: Final = 28
+IP_UDP_BYTES: Final = 28
 """Bytes of the IP and UDP headers, which a camera's packet size includes."""
 
-HEADER: Final = 8
-EXTENDED_HEADER: Final = 20
+HEADER_BYTES: Final = 8
+EXTENDED_HEADER_BYTES: Final = 20
 """Bytes of the header of a packet with extended ids."""
 
-EXTENDED: Final = 0x80
+EXTENDED_FLAG: Final = 0x80
 """Bit in the byte of the packet's kind: block ids have 64 bits, packet ids 32."""
 
 _SHORT: Final = struct.Struct(">HHI")
@@ -121,7 +120,7 @@ class Leader(NamedTuple):
 
 
 class ImpliedPicture(NamedTuple):
-    """A picture as the camera's features describe it, for leaders that do not.
+    """A picture's format by the camera's features, for leaders without it.
 
     Attributes:
         pixel_format: PFNC's number.
@@ -150,16 +149,16 @@ class Trailer(NamedTuple):
 
 def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHeader | None:
     """Decode the header of a packet of ``size`` bytes; None if it is too short."""
-    if size < HEADER:
+    if size < HEADER_BYTES:
         return None
     status, block, word = _SHORT.unpack_from(data)
     kind = word >> 24
-    if not kind & EXTENDED:
-        return PacketHeader(status, block, kind, word & 0xFFFFFF, HEADER)
-    if size < EXTENDED_HEADER:
+    if not kind & EXTENDED_FLAG:
+        return PacketHeader(status, block, kind, word & 0xFFFFFF, HEADER_BYTES)
+    if size < EXTENDED_HEADER_BYTES:
         return None
     status, _, word, block, packet = _LONG.unpack_from(data)
-    return PacketHeader(status, block, kind & 0x7F, packet, EXTENDED_HEADER)
+    return PacketHeader(status, block, kind & 0x7F, packet, EXTENDED_HEADER_BYTES)
 
 
 def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Leader:
@@ -167,10 +166,10 @@ def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Lead
 
     Args:
         payload: bytes of the leader.
-        implied: picture for a leader without a size; None: such a leader is an error.
+        implied: picture size for a leader without a size; None: such a leader is an error.
 
     Raises:
-        MessageError: the leader is too short, or not that of an image.
+        MessageError: the leader is too short, or of no image.
     """
     if len(payload) < _LEADER.size:
         raise MessageError(f"leader: expected 12 bytes or more, got {len(payload)}", data=payload)

@@ -1,7 +1,7 @@
-"""Read values that a camera sends unasked: chunk data after each picture, and data of events.
+"""Read values that a camera sends without a request: chunk data of pictures, and data of events.
 
-A description has a port for each chunk and each event; a feature whose registers are read through
-such a port has its value in the bytes of the message. Nothing here asks the camera.
+A description has a port for each chunk and each event; a feature whose registers are behind such a
+port has its value in the message. Reading needs no request to the camera.
 
 Source: GigE Vision 2.0, chapter 24.6 (chunks: data, id, length, from the end of the payload on);
 GenApi 2.0, chapter 2.8.16 (``ChunkID`` and ``EventID`` of a Port).
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.features import DeviceMemory
 
 MAX_CHUNKS: Final = 256
-"""A picture has at most this many chunks."""
+"""Largest number of chunks of a picture."""
 
 MAX_MESSAGE_FEATURES: Final = 256
-"""At most this many features are read from one message."""
+"""Largest number of features that are read from one message."""
 
 MAX_REFERENCES: Final = 32
-"""At most this many nodes lie between a feature and the port of its message."""
+"""Largest number of nodes between a feature and the port of its message."""
 
 _ENDING: Final = struct.Struct(">II")
 _LEADS_TO_VALUE: Final = ("pValue", "pPort", "pVariable")
@@ -65,7 +65,7 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
 
 
 def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
-    """Return the reason why a picture without a size in its leader may have another one, or "".
+    """Return the reason why a picture's size by the features may be wrong, or "".
 
     Args:
         picture: picture with the size by the camera's features.
@@ -79,8 +79,8 @@ def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
         return f"a picture of {size} in chunk data that cannot be read: {exc}"
     if len(first) != need:
         return f"a picture of {size} has {need} bytes, the chunk that came has {len(first)}"
-    for name, said in (("ChunkWidth", leader.width), ("ChunkHeight", leader.height)):
-        if chunks.get(name, said) != said:
+    for name, expected in (("ChunkWidth", leader.width), ("ChunkHeight", leader.height)):
+        if chunks.get(name, expected) != expected:
             return f"its picture is {size} by its features, {name} is {chunks[name]}"
     return ""
 
@@ -124,7 +124,7 @@ class MessageFeatures(GenicamFeatures):
             names = [name for number in parts for name in self._by_number.get(number, ())]
             for name in names[:MAX_MESSAGE_FEATURES]:
                 try:
-                    values[name] = at_once(self._shown(self._named(name)))
+                    values[name] = at_once(self._as_user_value(self._named(name)))
                 except (MessageError, RuntimeError) as exc:
                     problems.append(f"{name}: {exc}")
         finally:
@@ -140,7 +140,7 @@ class MessageFeatures(GenicamFeatures):
         return _MessageBytes(self._parts[number])
 
     def _number_of(self, name: str) -> int | None:
-        """Return the number of the message that a feature's value comes with."""
+        """Return the number of the message with a feature's value."""
         waiting, seen = [name], set[str]()
         while waiting and len(seen) < MAX_REFERENCES:
             one = waiting.pop()
@@ -172,7 +172,7 @@ class _MessageBytes:
 
 
 def _port_numbers(nodes: Mapping[str, Element], kind: str) -> dict[str, int]:
-    """Return the number of each port that has one of the kind."""
+    """Return the number of each port of the kind."""
     found: dict[str, int] = {}
     for node in nodes.values():
         text = node.text_of(kind) if node.kind == "Port" else ""

@@ -9,7 +9,7 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames._driver import FoundSource
 from smartcam.frames._gige.discovery import find, networks
 from smartcam.frames._gige.gvcp import PORT
-from smartcam.frames._gige.setup import FEATURE, PACKETS, WantedStream
+from smartcam.frames._gige.setup import FEATURE, PACKET_SIZES, WantedStream
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
@@ -35,25 +35,25 @@ def wanted(address: FrameAddress) -> WantedStream:
     """
     names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
     features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]
-    said = address.parameters([*_PARAMETERS, *features])
+    given = address.parameters([*_PARAMETERS, *features])
     if address.path not in ("", "/"):
         raise address.wrong("path", "gige://HOST", address.path)
-    if "serial" in said and address.host:
-        raise address.wrong("serial", "none beside an address", said["serial"])
-    resend = said.get("resend", "on")
+    if "serial" in given and address.host:
+        raise address.wrong("serial", "none beside an address", given["serial"])
+    resend = given.get("resend", "on")
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
-    packet_size = said.get("packet_size", "auto")
+    packet_size = given.get("packet_size", "auto")
     asked = 0.0
     if packet_size != "auto":
-        asked = address.number("packet_size", packet_size, *PACKETS)
+        asked = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
-        said,
-        address.size(said["size"]) if "size" in said else None,
-        address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
+        given,
+        address.size(given["size"]) if "size" in given else None,
+        address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
         int(asked) & ~3,
         resend == "on",
-        said.get("trigger"),
+        given.get("trigger"),
     )
 
 
@@ -61,11 +61,11 @@ async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
     """Return the address and the port of a camera.
 
     Raises:
-        FrameSourceError: the address names no host, and not exactly one camera was found.
+        FrameSourceError: the address names no host, and none or several cameras were found.
     """
     if address.host:
         return address.host, address.port or PORT
-    serial = what.said.get("serial")
+    serial = what.parameters.get("serial")
     there = await find(networks())
     fitting = [one for one in there if serial in (None, one.info.serial)]
     if len(fitting) != 1:

@@ -1,4 +1,4 @@
-"""Control one camera: read its description, set its features, keep its heartbeat."""
+"""Control one camera: read its description, set its features, send heartbeats."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.description import Element
 
 OPEN_TIMEOUT: Final = 60.0
-"""Seconds until a camera is opened; most of it is its description, 512 bytes at a time."""
+"""Seconds for opening a camera; reading its description takes most of the time."""
 
 RESEND_CAPABILITY: Final = 0x4
 """Bit of the register CAPABILITIES: the camera can send packets again."""
 
 MAX_REMARK_LENGTH: Final = 1000
-"""The remark of a frame about unreadable chunk data has at most this many characters."""
+"""Largest number of characters of a frame's remark about unreadable chunk data."""
 
 CAPABILITIES: Final = 0x0934
 URL_SIZE: Final = 512
 HEARTBEAT_TIMEOUTS: Final = (0.5, 60.0)
-"""A camera's own heartbeat timeout is used if it is between these numbers of seconds."""
+"""Least and largest heartbeat timeout of a camera that is used unchanged, seconds."""
 
 
 class GigESession:
@@ -56,9 +56,9 @@ class GigESession:
         self.streamed = False
         """Whether the camera has streamed before."""
         self.watches_exposures = False
-        """Whether events about the outcome of triggers were switched on."""
+        """Whether events about triggers are switched on."""
         self.ids_agree = False
-        """Whether an event has named the block of a picture that came."""
+        """Whether an event has named the block of a received picture."""
         self.events = EventChannel(self)
         self._features: GenicamFeatures | None = None
         self._chunks: MessageFeatures | None = None
@@ -84,7 +84,7 @@ class GigESession:
             if isinstance(exc, FrameSourceError):
                 raise
             raise FrameTimeoutError(
-                f"{label}: it was not opened in {OPEN_TIMEOUT:g} s", source=label
+                f"{label}: not opened within {OPEN_TIMEOUT:g} s", source=label
             ) from exc
         except BaseException:
             await session.close()
@@ -99,7 +99,7 @@ class GigESession:
         return self._features
 
     def read_chunks(self, picture: WholePicture) -> tuple[Mapping[str, FeatureValue], str]:
-        """Return the values that came with a picture, and the problems in reading them."""
+        """Return the chunk values of a picture, and problems in reading them."""
         if picture.payload is None:
             return {}, ""
         try:
@@ -150,10 +150,9 @@ class GigESession:
         )
 
     async def latched_clock(self) -> int | None:
-        """Return the reading of the camera's clock now, ticks; None: it cannot be read.
+        """Return the camera's clock, ticks; None: it cannot be read.
 
-        A clock that stands still does not count: some cameras only store the written register, and
-        latch nothing.
+        A clock that stands still counts as unreadable: some cameras do not latch it.
 
         Raises:
             FrameSourceError: the camera does not answer.
@@ -188,7 +187,7 @@ class GigESession:
         try:
             await self.control.write_register(Register.CONTROL_PRIVILEGE, CONTROL)
         except FrameSourceError as exc:
-            if not await self._is_taken(exc):
+            if not await self._is_controlled_elsewhere(exc):
                 raise
             other = await self._register_or_0(Register.PRIMARY_APPLICATION_ADDRESS)
             where = ".".join(str(part) for part in other.to_bytes(4, "big"))
@@ -199,8 +198,8 @@ class GigESession:
             ) from exc
         self._ours = True
 
-    async def _is_taken(self, error: FrameSourceError) -> bool:
-        """Return True if taking control failed because another application has it.
+    async def _is_controlled_elsewhere(self, error: FrameSourceError) -> bool:
+        """Return True if taking control failed because another application has control.
 
         A camera should refuse with ACCESS_DENIED; the fake camera of Aravis does not answer at all.
         """
@@ -213,17 +212,17 @@ class GigESession:
 
 
 async def read_description(control: ControlChannel, label: str) -> dict[str, Element]:
-    """Read a camera's description; try the second URL if the first one leads nowhere.
+    """Read a camera's description; try the second URL if the first fails.
 
     Raises:
-        FrameSourceError: neither URL leads to a description.
+        FrameSourceError: no URL leads to a description.
     """
     tried = []
     for address in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
         url = text(await control.read(address, URL_SIZE))
         try:
-            lies = locate(url)
-            data = await control.read(lies.address, lies.length)
+            location = locate(url)
+            data = await control.read(location.address, location.length)
             return await _in_thread(functools.partial(_nodes, data), label)
         except (MessageError, RequestRefusedError) as exc:
             tried.append(str(exc))
@@ -237,7 +236,7 @@ def _nodes(data: bytes) -> dict[str, Element]:
 
 
 async def _in_thread(work: Callable[[], dict[str, Element]], label: str) -> dict[str, Element]:
-    """Do work in a thread, since 2 MB of XML take a quarter of a second."""
+    """Parse in a thread, since 2 MB of XML take a quarter of a second."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=f"description of {label}")
     try:
         return await asyncio.get_running_loop().run_in_executor(pool, work)

@@ -1,4 +1,4 @@
-"""Set a camera's features as its URL says, and the registers of its stream channel."""
+"""Apply a URL's settings to a camera, and set its stream channel's registers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartcam.frames._gige.gvcp import (
     PACKET_SIZE_MASK,
     Register,
 )
-from smartcam.frames._gige.gvsp import EXTENDED_HEADER, IP_UDP, bits_of
+from smartcam.frames._gige.gvsp import EXTENDED_HEADER_BYTES, IP_UDP_BYTES, bits_of
 from smartcam.frames._gige.triggering import set_trigger
 from smartcam.frames._pixels.formats import find_format
 
@@ -30,37 +30,37 @@ if TYPE_CHECKING:
 FEATURE: Final = "feature."
 """Prefix of the URL's parameters that set features."""
 
-PACKETS: Final = (576, 16384)
-"""Least and largest number of bytes of the stream's IP packets: each network carries the first."""
+PACKET_SIZES: Final = (576, 16384)
+"""Least and largest size of the stream's IP packets, bytes; every network carries the least."""
 
 TEST_WAIT: Final = 0.1
 """Seconds for a test packet."""
 
 MAX_FRAME_BYTES: Final = 1 << 30
-"""A frame has at most this many bytes."""
+"""Largest size of a frame, bytes."""
 
 MAX_NUMBER: Final = 1e12
-"""Numbers of frames per second, or of microseconds, above this value are not believed."""
+"""Largest plausible number of frames per second, or of microseconds."""
 
 _RATES: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _RATE_SWITCHES: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 _EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
-"""Names of the exposure time, microseconds: in today's SFNC, then in its first versions."""
+"""Names of the exposure time, microseconds: of today's SFNC, then of its first versions."""
 
 
 class WantedStream(NamedTuple):
     """The stream that a URL asks for.
 
     Attributes:
-        said: parameters of the URL, in their order.
+        parameters: parameters of the URL, in their order.
         size: width and height, pixels; None: the camera's setting.
         rate: frames per second; None: the camera's setting.
-        packet_size: bytes of an IP packet; 0: the largest that comes through.
-        resend: whether missing packets are asked for.
+        packet_size: bytes of an IP packet; 0: the largest that passes a test.
+        resend: whether missing packets are requested.
         trigger: source of the triggers, or ``off``; None: the camera's setting.
     """
 
-    said: Mapping[str, str]
+    parameters: Mapping[str, str]
     size: tuple[int, int] | None
     rate: float | None
     packet_size: int
@@ -69,7 +69,7 @@ class WantedStream(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """The longest time that a frame takes, as far as the camera states it.
+    """The longest duration of a frame, as far as the camera states it.
 
     Attributes:
         duration: seconds of the longest exposure and of the readout.
@@ -99,19 +99,19 @@ class StreamShape(NamedTuple):
 
 
 async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
-    """Set a camera in the order of the URL's parameters; return the resulting stream.
+    """Apply a URL's parameters to a camera in their order; return the resulting stream.
 
     Raises:
-        FrameSourceError: the camera has no such feature or value; the text lists those that it has.
+        FrameSourceError: the camera has no such feature or value; the text lists the existing ones.
     """
     features = session.features
-    with contextlib.suppress(FrameSourceError):  # it does not stream, which may be an error
+    with contextlib.suppress(FrameSourceError):  # the camera does not stream, which may be an error
         await features.execute("AcquisitionStop")
     await lock(features, False)
     mode = "AcquisitionMode"
     if mode in features and "Continuous" in await features.entries(mode):
         await features.set(mode, "Continuous")
-    for name, value in wanted.said.items():
+    for name, value in wanted.parameters.items():
         if name == "format":
             await _set_format(session, value)
         elif name == "size" and wanted.size is not None:
@@ -126,7 +126,7 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
 
 
 async def lock(features: GenicamFeatures, locked: bool) -> None:
-    """Tell the camera whether its stream's shape is fixed; not all cameras need that."""
+    """Lock or unlock the stream's parameters; some cameras need this."""
     if "TLParamsLocked" in features:
         with contextlib.suppress(FrameSourceError):  # some cameras have it read-only
             await features.set("TLParamsLocked", int(locked))
@@ -135,7 +135,7 @@ async def lock(features: GenicamFeatures, locked: bool) -> None:
 async def _set_format(session: GigESession, name: str) -> None:
     entries = await session.features.entries("PixelFormat")
     for entry, number in entries.items():
-        known = _known(number)
+        known = _format_of_code(number)
         names = [entry] if known is None else [entry, known.name, known.fourcc]
         if name.upper() in (one.upper() for one in names):
             await session.features.set("PixelFormat", entry)
@@ -189,12 +189,12 @@ async def read_shape(session: GigESession) -> StreamShape:
     entry = await features.get("PixelFormat")
     entries = await features.entries("PixelFormat")
     number = int(await features.number("PixelFormat") or 0)
-    pixels = _known(number)
+    pixels = _format_of_code(number)
     if pixels is None:
-        fitting = tuple(name for name, one in entries.items() if _known(one) is not None)
+        fitting = tuple(name for name, one in entries.items() if _format_of_code(one) is not None)
         raise FrameFormatError(
-            f"{session.label}: it is set to {entry}, {number:#010x}, which is not known here; of "
-            f"its formats are {', '.join(fitting) or 'none'}",
+            f"{session.label}: it is set to {entry}, {number:#010x}, which is unknown; of "
+            f"its formats, smartcam knows {', '.join(fitting) or 'none'}",
             source=session.label,
             available=fitting,
         )
@@ -231,8 +231,8 @@ async def read_exposure(features: GenicamFeatures) -> Exposure:
     return Exposure(exposure / 1e6 + readout, readout, is_auto)
 
 
-def _known(number: int) -> PixelFormat | None:
-    """Return the format of PFNC's number; its names differ, since cameras have older ones."""
+def _format_of_code(number: int) -> PixelFormat | None:
+    """Return the format of PFNC's number; cameras may use older names."""
     with contextlib.suppress(FrameFormatError):
         return find_format(number)
     return None
@@ -249,34 +249,34 @@ async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> fl
 
 
 async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
-    """Have the camera's stream channel send to a socket.
+    """Direct the camera's stream channel to a socket.
 
     Args:
         session: the camera.
         where: socket that receives the packets.
-        asked: number of bytes of a packet; 0: the largest that comes through.
+        asked: number of bytes of a packet; 0: the largest that passes a test.
 
     Returns:
         Number of bytes of an IP packet of the stream.
 
     Raises:
-        FrameSourceError: the camera refuses to send there, or refuses the packet size.
+        FrameSourceError: the camera refuses the destination or the packet size.
     """
     control = session.control
     address = int(ipaddress.IPv4Address(control.local_address))
     await control.write_register(Register.STREAM_DESTINATION, address)
     await control.write_register(Register.STREAM_PORT, where.port)
-    size = await (_given(session, asked) if asked else _tested(session, where))
-    if not size > IP_UDP + EXTENDED_HEADER:
+    chosen = _requested_packet_size(session, asked) if asked else _largest_tested(session, where)
+    size = await chosen
+    if not size > IP_UDP_BYTES + EXTENDED_HEADER_BYTES:
         raise FrameSourceError(
-            f"{session.label}: packet_size: expected {PACKETS[0]} bytes or more, the camera says "
-            f"{size}",
+            f"{session.label}: packet_size: expected {PACKET_SIZES[0]} bytes or more, got {size}",
             source=session.label,
         )
     return size
 
 
-async def _given(session: GigESession, asked: int) -> int:
+async def _requested_packet_size(session: GigESession, asked: int) -> int:
     control = session.control
     await control.write_register(Register.STREAM_PACKET_SIZE, asked | DO_NOT_FRAGMENT)
     size = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
@@ -288,17 +288,17 @@ async def _given(session: GigESession, asked: int) -> int:
     return size
 
 
-async def _tested(session: GigESession, where: StreamSocket) -> int:
-    """Return the largest size of a test packet that came, or the camera's own size if none came."""
+async def _largest_tested(session: GigESession, where: StreamSocket) -> int:
+    """Return the size of the largest received test packet, or the camera's own size."""
     control = session.control
     own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
     way = min(control.path_mtu, 9000)
-    for size in sorted({way, min(way, 1500), PACKETS[0]}, reverse=True):
+    for size in sorted({way, min(way, 1500), PACKET_SIZES[0]}, reverse=True):
         value = size | DO_NOT_FRAGMENT | FIRE_TEST_PACKET
-        # the camera does not send test packets, or none of this size
+        # the camera does not send test packets of this size
         with contextlib.suppress(FrameSourceError):
             await control.write_register(Register.STREAM_PACKET_SIZE, value)
             set_to = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
             if set_to <= size and await where.test_packet(set_to, TEST_WAIT):
                 return set_to
-    return await _given(session, min(own or 1500, way, 1500))
+    return await _requested_packet_size(session, min(own or 1500, way, 1500))

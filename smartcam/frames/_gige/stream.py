@@ -1,7 +1,7 @@
 """Pass packets from the stream's socket to the assembler, and pictures to their receiver.
 
-Measured CPU time of the receiver per packet of 1400 bytes: 29 us with asyncio's datagram transport,
-which makes an object and a call for each; 4 us with a bare socket that is read until it is empty.
+Measured CPU time per packet of 1400 bytes: 29 us with asyncio's datagram transport, which makes an
+object and a call for each; 4 us with a bare socket that is read until it is empty.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from smartcam.frames._gige.gvsp import IP_UDP
+from smartcam.frames._gige.gvsp import IP_UDP_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,12 +22,11 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.block import WholePicture
 
 MAX_PACKETS_PER_TURN: Final = 64
-"""At most this many packets are read before the event loop continues: a third of a millisecond."""
+"""Largest number of packets read before the event loop continues: 0.3 ms."""
 
-BUFFER: Final = 8 << 20
-"""Size of the receive buffer that the system is asked for, bytes. Linux gives at most
-net.core.rmem_max, by default 208 KiB, which a frame of 512x512 fills; packets that do not fit while
-the loop is busy are lost."""
+RECEIVE_BUFFER_BYTES: Final = 8 << 20
+"""Requested size of the receive buffer. Linux gives at most net.core.rmem_max, by default 208 KiB,
+which a frame of 512x512 fills; further packets are lost while the loop is busy."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
 """Socket option from asm-generic/socket.h that exceeds rmem_max, for processes that may administer
@@ -52,7 +51,7 @@ class StreamSocket:
             self.socket.setblocking(False)
             for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
                 with contextlib.suppress(OSError):  # the second option is for privileged processes
-                    self.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
+                    self.socket.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
             self.socket.bind((local, 0))
         except BaseException:
             self.socket.close()
@@ -71,7 +70,7 @@ class StreamSocket:
             async with asyncio.timeout(wait):
                 while True:
                     size, sender = await loop.sock_recvfrom_into(self.socket, buffer)
-                    if size == packet_size - IP_UDP and sender[0] == self.camera:
+                    if size == packet_size - IP_UDP_BYTES and sender[0] == self.camera:
                         return True
         except TimeoutError:
             return False
@@ -86,10 +85,9 @@ class Stream:
 
     Args:
         where: socket that receives the packets, closed with the stream.
-        assembler: maker of pictures from the packets.
-        done: function that takes each picture, and the number of lost frames that no picture
-            follows.
-        resend: function that takes the packets that the camera should send again.
+        assembler: assembler of pictures.
+        done: function that is called with new pictures.
+        resend: function that requests packets from the camera.
     """
 
     def __init__(
@@ -129,15 +127,15 @@ class Stream:
                 size, sender = receive(view)
             except BlockingIOError:
                 break
-            except OSError:  # an error of an earlier datagram that we sent; the next packets come
+            except OSError:  # an error of an earlier sent datagram; reading goes on
                 continue
             if sender[0] == camera:
                 feed(view, size, now, arrived)
             else:
                 self.foreign += 1
-        self._tell()
+        self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         pictures = self.assembler.pictures()
         if pictures or self.assembler.fault is not None or self.assembler.untold:
             self._done(pictures)
@@ -150,11 +148,11 @@ class Stream:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer_at = deadline  # a timer of uvloop does not say whether it was cancelled
+        self._timer_at = deadline  # uvloop's timers do not report cancellation
         self._timer = self._loop.call_at(deadline, self._due)
 
     def _due(self) -> None:
         self._timer = None
         for wanted in self.assembler.handle_timeout(self._loop.time()):
             self._resend(wanted)
-        self._tell()
+        self._report()

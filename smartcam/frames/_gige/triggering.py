@@ -1,9 +1,9 @@
 """Trigger a GigE Vision camera, and find the picture that a trigger caused.
 
-A picture belongs to the waiting trigger unless one of these contradicts it: it was exposed before
-the trigger was sent, by the camera's clock, which is read (latched) right before; a picture was
-lost meanwhile; an event of the camera names another block. If the camera's clock cannot be read,
-the decision rests on the stream alone: each earlier picture was accounted for.
+A picture belongs to the pending trigger unless it was exposed before the trigger by the camera's
+clock, which is latched right before; a picture was lost meanwhile; or an event of the camera names
+another block. If the clock cannot be read, only the stream is evidence: all earlier pictures have
+come.
 
 Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
 ``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
@@ -30,7 +30,7 @@ MISSED: Final = "FrameTriggerMissed"
 """Name of the event for a trigger that caused no picture."""
 
 MAX_EXPOSURES: Final = 16
-"""At most this many exposures of one trigger are remembered."""
+"""Largest number of exposures of one trigger that are kept."""
 
 SOFTWARE: Final = "Software"
 FRAME_START: Final = "FrameStart"
@@ -41,7 +41,7 @@ class TriggerSetting(NamedTuple):
 
     Attributes:
         selector: entry of TriggerSelector; ``""``: the camera has only one kind.
-        source: entry of TriggerSource; ``""``: the camera does not say.
+        source: entry of TriggerSource; ``""``: unknown.
     """
 
     selector: str
@@ -76,12 +76,12 @@ async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
 
 
 async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:
-    if await _said(features, "TriggerMode") != "On":
+    if await _text_of(features, "TriggerMode") != "On":
         return []
-    return [TriggerSetting(selector, await _said(features, "TriggerSource"))]
+    return [TriggerSetting(selector, await _text_of(features, "TriggerSource"))]
 
 
-async def _said(features: GenicamFeatures, name: str) -> str:
+async def _text_of(features: GenicamFeatures, name: str) -> str:
     """Return a feature's text, or "" if it is not available now."""
     if name not in features:
         return ""
@@ -94,16 +94,16 @@ async def _said(features: GenicamFeatures, name: str) -> str:
 
 
 async def set_trigger(features: GenicamFeatures, source: str) -> None:
-    """Have each picture wait for a trigger from a source; ``off``: for none.
+    """Set the source of triggers, each of which causes one picture; ``off``: no triggers.
 
     Raises:
-        FrameSourceError: the camera has no such source; the text lists those that it has.
+        FrameSourceError: the camera has no such source; the text lists the existing ones.
     """
     if "TriggerSelector" in features:
         for selector in await features.entries("TriggerSelector"):
             if selector != FRAME_START:
                 await features.set("TriggerSelector", selector)
-                if await _said(features, "TriggerMode") == "On":
+                if await _text_of(features, "TriggerMode") == "On":
                     await features.set("TriggerMode", "Off")
         await features.set("TriggerSelector", FRAME_START)
     if source.lower() == "off":
@@ -119,10 +119,10 @@ async def set_trigger(features: GenicamFeatures, source: str) -> None:
 async def one_setting(
     settings: list[TriggerSetting], features: GenicamFeatures, by_line: bool, name: str
 ) -> TriggerSetting:
-    """Return the kind of trigger that causes exactly one picture, and is fired in this way.
+    """Return the setting of a trigger that causes exactly one picture.
 
     Raises:
-        NotRunningError: no trigger is switched on, or only one from another source.
+        NotRunningError: no trigger is switched on, or only from another source.
         UnsupportedError: a trigger causes several pictures, or several triggers are needed for one.
     """
     if not settings:
@@ -132,10 +132,10 @@ async def one_setting(
         )
     setting = settings[0]
     if len(settings) > 1 or setting.selector not in ("", FRAME_START):
-        said = "; ".join(map(str, settings))
+        shown = "; ".join(map(str, settings))
         raise UnsupportedError(
             f"{name}: expected one trigger for each picture, TriggerMode On for {FRAME_START} "
-            f"alone, got: {said}"
+            f"alone, got: {shown}"
         )
     is_software = setting.source == SOFTWARE or not (setting.source or by_line)
     if by_line and is_software:
@@ -176,7 +176,7 @@ class ArmedTrigger:
         latched: the camera's clock right before the trigger, ticks; None: it cannot be read.
         setting: kind of the trigger.
         delay: seconds from the trigger to its exposure (``TriggerDelay``).
-        is_first: whether no picture of the stream has come yet.
+        is_first: whether the stream has had no picture yet.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class ArmedTrigger:
         self.pending, self.delay = pending, delay
         self._latched, self._setting, self._is_first = latched, setting, is_first
         self.exposed: list[int] = []
-        """Blocks that the camera exposed since, by its events."""
+        """Blocks exposed since the trigger, by the camera's events."""
 
     def is_older(self, picture: WholePicture) -> bool:
         """Return True if a picture was exposed before the trigger, by the camera's clock."""
@@ -202,11 +202,11 @@ class ArmedTrigger:
         return older
 
     def doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
-        """Return the reason why a picture may not be the trigger's, or ``""``.
+        """Return the reason why a picture may belong to another trigger, or ``""``.
 
         Args:
             picture: picture that came first.
-            ids_agree: whether events and pictures of this camera are known to have the same ids.
+            ids_agree: whether this camera's events and pictures are known to have the same ids.
         """
         if picture.lost > 0 and not self._is_first:
             return f"{picture.lost} right before it came incomplete, or not at all"
@@ -215,11 +215,11 @@ class ArmedTrigger:
         return ""
 
     def take_event(self, event: FrameEvent, ticks: float | None) -> bool:
-        """Take an event of the camera; return True if it reports that the trigger was missed.
+        """Record an event of the camera; return True if it reports a missed trigger.
 
         Args:
-            event: event that the camera told.
-            ticks: reading of the camera's clock that came with the event; None: none did.
+            event: reported event.
+            ticks: the event's time on the camera's clock; None: no time.
         """
         if ticks is not None and self._latched is not None and ticks < self._latched:
             return False
@@ -235,7 +235,7 @@ class ArmedTrigger:
             self.pending.notes.append(text)
 
     def record(self, picture: WholePicture, ticks_per_second: int) -> FrameTrigger:
-        """Return the record of the trigger for its picture."""
+        """Return the trigger's record for its picture."""
         evidence: list[str] = []
         if picture.block_id in self.exposed:
             evidence.append(f"the camera's event {EXPOSED} names its block {picture.block_id}")

@@ -1,4 +1,4 @@
-"""The planes of a picture where a decoder left them, joined when somebody asks for their bytes."""
+"""Keep the planes of a decoded picture separate until their bytes are needed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
 
 
 class PlanesApart:
-    """Planes that stand in places of their own, such as a decoder's Y, U and V.
+    """Planes in separate buffers, such as a decoder's Y, U and V.
 
-    Joining them costs a copy of the whole picture, which the brightness alone does not need.
+    Joining copies the whole picture, which reading the brightness does not need.
 
     Args:
-        planes: objects with the bytes of a plane each, which nobody writes into.
+        planes: buffers with the bytes of one plane each, which do not change.
     """
 
     __slots__ = ("_joined", "_planes")
@@ -25,12 +25,12 @@ class PlanesApart:
 
     @property
     def first(self) -> bytes | memoryview:
-        """The bytes of the first plane, and of those behind it where they were joined."""
-        planes = self._planes  # before the other one: another thread may join them meanwhile
+        """Bytes that begin with the first plane: of this plane, or of all planes if joined."""
+        planes = self._planes  # read first: another thread may join the planes
         return planes[0] if self._joined is None else self._joined
 
     def joined(self) -> bytes:
-        """Return the bytes of all planes, one behind the other; the decoder's own are let go."""
+        """Return the bytes of all planes in order, and release the decoder's buffers."""
         planes, joined = self._planes, self._joined
         if joined is None:
             joined = self._joined = b"".join(planes)
@@ -39,16 +39,16 @@ class PlanesApart:
 
 
 class JoinedOnUse:
-    """An attribute for bytes that may be given as :class:`PlanesApart`; who reads it gets bytes.
+    """A descriptor for bytes that may be set as :class:`PlanesApart`; reading it gives bytes.
 
     Args:
-        slot: descriptor that keeps what is given.
+        slot: descriptor that stores the value.
     """
 
     def __init__(self, slot: Any) -> None:
         self._slot = slot
         self.held: Callable[[Any], Any] = slot.__get__
-        """Returns what was given."""
+        """Returns the stored value."""
 
     def __get__(self, owner: Any, kind: type | None = None) -> Any:
         if owner is None:

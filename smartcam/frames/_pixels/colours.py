@@ -119,13 +119,13 @@ def yuv_to_rgb(
 ) -> NDArray[Any]:
     """Return the colours, (H, W, 3); each U and V holds for all pixels that share it.
 
-    They are the nearest integers, or with OpenCV, which is faster, at most one level beside them.
+    The colours are exact to the nearest integer; with OpenCV, which is faster, to one level.
 
     Args:
         y: brightness, (H, W), unsigned.
         chroma: differences of blue and of red, U and V, (h, w) each, with the same or smaller
             numbers of rows and columns; or one array (h, w, 2) with both.
-        matrix: the matrix that defines Y, U and V.
+        matrix: definition of Y, U and V.
         depth: bits of a sample, 8 to 16, and of a colour.
     """
     if opencv() is not None:
@@ -143,7 +143,7 @@ def _by_tables(
     depth: int,
 ) -> NDArray[Any]:
     """Compute the colours of planes by NumPy."""
-    # bits above the depth have no meaning: a value beyond a table takes the table's last entry
+    # bits above the depth have no meaning: larger values use the table's last entry
     bright = tables["y"].take(y, mode="clip")
     shares = (
         tables["red of v"].take(v, mode="clip"),
@@ -172,7 +172,7 @@ class Colours(NamedTuple):
     Attributes:
         grey: function that computes the brightness; None if the samples have none.
         rgb: function that computes red, green and blue; None if the samples have none.
-        is_grey: True if the samples are the brightness themselves.
+        is_grey: True if the samples are brightness.
     """
 
     grey: _Conversion | None
@@ -197,7 +197,7 @@ def _without_alpha(samples: NDArray[Any]) -> NDArray[Any]:
 
 
 def _to_rgb(order: str, plainly: _Conversion) -> _Conversion:
-    """Return a function that computes colours of samples with an order of OpenCV's name."""
+    """Return a function that converts samples to colours by OpenCV's conversion ``order``."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
@@ -210,11 +210,11 @@ def _to_rgb(order: str, plainly: _Conversion) -> _Conversion:
 
 
 def _to_grey(order: str, plainly: _Conversion) -> _Conversion:
-    """Return a function that computes the brightness of samples with an order of OpenCV's name."""
+    """Return a function that converts samples to brightness by OpenCV's conversion ``order``."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
-        if cv2 is None or samples.dtype != np.uint8:  # OpenCV's result is off by up to two
+        if cv2 is None or samples.dtype != np.uint8:  # OpenCV's result may differ by two levels
             return _brightness(plainly(samples))
         made: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2GRAY"))
         return made

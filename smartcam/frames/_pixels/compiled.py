@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MIN_LIMITED_Y: Final = 16
-"""Least Y of limited range, black; OpenCV's own conversions raise any smaller Y to it."""
+"""Y of black in limited range; OpenCV's conversions raise a smaller Y to this value."""
 
 BAND_BYTES: Final = 1 << 17
 """Number of bytes of colours that are computed at a time, so that intermediate values stay in the
@@ -33,7 +33,7 @@ def opencv() -> Any:
 
 
 def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
-    """Look up each sample in a table of 256 values."""
+    """Return the table's value for each sample, from a table of 256 values."""
     cv2 = opencv()
     found: NDArray[Any]
     found = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
@@ -48,7 +48,7 @@ def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
         y: index of Y in a pair.
 
     Returns:
-        The colours; None if a Y is below that range, or OpenCV is not installed.
+        The colours; None if a Y is below limited range, or OpenCV is not installed.
     """
     cv2 = opencv()
     if cv2 is None or cv2.extractChannel(pairs, y).min() < MIN_LIMITED_Y:

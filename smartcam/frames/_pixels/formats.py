@@ -32,14 +32,13 @@ class PixelFormat:
     """The layout of a frame's pixels in its bytes.
 
     Attributes:
-        name: name in PFNC, such as ``Mono8``, or if it has none the usual one, such as ``NV12`` or
+        name: name in PFNC, such as ``Mono8``; without one, the usual name, such as ``NV12`` or
             ``MJPEG``.
-        fourcc: four letters of V4L2, as ``GREY``, or "" if V4L2 has none; without the blanks at its
-            end.
+        fourcc: four letters of V4L2, such as ``GREY``, without blanks at the end; "": not in V4L2.
         bits: number of bits of a pixel, unused ones included; 0 for a compressed format.
-        code: 32 bits of PFNC, as GigE Vision sends it; 0: PFNC has none.
+        code: PFNC's code of 32 bits, as in GigE Vision; 0: not in PFNC.
         depth: number of significant bits of a sample.
-        layout: layout of its bytes.
+        layout: layout of the bytes.
     """
 
     name: str
@@ -50,7 +49,7 @@ class PixelFormat:
     layout: PixelLayout = field(kw_only=True, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[Callable[[str], PixelFormat], tuple[str]]:
-        """Return the function that finds the format in another process, and its name."""
+        """Return a function and the name by which another process finds the format."""
         return find_format, (self.name,)
 
     @property
@@ -127,7 +126,7 @@ def _samples(
 
 
 def _packed(name: str, code: int, colours: str) -> PixelFormat:
-    """Return a format whose samples share bytes; the second byte of the code has its bits."""
+    """Return a format of packed samples; the second byte of the code has the bits per pixel."""
     packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
     depth = 10 if "10" in name else 12
     layout = SampleLayout(COLOURS[colours], 2, packing=packing)
@@ -141,7 +140,7 @@ def _pairs(name: str, fourcc: str, code: int, y: int, matrix: str) -> PixelForma
 def _planes(
     name: str, fourcc: str, across: int, down: int, matrix: str, depth: int = 8
 ) -> PixelFormat:
-    """Return a format of planes; U and V are interleaved if it is called NV."""
+    """Return a format of planes; U and V are interleaved if its name begins with NV."""
     layout = Planes(across, down, name.startswith("NV"), matrix, depth)
     bits = 8 * layout.size_of * (across * down + 2) // (across * down)
     return PixelFormat(name, fourcc, bits, 0, depth, layout=layout)
@@ -167,7 +166,7 @@ _BAYER: Final = {
 """V4L2's names of 8, 10, 12 and 16 bits, in the order of PFNC's codes."""
 
 _BAYER_CODES: Final = ((8, 0x01080008), (10, 0x0110000C), (12, 0x01100010), (16, 0x0110002E))
-"""Bits, and the code of the first of the four."""
+"""Bits per sample, and the code of the first of the four patterns."""
 
 _BAYER_PACKED: Final = (
     ("10Packed", {"GR": 0x010C0026, "RG": 0x010C0027, "GB": 0x010C0028, "BG": 0x010C0029}),
@@ -239,7 +238,7 @@ PIXEL_FORMATS: Final = (
     PixelFormat("JPEGXL", "", 0, 0, 16, layout=Compressed("Codecs.decode")),
     PixelFormat("H264", "H264", 0, layout=Compressed("Codecs.h264_decoder")),
 )
-"""All formats that are known.
+"""All known formats.
 
 Y, U and V have BT.601 and limited range, the default of V4L2, unless the name says ``full`` range,
 ``709`` (BT.709) or ``2020`` (BT.2020). Red, green and blue have the full range, unless the name
@@ -277,7 +276,7 @@ def find_format(name: str | int) -> PixelFormat:
     """Return a format by its name in PFNC or V4L2, or by its code in PFNC.
 
     Args:
-        name: name, in any case and with or without blanks at the end; or the 32 bits of PFNC.
+        name: name, in any case and with or without blanks at the end; or PFNC's code.
 
     Raises:
         FrameFormatError: there is no such format; the text lists the known ones.

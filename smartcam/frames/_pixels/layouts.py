@@ -1,4 +1,4 @@
-"""Make arrays of a frame's bytes: by samples, by planes, or through a codec."""
+"""Convert a frame's bytes to arrays: from samples, from planes, or through a codec."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RawPicture(NamedTuple):
 
     Attributes:
         format: name of the format, for errors.
-        data: bytes of the picture; for the brightness alone also :class:`PlanesApart`.
+        data: bytes of the picture; for brightness only, also :class:`PlanesApart`.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next.
@@ -40,7 +40,7 @@ class RawPicture(NamedTuple):
     stride: int
 
     def wrong(self, expected: str, got: str) -> FrameFormatError:
-        """Return the error for bytes that are no such picture."""
+        """Return the error for bytes that do not fit the format."""
         return FrameFormatError(
             f"{self.format} {self.width}x{self.height}: expected {expected}, got {got}"
         )
@@ -108,7 +108,7 @@ def _view(
 class SampleLayout(PixelLayout):
     """One or more samples per pixel, one pixel after the other.
 
-    A packed format with a stride of 0 has rows that follow each other within a byte.
+    In a packed format with a stride of 0, a row may begin within a byte.
 
     Attributes:
         colours: conversions of the samples.
@@ -162,13 +162,13 @@ class SampleLayout(PixelLayout):
         return unpacked
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
-        """Return the brightness: of colours Y of BT.601, of a Bayer pattern the demosaiced one."""
+        """Return the brightness: Y of BT.601 for colours, demosaiced for Bayer patterns."""
         if self.colours.grey is None:
             raise picture.wrong("a format with brightness", "distances")
         return self.colours.grey(self.array(picture))
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
-        """Return the colours; for a grey format the grey three times."""
+        """Return the colours; for a grey format, three equal channels."""
         if self.colours.rgb is None:
             raise picture.wrong("a format with colours", "distances")
         return self.colours.rgb(self.array(picture))
@@ -176,11 +176,11 @@ class SampleLayout(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class YuvPairs(PixelLayout):
-    """Two pixels in four bytes: each has its Y, both share U and V.
+    """Two pixels in four bytes with a Y each, and common U and V.
 
     Attributes:
         y: index of Y in a pixel's two bytes; the other is U or V.
-        matrix: name of their matrix in ``MATRICES``.
+        matrix: name of the matrix in ``MATRICES``.
     """
 
     y: int
@@ -229,14 +229,14 @@ class YuvPairs(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class Planes(PixelLayout):
-    """Y, then U and V for each pixel, two or four; all strides follow from that of Y.
+    """Planes of Y, U and V; up to four pixels share U and V; Y's stride gives all strides.
 
     Attributes:
         across: pixels along a row that share a U and a V.
         down: rows that share a U and a V.
-        woven: whether U and V alternate in one plane with the stride of Y; else each has its own
-            plane.
-        matrix: name of their matrix in ``MATRICES``.
+        woven: whether U and V alternate in one plane with the stride of Y; else they have separate
+            planes.
+        matrix: name of the matrix in ``MATRICES``.
         depth: bits of a sample; more than 8 take two bytes, the low one first.
     """
 
@@ -291,7 +291,7 @@ class Planes(PixelLayout):
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
-        if isinstance(picture.data, PlanesApart):  # a decoder's: it has all planes
+        if isinstance(picture.data, PlanesApart):  # a decoder's planes are complete
             picture = picture._replace(data=picture.data.first)
         else:
             self.check(picture)
@@ -320,7 +320,7 @@ class Compressed(PixelLayout):
 
     @property
     def grey_is_sent(self) -> bool:
-        """No."""
+        """Always False."""
         return False
 
     def least_stride(self, width: int) -> int:
@@ -336,11 +336,11 @@ class Compressed(PixelLayout):
         return _view(picture, "u1", (memoryview(picture.data).nbytes,), (1,))
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
-        """Raise."""
+        """Raise, since brightness needs a codec."""
         raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
-        """Raise."""
+        """Raise, since colours need a codec."""
         raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
 
 

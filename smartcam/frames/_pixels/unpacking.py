@@ -1,8 +1,8 @@
 """Unpack pixels of 10 and 12 bits that share bytes, into two bytes each.
 
 PFNC packs ``10p`` and ``12p`` as one stream of bits, the lowest first. GigE Vision's older
-``10Packed`` and ``12Packed`` put two pixels into three bytes: the high bits of each into the outer
-ones, the remaining bits of both into the middle one.
+``10Packed`` and ``12Packed`` put two pixels into three bytes: the high bits into the outer bytes,
+the low bits of both into the middle byte.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class PixelBits(NamedTuple):
-    """Some bits of a pixel: ``(byte >> right & mask) << left``."""
+    """Bits of a pixel in one byte: ``(byte >> right & mask) << left``."""
 
     byte: int
     right: int
@@ -25,7 +25,7 @@ class PixelBits(NamedTuple):
 
 
 class Packing(NamedTuple):
-    """The places of some pixels' bits in some bytes, a pattern that repeats.
+    """A repeating pattern of pixels' bits in bytes.
 
     Attributes:
         size: number of bytes of the pattern.

@@ -1,1 +1,1 @@
-"""Send and receive streams: the shared stream, bit rate control, RTP and RTSP."""
+"""Send and receive video streams: shared encoding, bit rate control, RTP and RTSP."""

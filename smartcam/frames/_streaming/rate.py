@@ -1,4 +1,4 @@
-"""Choose quality and rate of pictures for a bit rate or a latency; nothing is sent here."""
+"""Choose JPEG quality and frame rate for a wanted bit rate or latency."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from smartcam.exceptions import ConfigurationError
 logger: logging.Logger = logging.getLogger("smartcam.frames")
 
 CHANGE_AVERAGING_TIME: Final = 0.3
-"""Seconds over which the size of frames is averaged after a change of the scene."""
+"""Averaging time, seconds, of the frames' size after a change of the scene."""
 
 STEADY_AVERAGING_TIME: Final = 1.0
-"""Seconds over which the size of frames is averaged otherwise, since no two frames are alike."""
+"""Averaging time, seconds, of the frames' size in a steady scene."""
 
 COUNTED_SECONDS: Final = 2.0
-"""Seconds over which frames and bytes are counted."""
+"""Duration, seconds, over which frames and bytes are counted."""
 
 CHANGE_FACTOR: Final = 1.4
 """Factor by which a value must differ from its mean to count as a change."""
@@ -34,35 +34,35 @@ MIN_DEVIATION_SHARE: Final = 0.03
 """Share of a value below which a deviation is not corrected."""
 
 BUSY_SHARE: Final = 0.7
-"""If frames are on the way for more than this part of the time, the link limits the frame rate."""
+"""Share of the time with frames on the way, above which the link limits the frame rate."""
 
 SLOW_SOURCE_FACTOR: Final = 1.15
-"""If the pause between two frames is longer by this factor, the source limits the frame rate."""
+"""Factor by which pauses between frames are longer if the source limits the frame rate."""
 
 FREE_SHARE: Final = 0.5
-"""If frames are on the way for less than this part of the time, fewer frames do not arrive
-sooner."""
+"""Share of the time with frames on the way, below which a lower frame rate does not reduce
+latency."""
 
 LOGGED_CHANGE_FACTOR: Final = 1.25
 """Factor by which the frame rate must change before it is logged again."""
 
-STEEP: Final = 0.7
-"""The size of a JPEG is about proportional to this power of its quantization steps; the rest is
-corrected afterwards."""
+SIZE_EXPONENT: Final = 0.7
+"""A JPEG's size is about proportional to this negative power of its quantization steps; feedback
+corrects the rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class RateStatistics:
-    """The quality and rates that a rate control has set, and the reason.
+    """Quality and rates of a rate control, with the reason.
 
     Attributes:
         quality: JPEG quality for the next frames.
         fps: largest frame rate, frames per second.
         why: reason for these values: "bit rate", "latency" or "the best quality"; "" before the
-            first frame. "at the lowest quality" follows if the frame rate is lowered, too, and "no
-            frame may be smaller, nor fewer" if that is not enough.
-        bitrate: recent bits per second.
-        latency: recent seconds from a frame's capture to its arrival.
+            first frame. "at the lowest quality" is appended if the frame rate is lowered, too, and
+            "no frame may be smaller, nor fewer" if all limits are reached.
+        bitrate: recent bit rate, bits per second.
+        latency: recent time from capture to arrival, seconds.
     """
 
     quality: int
@@ -89,7 +89,7 @@ class _Mean:
 
 
 class _Flow:
-    """The number of recent frames and bytes, and the seconds that they took."""
+    """Number of recent frames and bytes, and their duration in seconds."""
 
     def __init__(self) -> None:
         self.frames = self.bytes = self.seconds = 0.0
@@ -102,7 +102,7 @@ class _Flow:
 
 
 class RateControl:
-    """Keeps a bit rate or a latency, first by the quality of JPEGs, then by the frame rate.
+    """Keep a bit rate or a latency, first by the quality of JPEGs, then by the frame rate.
 
     ::
 
@@ -110,9 +110,9 @@ class RateControl:
         ...  # send a frame of control.quality, control.rest seconds after the last one at least
         control.sent(size, went, took)
 
-    It lowers the quality as far as allowed, and only then the frame rate; upwards the frame rate is
-    raised first. It follows a drop within a second, and rises by at most 30 % per second, so that
-    it does not oscillate. If both a bit rate and a latency are given, the stricter one counts.
+    The control lowers the quality to its limit, and only then the frame rate; it raises the frame
+    rate first. It follows a drop within a second, and rises by at most 30 % per second to avoid
+    oscillation. Of a bit rate and a latency, the stricter one is kept.
 
     Args:
         bitrate: bits per second on average.
@@ -139,10 +139,10 @@ class RateControl:
         self._why: str = ""
         self._told_fps = self._fps
         self._went: float | None = None
-        # frame rate of the source, frames per second, as far as it is known; 0: unknown
+        # frame rate of the source, frames per second; 0: unknown
         self._comes = 0.0
         self._flow = _Flow()
-        self._weight = _Mean()  # number of bytes that a frame would have with steps of 1
+        self._weight = _Mean()  # size of a frame with quantization steps of 1, bytes
         self._way = _Mean()  # seconds per byte on the way
         self._age, self._took = _Mean(), _Mean()
 
@@ -153,16 +153,16 @@ class RateControl:
 
     @property
     def fps(self) -> float:
-        """Frames a second at most."""
+        """Largest frame rate, frames per second."""
         return self._fps
 
     @property
     def rest(self) -> float:
-        """Least seconds from one frame to the next."""
+        """Least time between two frames, seconds."""
         return 1 / self._fps
 
     def statistics(self) -> RateStatistics:
-        """Return the quality and rate that the control has set, and the reason."""
+        """Return the current quality and rates, with the reason."""
         flow = self._flow
         return RateStatistics(
             self.quality,
@@ -180,9 +180,9 @@ class RateControl:
         Args:
             size: bytes of the frame.
             went: time at which the frame was sent, in seconds of any clock.
-            took: seconds until the frame arrived.
-            age: seconds from the frame's capture until it was sent.
-            quality: quality of the frame; None: the present one.
+            took: time until the frame arrived, seconds.
+            age: time from the frame's capture until it was sent, seconds.
+            quality: quality of the frame; None: the current quality.
         """
         size, took = max(1, size), max(1e-6, took)
         if self._went is None or went <= self._went:
@@ -193,16 +193,16 @@ class RateControl:
             self._learn(took / seconds)
         self._went = went
         had = self.quality if quality is None else quality
-        # a frame that was long on its way has already counted for all that time
+        # a frame that is long on its way is counted only once
         of_late = max(seconds, took)
-        self._weight.add(size * _steps(had) ** STEEP, of_late)
+        self._weight.add(size * _steps(had) ** SIZE_EXPONENT, of_late)
         self._way.add(took / size, of_late)
         self._age.add(age, of_late)
         self._took.add(took, of_late)
         self._follow(seconds)
 
     def _learn(self, busy: float) -> None:
-        """Learn the frame rate of the source, if neither the link nor this control limits it."""
+        """Estimate the source's frame rate if neither the link nor this control limits it."""
         came = self._flow.frames / self._flow.seconds
         if busy < BUSY_SHARE and (
             self._fps >= self._rates[1] or came * SLOW_SOURCE_FACTOR < self._fps
@@ -210,7 +210,7 @@ class RateControl:
             self._comes = came
 
     def _follow(self, seconds: float) -> None:
-        """Move towards the wanted values: down at once, up slowly."""
+        """Move towards the target values: down at once, up slowly."""
         least, best = self._qualities
         wanted, wanted_fps, why = self._wanted()
         quality = min(best, max(least, _quality(self._weight.value / wanted)))
@@ -226,7 +226,7 @@ class RateControl:
             slowly = _quality(self._weight.value / (has * grows))
             self._quality = max(self._quality, min(quality, slowly))
         if why in {"bit rate", "latency"}:
-            if self._fps < self._rates[1]:  # while the frame rate is coming back
+            if self._fps < self._rates[1]:  # while the frame rate recovers
                 why = f"{why}, at the lowest quality"
             elif self._quality >= best:
                 why = "the best quality"
@@ -234,7 +234,7 @@ class RateControl:
         self._tell()
 
     def _wanted(self) -> tuple[float, float, str]:
-        """Return the bytes of a frame, frames per second, and why."""
+        """Return the target size of a frame, bytes, the frame rate, and the reason."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
         found: list[tuple[float, float, str]] = []
@@ -255,7 +255,7 @@ class RateControl:
         return size, min(most, fps), f"{name}, at the lowest quality"
 
     def _bytes(self, quality: float) -> float:
-        return self._weight.value / float(_steps(quality) ** STEEP)
+        return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
 
     def _tell(self) -> None:
         back = self._fps == self._rates[1] != self._told_fps
@@ -265,13 +265,13 @@ class RateControl:
 
 
 def _steps(quality: float) -> float:
-    """Return the coarseness of a JPEG's steps, 1 at quality 50 (as libjpeg defines it)."""
+    """Return the scale of a JPEG's quantization steps, 1 at quality 50 (libjpeg's definition)."""
     return 50 / quality if quality < 50 else max(0.02, (100 - quality) / 50)
 
 
 def _quality(weight: float) -> float:
-    """Return the quality whose steps, to the power ``STEEP``, are ``weight``."""
-    steps = float(max(1e-3, weight) ** (1 / STEEP))
+    """Return the quality whose steps, to the power ``SIZE_EXPONENT``, are ``weight``."""
+    steps = float(max(1e-3, weight) ** (1 / SIZE_EXPONENT))
     return 50 / steps if steps > 1 else 100 - 50 * steps
 
 
@@ -298,7 +298,7 @@ def _check(
 
 
 def _check_pair(value: tuple[float, float], name: str) -> None:
-    """Check that both are numbers; the caller checks their range."""
+    """Raise unless a value is a pair of numbers; the caller checks their range."""
     if not isinstance(value, tuple) or len(value) != 2:
         raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
     for one in value:

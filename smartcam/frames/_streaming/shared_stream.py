@@ -1,4 +1,4 @@
-"""One encoder for all who look at a source."""
+"""Encode a source once for all viewers."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LINGER: Final = 2.0
-"""Seconds that the source is read on without a viewer: a client that has asked for its parameters
-begins to play in that time."""
+"""Seconds for which a source is read without viewers: a client that got the description starts to
+play within this time."""
 
-KEY_PAUSE: Final = 1.0
-"""Seconds between two key frames that viewers ask for, however many they are."""
+KEY_FRAME_INTERVAL: Final = 1.0
+"""Least time between two requested key frames, seconds."""
 
 MAX_FAILURES: Final = 3
-"""Largest number of frames in a row that cannot be encoded before the stream ends."""
+"""Number of frames in a row that fail to encode, after which the stream ends."""
 
 
 class StreamViewer(Protocol):
-    """A viewer that is handed the encoded frames; neither call may wait or raise."""
+    """A viewer that receives encoded frames; its methods must not wait or raise."""
 
     def take(self, unit: Frame, key: bool) -> None:
-        """Take an encoded frame, which nobody else is held up for."""
+        """Receive an encoded frame, without blocking."""
         ...
 
     def ended(self, error: FrameSourceError) -> None:
-        """Hear that nothing more comes; it is no viewer any longer."""
+        """Receive the error that ended the stream; the viewer is then removed."""
         ...
 
 
 @dataclass(slots=True)
 class EncodedCounts:
-    """Counts of frames encoded, of key frames among them, and of frames that failed."""
+    """Counts of encoded frames, of key frames among them, and of failed frames."""
 
     encoded: int = 0
     keys: int = 0
@@ -52,14 +52,14 @@ class EncodedCounts:
 
 
 class SharedH264:
-    """Reads a source while there are viewers, and encodes once for all of them.
+    """Read a source while there are viewers, and encode it once for all.
 
-    Its newest frame is encoded when the one before it is; what comes meanwhile is skipped. A source
-    that ends takes its viewers along; with the next one it is tried again.
+    The newest frame is encoded after the one before; other frames are skipped. When the source
+    ends, its viewers are removed; the next viewer restarts the source.
 
     Args:
-        source: source that is open for as long as this object is used.
-        encoder: encoder that nobody else uses.
+        source: open source, which must stay open while this object is used.
+        encoder: encoder of this stream only.
     """
 
     def __init__(self, source: FrameSource, encoder: H264Encoder) -> None:
@@ -71,9 +71,9 @@ class SharedH264:
         self._task: asyncio.Task[FrameSourceError] | None = None
         self._ending: set[asyncio.Task[FrameSourceError]] = set()
         self._resting: asyncio.TimerHandle | None = None
-        self._key: Frame | None = None  # the last one since it began to read
+        self._key: Frame | None = None  # last key frame since reading began
         self._key_wanted = False
-        self._key_came = -KEY_PAUSE
+        self._key_came = -KEY_FRAME_INTERVAL
 
     @property
     def viewers(self) -> int:
@@ -81,40 +81,40 @@ class SharedH264:
         return len(self._viewers)
 
     def join(self, viewer: StreamViewer) -> None:
-        """Hand a viewer what is encoded from now on.
+        """Add a viewer, which receives all frames from now on.
 
-        A key frame comes soon, for the first viewer at once.
+        A key frame comes soon; for the first viewer at once.
         """
         if not self._viewers:
-            self._key_came = -KEY_PAUSE
+            self._key_came = -KEY_FRAME_INTERVAL
         self._viewers[viewer] = None
         self._key_wanted = True
-        self._go()
+        self._start()
 
     def leave(self, viewer: StreamViewer) -> None:
-        """Hand a viewer no more; one that was not there is ignored."""
+        """Remove a viewer; an unknown viewer is ignored."""
         self._viewers.pop(viewer, None)
-        self._rest_if_idle()
+        self._stop_if_idle()
 
     def key_frame(self) -> None:
-        """Ask for a key frame: within :data:`KEY_PAUSE`, and one for all who ask until then."""
+        """Request a key frame, at most one per :data:`KEY_FRAME_INTERVAL` for all viewers."""
         self._key_wanted = True
 
     async def first(self, timeout: float) -> Frame:
-        """Return a key frame of the stream that is encoded, or would be for a viewer.
+        """Return a key frame of the stream, which is started if needed.
 
         Raises:
-            FrameSourceError: the source gives no frame, or none in time.
+            FrameSourceError: the source ended, or no frame came in time.
 
         Cancellation: safe.
         """
         if self._task is not None and self._key is not None:
-            self._rest_if_idle()
+            self._stop_if_idle()
             return self._key
         asking: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
         self._asking.add(asking)
         self._key_wanted = True
-        self._go()
+        self._start()
         try:
             async with asyncio.timeout(timeout):
                 return await asking
@@ -124,38 +124,38 @@ class SharedH264:
             ) from None
         finally:
             self._asking.discard(asking)
-            self._rest_if_idle()
+            self._stop_if_idle()
 
     async def close(self) -> None:
-        """Read no longer; viewers are told nothing. Idempotent.
+        """Stop reading, without informing viewers. Idempotent.
 
-        Cancellation: takes effect when the task has ended, which waits for nothing.
+        Cancellation: takes effect after the task has ended, without delay.
         """
         self._viewers.clear()
         closed = FrameSourceError(f"{self.source.name}: its stream was closed")
-        self._rest()
+        self._stop_reading()
         self._answer(closed)
         while self._ending:
             await asyncio.wait(set(self._ending))
 
-    def _go(self) -> None:
+    def _start(self) -> None:
         if self._resting is not None:
             self._resting.cancel()
             self._resting = None
         if self._task is None:
             name = f"stream of {self.source.name}"
             self._task = asyncio.get_running_loop().create_task(self._run(), name=name)
-            self._task.add_done_callback(self._ran)
+            self._task.add_done_callback(self._ended)
 
-    def _rest_if_idle(self) -> None:
+    def _stop_if_idle(self) -> None:
         if self._viewers or self._asking or self._task is None:
             return
         if self._resting is not None:
             self._resting.cancel()
-        self._resting = asyncio.get_running_loop().call_later(LINGER, self._rest)
+        self._resting = asyncio.get_running_loop().call_later(LINGER, self._stop_reading)
 
-    def _rest(self) -> None:
-        """Stop reading; whoever comes now has it begin again."""
+    def _stop_reading(self) -> None:
+        """Stop reading; a new viewer restarts it."""
         task, self._task = self._task, None
         self._key = None
         if self._resting is not None:
@@ -166,8 +166,8 @@ class SharedH264:
             task.add_done_callback(self._ending.discard)
             task.cancel()
 
-    def _ran(self, task: asyncio.Task[FrameSourceError]) -> None:
-        """Tell everybody why it ended by itself; whoever comes then has it begin again."""
+    def _ended(self, task: asyncio.Task[FrameSourceError]) -> None:
+        """Report the error of the ended task to all viewers; a new viewer restarts it."""
         if task is not self._task:
             return
         name = self.source.name
@@ -175,17 +175,17 @@ class SharedH264:
         self._end(cancelled if task.cancelled() else task.result())
 
     async def _run(self) -> FrameSourceError:
-        """Encode until the source ends; return how."""
+        """Encode until the source ends; return its error."""
         name = self.source.name
         try:
             async with self.source.reader(timeout=None) as reader:
                 await self._encode(reader)
-            error = FrameSourceError(f"{name}: it has ended", source=name)
+            error = FrameSourceError(f"{name}: the source has ended", source=name)
         except FrameSourceError as exc:
             error = exc
         except SmartCamError as exc:  # source or codecs were closed
             error = FrameSourceError(f"{name}: {exc}", source=name)
-        except Exception as exc:  # noqa: BLE001 - viewers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - passed on to viewers
             _log.exception("%s: cannot be encoded", name)
             error = FrameSourceError(f"{name}: {exc!r}", source=name)
         return error
@@ -212,8 +212,8 @@ class SharedH264:
         failures = 0
         async for frame in reader:
             if not self._viewers and not self._asking:
-                continue  # it lingers
-            if self._key_wanted and now() - self._key_came >= KEY_PAUSE:
+                continue  # no viewers during the linger
+            if self._key_wanted and now() - self._key_came >= KEY_FRAME_INTERVAL:
                 self._encoder.begin_anew()
                 self._key_came = now()
             try:
@@ -236,5 +236,5 @@ class SharedH264:
         for viewer in list(self._viewers):
             if viewer in self._viewers:
                 viewer.take(unit, key)
-                await asyncio.sleep(0)  # many viewers do not hold up the loop
+                await asyncio.sleep(0)  # many viewers must not block the loop
         self.counts.encoded += 1

@@ -1,8 +1,8 @@
 """The structures and numbers of ``linux/videodev2.h``.
 
-A structure is a :class:`struct.Struct` in the machine's own layout; ``0P`` pads to what a pointer
-is aligned to, as the unions of the header are. An ioctl's number has its structure's size in it, so
-a kernel with another layout refuses it and misreads nothing.
+A structure is a :class:`struct.Struct` in the machine's own layout; ``0P`` pads to the alignment of
+a pointer, like the header's unions. An ioctl's number contains its structure's size, so a kernel
+with another layout refuses the call.
 
 Source: linux/videodev2.h, asm-generic/ioctl.h.
 """
@@ -120,7 +120,7 @@ class Capability(NamedTuple):
 
 
 class BufferLayout(NamedTuple):
-    """``struct v4l2_format`` of one plane, as far as it is of interest."""
+    """The used fields of ``struct v4l2_format`` of one plane."""
 
     width: int
     height: int
@@ -136,21 +136,21 @@ class BufferLayout(NamedTuple):
 
 
 PRIVATE_MAGIC: Final = 0xFEEDCAFE
-"""V4L2_PIX_FMT_PRIV_MAGIC: the fields after ``private`` mean something."""
+"""V4L2_PIX_FMT_PRIV_MAGIC: the fields after ``private`` are valid."""
 
 COLORSPACE_JPEG: Final = 7
 
 MATRIX_OF_COLORSPACE: Final = {2: "240M", 3: "709", 10: "2020", 12: "709"}
-"""``V4L2_MAP_YCBCR_ENC_DEFAULT``: of SMPTE 240M, Rec. 709, BT.2020, DCI-P3; else BT.601's."""
+"""``V4L2_MAP_YCBCR_ENC_DEFAULT``: SMPTE 240M, Rec. 709, BT.2020, DCI-P3; otherwise BT.601."""
 
 MATRIX_OF_ENCODING: Final = {
     1: "601", 2: "709", 3: "601", 4: "709", 5: "601", 6: "2020",
     7: "2020 of constant luminance", 8: "240M",
 }  # fmt: skip
-"""``enum v4l2_ycbcr_encoding``; 0 is what the color space has by default."""
+"""``enum v4l2_ycbcr_encoding``; 0 is the color space's default."""
 
 FULL_RANGE, LIMITED_RANGE = 1, 2
-"""``enum v4l2_quantization``; 0 is full for red, green and blue, and for JPEG's color space."""
+"""``enum v4l2_quantization``; 0 means full range for RGB and for JPEG's color space."""
 
 
 FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
@@ -158,7 +158,7 @@ FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
 
 
 def new_buffer(index: int) -> bytearray:
-    """Return the argument that asks for a buffer, or for any."""
+    """Return the argument of ioctls about a buffer."""
     argument = bytearray(_BUFFER.size)
     _BUFFER.pack_into(argument, 0, index, CAPTURE, 0, 0, 0, 0, 0, 0, MEMORY_MMAP, 0, 0)
     return argument
@@ -171,12 +171,12 @@ def offset_and_length(argument: bytearray) -> tuple[int, int]:
 
 
 def text(raw: bytes) -> str:
-    """Return a text of the kernel's; it ends at the first zero."""
+    """Return a text from the kernel up to its first zero."""
     return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
 def fourcc(name: str) -> int:
-    """Return four characters as V4L2 counts them; fewer are filled with spaces."""
+    """Return the fourcc number of up to four characters, which are padded with spaces."""
     return int.from_bytes(name.ljust(4).encode("latin-1"), "little")
 
 

@@ -1,4 +1,4 @@
-"""Buffers that a driver writes pictures into: asked for, mapped, queued, and given back."""
+"""Request, map, queue and release the buffers into which a driver writes pictures."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
     from smartcam.frames._v4l2.device import CaptureDevice
 
-LEAST: Final = 2
-"""Buffers: one that is written while another one is read."""
+MIN_BUFFERS: Final = 2
+"""Least number of buffers: one is written while another is read."""
 
 
 _unpack: Final = abi.FULL_BUFFER.unpack_from
 
 
-class Full(NamedTuple):
+class FilledBuffer(NamedTuple):
     """The contents of a filled buffer.
 
     Attributes:
-        data: a copy, the only one that is made; of a buffer with an error it is empty.
-        used: bytes that the driver says it wrote.
+        data: copy of the bytes; empty for a buffer with an error.
+        used: number of bytes that the driver reports as written.
         flags: flags of V4L2.
         seconds: seconds of its time stamp.
         sequence: the driver's number of the frame.
@@ -39,11 +39,11 @@ class Full(NamedTuple):
 
 
 class Buffers:
-    """The buffers of a device, which streams from now on.
+    """The buffers of a streaming device; making them starts the stream.
 
     Args:
-        device: set to what it is to stream.
-        count: how many are asked for; the driver may give more or fewer.
+        device: device with its format set.
+        count: requested number of buffers; the driver may give more or fewer.
 
     Raises:
         FrameSourceError: the device is in use, or has no memory; nothing streams.
@@ -52,14 +52,14 @@ class Buffers:
     def __init__(self, device: CaptureDevice, count: int) -> None:
         self._device = device
         self._pages: list[mmap.mmap] = []
-        self._argument = abi.new_buffer(0)  # of one call after the other
+        self._argument = abi.new_buffer(0)  # reused by all calls
         try:
             given = device.ask(
                 abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, tried="asking for buffers"
             )[0]
-            if given < LEAST:
+            if given < MIN_BUFFERS:
                 raise FrameSourceError(
-                    f"{device.path}: expected {LEAST} buffers or more, got {given}",
+                    f"{device.path}: expected {MIN_BUFFERS} buffers or more, got {given}",
                     source=device.path,
                 )
             for index in range(given):
@@ -72,11 +72,11 @@ class Buffers:
     def __len__(self) -> int:
         return len(self._pages)
 
-    def take(self) -> Full:
-        """Take the oldest picture that is there out of its buffer; the driver gets the buffer back.
+    def take(self) -> FilledBuffer:
+        """Return the oldest picture, and give its buffer back to the driver.
 
         Raises:
-            BlockingIOError: no picture is there.
+            BlockingIOError: there is no picture.
             OSError: the device is gone, or its driver gave up.
         """
         argument, number, ioctl = self._argument, self._device.number, system.ioctl
@@ -84,10 +84,10 @@ class Buffers:
         place, used, flags, seconds, microseconds, sequence = _unpack(argument)
         data = b"" if flags & abi.BUF_ERROR else self._pages[place][:used]
         ioctl(number, abi.QBUF, argument)
-        return Full(data, used, flags, seconds + microseconds / 1e6, sequence)
+        return FilledBuffer(data, used, flags, seconds + microseconds / 1e6, sequence)
 
     def release(self) -> None:
-        """Stop the stream and give the buffers back: others may use the device."""
+        """Stop the stream and release the buffers, so that other programs can use the device."""
         with suppress(FrameSourceError):  # the device may be gone
             self._device.ask(abi.STREAMOFF, abi.CAPTURE)
         while self._pages:

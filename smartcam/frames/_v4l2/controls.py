@@ -1,4 +1,4 @@
-"""Read and set a device's controls: exposure, gain, white balance and so on, with their ranges."""
+"""Read and set a device's controls, such as exposure and gain, with their ranges."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KINDS: Final = {
     abi.CTRL_BITMASK: "bitmask",
     abi.CTRL_INTEGER_MENU: "menu",
 }
-"""The supported types of controls; 64-bit numbers, texts and structures are not."""
+"""Supported types of controls; 64-bit numbers, texts and structures are not supported."""
 
 SWITCHES: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
 
@@ -42,7 +42,7 @@ class DeviceControl:
         least: smallest value.
         most: largest value.
         step: difference between two values.
-        default: value that the driver sets at first.
+        default: the driver's initial value.
         value: present value; None: the value cannot be read.
         menu: label of each value, for a menu.
         flags: flags of V4L2.
@@ -61,7 +61,7 @@ class DeviceControl:
 
     @property
     def range(self) -> str:
-        """Range of the control, in words."""
+        """Range of the control as a text."""
         if self.menu:
             return ", ".join(f"{value} ({label})" for value, label in self.menu.items())
         if self.kind == "button":
@@ -74,12 +74,12 @@ class DeviceControl:
         return f"{self.least} to {self.most}{step}"
 
     def __str__(self) -> str:
-        """Return the control as lists and error texts have it."""
+        """Return the control as a line of lists and error texts."""
         now = "" if self.value is None else f", now {self.value}"
         return f"{self.name}: {self.range}; default {self.default}{now}"
 
     def number_of(self, value: int | str) -> int | None:
-        """Return the number of a value; None if the device does not take such a value."""
+        """Return the number of a value; None if the device does not accept it."""
         found = self._read(value)
         if found is None or self.kind == "button":
             return found
@@ -93,20 +93,20 @@ class DeviceControl:
     def _read(self, value: int | str) -> int | None:
         if not isinstance(value, str):
             return int(value)
-        said = value.strip()
-        if self.kind == "boolean" and said.lower() in SWITCHES:
-            return SWITCHES[said.lower()]
+        text = value.strip()
+        if self.kind == "boolean" and text.lower() in SWITCHES:
+            return SWITCHES[text.lower()]
         for one, label in self.menu.items():
-            if simple(label) == simple(said) and not said.isdigit():
+            if simple(label) == simple(text) and not text.isdigit():
                 return one
         try:
-            return int(said, 0)
+            return int(text, 0)
         except ValueError:
             return None
 
 
 def simple(label: str) -> str:
-    """Return a label in lower case, with an underscore for all that is no letter or digit."""
+    """Return a label in lower case, with underscores for blanks and punctuation."""
     return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
 
 
@@ -119,11 +119,11 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
     """Set a control.
 
     Returns:
-        What the device has it set to.
+        The device's new value.
 
     Raises:
-        FrameFeatureError: there is no control of that name, it cannot be set, or takes no such
-            value; it lists what there is.
+        FrameFeatureError: there is no control of that name, it cannot be set, or does not accept
+            the value; the text lists the controls or the range.
     """
     answer = _described(device).get(simple(name))
     if answer is None:
@@ -146,17 +146,17 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
 
 
 def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
-    """Return the driver's descriptions by name; no value is read, which may take a camera long."""
+    """Return the driver's descriptions by name, without values, which may be slow to read."""
     found: dict[str, tuple[Any, ...]] = {}
     number = 0
     while True:
         try:
             answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
         except OSError as exc:
-            if exc.errno in (errno.EINVAL, errno.ENOTTY):  # that was the last one
+            if exc.errno in (errno.EINVAL, errno.ENOTTY):  # end of the list
                 return found
             raise failure(device.path, "listing its controls", exc) from exc
-        if answer[0] <= number:  # a driver that goes in circles
+        if answer[0] <= number:  # the driver repeats controls
             return found
         number = answer[0]
         if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:

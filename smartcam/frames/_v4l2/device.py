@@ -1,4 +1,4 @@
-"""A device that is open: what it is, what it can stream, and its refusals as errors of smartcam."""
+"""An open device: its identity, formats and settings, with the driver's errors as smartcam's."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fo
 """The supported formats of V4L2."""
 
 MAX_ANSWERS: Final = 512
-"""Largest number of answers to one enumeration; a driver that goes on is broken."""
+"""Largest number of entries of one enumeration; a driver with more is broken."""
 
-MAX_RATE_OFF: Final = 0.01
-"""Share by which a rate may differ from the wanted one: 29.97/s is 30/s to a camera."""
+MAX_RATE_DEVIATION: Final = 0.01
+"""Largest relative deviation from the requested rate: a camera may give 29.97/s for 30/s."""
 
 REASONS: Final = {
     errno.ENOENT: "there is no such device",
     errno.ENXIO: "there is no such device",
     errno.ENODEV: "it is gone: unplugged, or its driver was unloaded",
-    errno.EACCES: "not allowed; a member of its group, mostly 'video', may",
-    errno.EPERM: "not allowed; a member of its group, mostly 'video', may",
+    errno.EACCES: "access is denied: add the user to the device's group, mostly 'video'",
+    errno.EPERM: "access is denied: add the user to the device's group, mostly 'video'",
     errno.EBUSY: "it is in use by another program",
     errno.ENOTTY: "it is not a V4L2 device, or its driver cannot do that",
     errno.ENOSPC: "the bus has no room for so many pictures: take a smaller size or a lower rate",
@@ -45,7 +45,7 @@ REASONS: Final = {
 
 
 def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
-    """Return the error for a refusal of the system; its text lists the devices present."""
+    """Return the error for a failed system call; its text lists the existing devices."""
     number = error.errno or 0
     here = tuple(f"{one} ({name})" for one, name in system.nodes().items())
     reason = REASONS.get(number, os.strerror(number))
@@ -58,7 +58,7 @@ def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
 
 
 class WantedSetting(NamedTuple):
-    """The setting asked of a device; None leaves a value as it is."""
+    """The requested setting of a device; None leaves a value unchanged."""
 
     format: PixelFormat | None
     size: tuple[int, int] | None
@@ -70,8 +70,8 @@ class Setting(NamedTuple):
 
     Attributes:
         format: format of the pixels.
-        layout: how they lie in a buffer.
-        rate: frames per second; None: it does not say.
+        layout: layout of the pixels in a buffer.
+        rate: frames per second; None: unknown.
     """
 
     format: PixelFormat
@@ -80,7 +80,7 @@ class Setting(NamedTuple):
 
 
 class CaptureDevice:
-    """An open capture device. All of it may wait for the device, and none of it is asynchronous."""
+    """An open capture device. Its methods block while the device works."""
 
     def __init__(self, path: str, number: int) -> None:
         self.path = path
@@ -92,8 +92,7 @@ class CaptureDevice:
         """Open a device that captures pictures.
 
         Raises:
-            FrameSourceError: there is no such file, it is no device of
-                V4L2, or it may not be opened.
+            FrameSourceError: there is no such file, it is no V4L2 device, or access is denied.
         """
         try:
             number = system.open(path)
@@ -108,16 +107,16 @@ class CaptureDevice:
         return device
 
     def close(self) -> None:
-        """Give the device back."""
+        """Close the device."""
         system.close(self.number)
 
     @property
     def identity(self) -> tuple[str, str]:
-        """Name and place of the device; another one has another."""
+        """Name and bus address of the device, which identify it."""
         return abi.text(self.capability.card), abi.text(self.capability.bus_info)
 
     def ask(self, request: Ioctl, *fields: object, tried: str = "") -> tuple[Any, ...]:
-        """Return the driver's answer; fields that are not given are 0.
+        """Return the driver's answer; omitted fields are 0.
 
         Raises:
             FrameSourceError: the driver refuses.
@@ -131,13 +130,13 @@ class CaptureDevice:
         """Return the driver's answer, or raise its OSError."""
         layout = request.layout
         argument = bytearray(layout.size)
-        # the fields that are asked with stand in front, each of 32 bits
+        # the input fields come first, each of 32 bits
         struct.pack_into(f"{len(fields)}I", argument, 0, *fields)
         system.ioctl(self.number, request, argument)
         return layout.unpack(argument)
 
     def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
-        """Yield the entries that the driver enumerates; none where it has no enumeration."""
+        """Yield the entries of the driver's enumeration, if it has one."""
         for index in range(MAX_ANSWERS):
             try:
                 yield self.try_to(request, index, *fields)
@@ -146,14 +145,14 @@ class CaptureDevice:
                     return
                 raise failure(self.path, request.name, exc) from exc
 
-    # what it can
+    # capabilities
 
     def formats(self) -> list[int]:
-        """Return the fourcc of each format that it can stream."""
+        """Return the fourcc of each supported format."""
         return [answer[4] for answer in self.enumerate(abi.ENUM_FMT, abi.CAPTURE)]
 
     def sizes(self, code: int) -> list[tuple[int, int]]:
-        """Return the sizes of a format; of steps the smallest and the largest."""
+        """Return the sizes of a format; for a range, the smallest and the largest."""
         found: list[tuple[int, int]] = []
         for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
             if kind == abi.DISCRETE:
@@ -163,7 +162,7 @@ class CaptureDevice:
         return found
 
     def size_texts(self, code: int) -> list[str]:
-        """Return the sizes of a format in words."""
+        """Return the sizes of a format as texts."""
         for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
             if kind != abi.DISCRETE:
                 least, most = f"{numbers[0]}x{numbers[3]}", f"{numbers[1]}x{numbers[4]}"
@@ -172,7 +171,7 @@ class CaptureDevice:
         return [f"{width}x{height}" for width, height in self.sizes(code)]
 
     def rates(self, code: int, width: int, height: int) -> list[float]:
-        """Return the frames per second, fastest first; of steps the fastest and the slowest."""
+        """Return the frame rates, fastest first; for a range, the fastest and the slowest."""
         found: list[float] = []
         asked = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
         for _, _, _, _, kind, *numbers in asked:
@@ -186,13 +185,14 @@ class CaptureDevice:
                 break
         return sorted(found, reverse=True)
 
-    # what it is set to
+    # settings
 
     def set(self, wanted: WantedSetting) -> Setting:
-        """Set the device so, and see that it did it.
+        """Apply a setting, and check the result.
 
         Raises:
-            FrameFormatError: the device took another format, size or rate; it lists what there is.
+            FrameFormatError: the device chose another format, size or rate; the text lists the
+                supported ones.
             FrameSourceError: the device is in use.
         """
         current = self._layout(self.ask(abi.G_FMT, abi.CAPTURE, tried="reading its format"))
@@ -209,13 +209,13 @@ class CaptureDevice:
         return Setting(found, layout, self._rate(wanted.rate, layout))
 
     def _coloured(self, found: PixelFormat, layout: BufferLayout) -> PixelFormat:
-        """Return the format with the matrix and the range that the device tells.
+        """Return the format with the device's matrix and range.
 
         Raises:
-            FrameFormatError: the device has a matrix that is not known here.
+            FrameFormatError: the device's matrix is not supported.
         """
-        told = layout.private == abi.PRIVATE_MAGIC
-        encoding, quantization = (layout.ycbcr_enc, layout.quantization) if told else (0, 0)
+        is_extended = layout.private == abi.PRIVATE_MAGIC
+        encoding, quantization = (layout.ycbcr_enc, layout.quantization) if is_extended else (0, 0)
         if found.name in ("RGB8", "BGR8"):
             limited = quantization == abi.LIMITED_RANGE
             return find_format(f"{found.name}_limited") if limited else found
@@ -234,7 +234,7 @@ class CaptureDevice:
         return with_matrix(found, matrix + full)
 
     def _check(self) -> None:
-        """See that it captures pictures in a way that is known here."""
+        """Check that the device captures pictures in a supported way."""
         one = self.capability
         does = one.device_caps if one.capabilities & abi.CAP_DEVICE_CAPS else one.capabilities
         if does & abi.CAP_VIDEO_CAPTURE and does & abi.CAP_STREAMING:
@@ -260,13 +260,13 @@ class CaptureDevice:
         return abi.BufferLayout(*answer[1:12])
 
     def _code(self, wanted: PixelFormat | None, current: int) -> int:
-        """Return the fourcc that is to be streamed."""
+        """Return the fourcc to stream."""
         if wanted is None:
             known = [one for one in (current, *self.formats()) if one in FORMATS]
         else:
             known = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
         if not known:
-            raise self._no_format("a format that is known here" if wanted is None else wanted.name)
+            raise self._no_format("a supported format" if wanted is None else wanted.name)
         return known[0]
 
     def _no_format(self, expected: str) -> FrameFormatError:
@@ -278,14 +278,14 @@ class CaptureDevice:
         )
 
     def _compare(self, code: int, size: tuple[int, int] | None, got: BufferLayout) -> None:
-        """See that the device took what it was asked for."""
+        """Check that the device applied the setting."""
         if got.fourcc != code:
             raise self._no_format(_named(code))
         if size is not None and size != (got.width, got.height):
             there = tuple(self.size_texts(code))
             raise FrameFormatError(
                 f"{self.path}: expected {_named(code)} {size[0]}x{size[1]}, the device took "
-                f"{got.width}x{got.height}; it has {', '.join(there) or 'what it does not say'}",
+                f"{got.width}x{got.height}; it has {', '.join(there) or 'no list of sizes'}",
                 source=self.path,
                 available=there,
             )
@@ -297,7 +297,7 @@ class CaptureDevice:
             )
 
     def _rate(self, wanted: float | None, layout: BufferLayout) -> float | None:
-        """Set the rate, where one is wanted; return what it is."""
+        """Set the rate if one is wanted; return the device's rate."""
         try:
             _, can, _, over, under, *_ = self.try_to(abi.G_PARM, abi.CAPTURE)
             if wanted is not None and can & abi.CAP_TIMEPERFRAME:
@@ -310,15 +310,15 @@ class CaptureDevice:
                 raise failure(self.path, "setting its rate", exc) from exc
             can = over = under = 0
         got = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
-        if wanted is not None and (got is None or abs(got - wanted) > wanted * MAX_RATE_OFF):
+        if wanted is not None and (got is None or abs(got - wanted) > wanted * MAX_RATE_DEVIATION):
             there = tuple(
                 f"{one:g}/s" for one in self.rates(layout.fourcc, layout.width, layout.height)
             )
             raise FrameFormatError(
                 f"{self.path}: expected {wanted:g} frames/s of {_named(layout.fourcc)} "
                 f"{layout.width}x{layout.height}, the device took "
-                f"{'none that it tells' if got is None else f'{got:g}'}; it has "
-                f"{', '.join(there) or 'what it does not say'}",
+                f"{'an unknown rate' if got is None else f'{got:g}'}; it has "
+                f"{', '.join(there) or 'no list of rates'}",
                 source=self.path,
                 available=there,
             )

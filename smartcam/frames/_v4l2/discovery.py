@@ -1,4 +1,4 @@
-"""The cameras that are here."""
+"""Find the V4L2 cameras of this machine."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def find() -> list[FoundSource]:
-    """Return a source for each video device, with what keeps one from being opened.
+    """Return a source for each video device; a remark says why a device cannot be opened.
 
-    Metadata, codecs and the like are left out: their pictures are elsewhere, or there are none.
+    Devices of metadata or codecs are left out, since they capture no pictures.
     """
     found = [_look(path, name) for path, name in system.nodes().items()]
     return [one for one in found if one is not None]
@@ -29,7 +29,7 @@ def _look(path: str, name: str) -> FoundSource | None:
         device = CaptureDevice.open(path)
     except FrameSourceError as exc:
         cause = exc.__cause__
-        if cause is None:  # it opened, and is no camera
+        if cause is None:  # the device is no camera
             return None
         return FoundSource(url, name, remark=str(exc))
     with closing(device):
@@ -39,7 +39,7 @@ def _look(path: str, name: str) -> FoundSource | None:
         except FrameSourceError as exc:
             return FoundSource(url, name, remark=str(exc))
     others = [abi.fourcc_text(code) for code in formats if code not in FORMATS]
-    remark = f"also has {', '.join(others)}, not known here" if others else ""
+    remark = f"also has {', '.join(others)}, not supported" if others else ""
     return FoundSource(url, device.identity[0], known, remark)
 
 

@@ -1,4 +1,4 @@
-"""Cameras of Video4Linux."""
+"""Use cameras of Video4Linux as sources of frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 
 DEVICE_TIMEOUT: Final = 10.0
-"""Seconds for a device to be opened, set and started; the slowest cameras take one or two."""
+"""Seconds for opening, setting and starting a device; the slowest cameras take one or two."""
 
 CONTROL: Final = "control."
 """Prefix of the parameters that set a control."""
@@ -37,29 +37,26 @@ CONTROL: Final = "control."
 class V4L2Driver(FrameDriver):
     """A camera of the Linux kernel: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``.
 
-    What the URL does not say stays as the device has it. What it says and the device does not
-    take is a :exc:`~smartcam.FrameFormatError` that lists what it has.
+    Settings that are not in the URL keep the device's values. An unsupported setting raises a
+    :exc:`~smartcam.FrameFormatError` that lists the supported ones.
 
-    - the path: the device's; ``/dev/v4l/by-id/...`` is the same camera at any port.
+    - the path: path of the device; ``/dev/v4l/by-id/...`` finds the camera at any port.
     - ``format``: pixel format, by its name in PFNC or V4L2.
     - ``size``: ``WIDTHxHEIGHT``, pixels.
     - ``fps``: frames per second.
     - ``buffers``: number of buffers that the driver writes into, 2 to 32; default 4.
-    - ``control.NAME``: sets a control, in the order of the URL, as often as the device is started:
-      ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
-      lower case letters with underscores, the value a number, a menu's label, or ``on`` and
-      ``off``.
+    - ``control.NAME``: sets a control at each start of the device, in the URL's order:
+      ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is the control's
+      label in lower case with underscores, the value a number, a menu's label, ``on`` or ``off``.
 
-    ``source.features`` has the controls for the time in between; such a setting
-    lasts until those of the URL are set again.
+    ``source.features`` sets controls at other times; such a setting lasts until the URL's controls
+    are set again.
 
-    While nothing is read from it, the device is closed: another program can use it. Each frame's
-    bytes are copied out of the driver's buffer once. One that is replaced before a reader took it
-    has been copied, too: to know that before, buffers would have to be kept from the driver, which
-    then had fewer to write into.
+    Without readers the device is closed, so that other programs can use it. Each frame's bytes are
+    copied from the driver's buffer once, even if the frame is replaced before a reader gets it:
+    keeping the buffer would leave the driver fewer buffers.
 
-    All that may wait for the device runs in a thread of its own; the event loop only takes full
-    buffers out.
+    Blocking calls run in a thread; the event loop only reads filled buffers.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -70,30 +67,30 @@ class V4L2Driver(FrameDriver):
             if name.startswith(CONTROL) and name != CONTROL
         ]
         known = ["format", "size", "fps", "buffers"]
-        said = address.parameters([*known, *(controls or [f"{CONTROL}NAME"])])
+        given = address.parameters([*known, *(controls or [f"{CONTROL}NAME"])])
         self._path = address.path
         if address.host or self._path in ("", "/"):
             raise address.wrong("path", "a device, as in v4l2:///dev/video0", address.shown)
         self._wanted = WantedSetting(
-            find_format(said["format"]) if "format" in said else None,
-            address.size(said["size"]) if "size" in said else None,
-            address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
+            find_format(given["format"]) if "format" in given else None,
+            address.size(given["size"]) if "size" in given else None,
+            address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
         )
-        buffers = address.number("buffers", said.get("buffers", "4"), 2, 32)
+        buffers = address.number("buffers", given.get("buffers", "4"), 2, 32)
         if buffers != int(buffers):
-            raise address.wrong("buffers", "a whole number", said["buffers"])
+            raise address.wrong("buffers", "a whole number", given["buffers"])
         self._buffers = int(buffers)
         self._controls = {
-            name.removeprefix(CONTROL): said[name] for name in controls if name in said
+            name.removeprefix(CONTROL): given[name] for name in controls if name in given
         }
         self._identity: tuple[str, str] | None = None
-        self._stream: CaptureStream | None = None  # the thread's, but for taking frames out
+        self._stream: CaptureStream | None = None  # used by the thread; the loop reads frames
         self._watched: int | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
-        """Return the cameras that are here, with their formats."""
+        """Return this machine's cameras with their formats."""
         thread = ThreadPoolExecutor(1, "v4l2")
         try:
             return await asyncio.get_running_loop().run_in_executor(thread, find)
@@ -101,18 +98,18 @@ class V4L2Driver(FrameDriver):
             thread.shutdown(wait=False)
 
     async def open(self) -> StreamFormat:
-        """See that the device is there and does what the URL says."""
+        """Open the device, check the URL's settings, and close it again."""
         self._thread = ThreadPoolExecutor(1, f"v4l2 {self._path}")
         return await self._do(self._try, "be opened")
 
     async def start(self, sink: FrameSink) -> None:
-        """Open the device and have it stream."""
+        """Open the device and start its stream."""
         stream = await self._do(self._begin, "start")
         self._watched = stream.device.number
         asyncio.get_running_loop().add_reader(self._watched, self._ready, stream, sink)
 
     async def stop(self) -> None:
-        """Stop the stream; the device is closed."""
+        """Stop the stream and close the device."""
         self._unwatch()
         if self._thread is not None:
             await self._do(self._end, "stop")
@@ -128,26 +125,26 @@ class V4L2Driver(FrameDriver):
 
     @property
     def features(self) -> V4L2Features:
-        """The controls, by SFNC's names where it has the same: ``ExposureTime``, ``Gain``."""
+        """The controls, by SFNC's names if it has them: ``ExposureTime``, ``Gain``."""
         return V4L2Features(self)
 
     async def controls(self) -> dict[str, DeviceControl]:
         """Return the device's controls by name.
 
         Raises:
-            FrameSourceError: the device is not there.
+            FrameSourceError: the device is missing.
         """
         return await self._do(lambda: self._with_device(list_controls), "list its controls")
 
     async def set_control(self, name: str, value: int | str) -> int:
-        """Set a control now; the URL's are set again when the device starts anew.
+        """Set a control now; the URL's controls are set again at the next start.
 
         Returns:
-            What the device has it set to.
+            The device's new value.
 
         Raises:
-            FrameSourceError: there is no control of that name, or it takes no such value; it lists
-                what there is, with the range.
+            FrameSourceError: there is no control of that name, or it does not accept the value; the
+                text lists the controls or the range.
         """
         return await self._do(
             lambda: self._with_device(lambda device: set_control(device, name, value)),
@@ -169,18 +166,18 @@ class V4L2Driver(FrameDriver):
             asyncio.get_running_loop().remove_reader(watched)
 
     async def _do(self, job: Callable[[], Value], what: str) -> Value:
-        """Have the thread do something, after all that it was given before.
+        """Run a job in the thread, in the order of the calls.
 
-        Cancellation: it is done nevertheless, and what it leaves the next :meth:`stop` ends.
+        Cancellation: the job runs nevertheless, and the next :meth:`stop` cleans up.
         """
         if self._thread is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`")
         done = asyncio.get_running_loop().run_in_executor(self._thread, job)
-        done.add_done_callback(_heard)
+        done.add_done_callback(_retrieve_error)
         finished, _ = await asyncio.wait([done], timeout=DEVICE_TIMEOUT)
         if not finished:
             raise FrameSourceError(
-                f"{self.name}: it was to {what}, and did not answer within {DEVICE_TIMEOUT:g} s",
+                f"{self.name}: the device did not {what} within {DEVICE_TIMEOUT:g} s",
                 source=self.name,
             )
         return done.result()
@@ -193,8 +190,8 @@ class V4L2Driver(FrameDriver):
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        asked = FORMATS[setting.layout.fourcc]  # as V4L2 calls it, whatever its colours mean
-        self._wanted = WantedSetting(asked, size, self._wanted.rate)  # so it stays
+        asked = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
+        self._wanted = WantedSetting(asked, size, self._wanted.rate)  # keep the device's choice
         return StreamFormat(setting.format, *size, rates)
 
     def _begin(self) -> CaptureStream:
@@ -231,13 +228,13 @@ class V4L2Driver(FrameDriver):
             for one in (self._identity, device.identity)
         )
         return FrameSourceError(
-            f"{self.name}: expected {expected}, which was there when it was opened, got {got}",
+            f"{self.name}: expected {expected}, as when it was opened, got {got}",
             source=self.name,
             available=(got,),
         )
 
 
-def _heard(done: asyncio.Future[Value]) -> None:
-    """Take the error of a job that nobody waits for any longer."""
+def _retrieve_error(done: asyncio.Future[Value]) -> None:
+    """Mark the error of an abandoned job as retrieved."""
     if not done.cancelled():
         done.exception()

@@ -1,7 +1,7 @@
-"""A V4L2 device's controls as features: by SFNC's names and units where it has the same thing.
+"""A V4L2 device's controls as features, by SFNC's names and units if it has them.
 
-A control that SFNC does not know keeps its own name, its label in lower case with underscores. Both
-names of a control are known.
+A control that SFNC lacks keeps its own name, its label in lower case with underscores. Both names
+of a control work.
 
 Source: V4L2 documentation, user, camera and image process control classes (numbers and units:
 ``V4L2_CID_EXPOSURE_ABSOLUTE`` counts 100 us); SFNC 2.7 (names; entries of ``...Auto``).
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 class SfncFeature(NamedTuple):
-    """The feature of SFNC that a control is.
+    """The feature of SFNC that corresponds to a control.
 
     Attributes:
         name: name of the feature.
         unit: unit of the feature.
-        factor: the control's number times this is the feature's value; 1: it stays a whole number.
-        entries: name in SFNC of each of the control's values; empty: they keep their own.
+        factor: the feature's value divided by the control's number; 1: the value is a whole number.
+        entries: SFNC's names of the control's values; empty: the control's own names.
     """
 
     name: str
@@ -53,10 +53,10 @@ SFNC: Final = {
     0x00980915: SfncFeature("ReverseY"),
     0x009F0903: SfncFeature("TestPattern"),
 }
-"""Features by the number of their control."""
+"""Features by the number of the control."""
 
 APERTURE_PRIORITY: Final = 3
-"""V4L2_EXPOSURE_APERTURE_PRIORITY: exposure time automatic, iris by hand, which most webcams have
+"""V4L2_EXPOSURE_APERTURE_PRIORITY: automatic exposure time with manual iris, which most webcams use
 in place of V4L2_EXPOSURE_AUTO."""
 
 _KINDS: Final[Mapping[str, FeatureKind]] = {
@@ -92,7 +92,7 @@ class ControlFeature:
 
     @property
     def spellings(self) -> set[str]:
-        """Spellings of all names of the feature."""
+        """Letters and digits of all names of the feature."""
         return {spelled(self.name), spelled(self.control.name)}
 
     def value(self, number: int | None) -> FeatureValue | None:
@@ -168,11 +168,11 @@ class V4L2Features(DeviceFeatures):
         return [one.name for one in await self._all()]
 
     async def describe_all(self) -> dict[str, Feature]:
-        """Return all features with their values and ranges as they are now."""
+        """Return all features with their current values and ranges."""
         return {one.name: one.described() for one in await self._all()}
 
     async def describe(self, name: str) -> Feature:
-        """Return a feature with its value and range as they are now."""
+        """Return a feature with its current value and range."""
         return (await self._found(name)).described()
 
     async def get(self, name: str) -> FeatureValue:
@@ -184,7 +184,7 @@ class V4L2Features(DeviceFeatures):
         return value
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the device has then."""
+        """Set a feature; return the device's new value."""
         found = await self._found(name)
         if found.control.kind == "button":
             raise self._wrong(found, "it is a command: it is executed")

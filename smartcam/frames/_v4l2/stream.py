@@ -14,31 +14,30 @@ from smartcam.frames._v4l2.stamps import BufferStamps
 
 if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
-    from smartcam.frames._v4l2.buffers import Full
+    from smartcam.frames._v4l2.buffers import FilledBuffer
     from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
 MAX_BAD_IN_A_ROW: Final = 30
-"""The stream ends after this many buffers in a row without a picture."""
+"""Number of buffers in a row without a picture, after which the stream fails."""
 
 MAX_EMPTY_IN_A_ROW: Final = 1000
-"""The stream ends after the system has reported a full buffer this many times without giving
-one."""
+"""Number of times that the system may report a filled buffer without having one."""
 
 HALF_OF_NUMBERS: Final = 1 << 31
-"""Half of all frame numbers, which have 32 bits: a larger step forwards is one backwards."""
+"""Half of the range of 32-bit frame numbers: a larger step forwards is a step backwards."""
 
 
 class CaptureStream:
-    """The frames of a device that was set.
+    """The stream of a device with an applied setting.
 
     Args:
-        device: device with its setting made, which belongs to this stream from now on.
+        device: device with its setting applied, which then belongs to this stream.
         setting: setting of the device.
         buffers: number of buffers to ask for.
         name: name of the camera.
 
     Raises:
-        FrameSourceError: the device does not stream; it still belongs to the caller.
+        FrameSourceError: the device does not stream; the caller must close it.
     """
 
     def __init__(self, device: CaptureDevice, setting: Setting, buffers: int, name: str) -> None:
@@ -55,12 +54,12 @@ class CaptureStream:
         )
         self._stamps = BufferStamps(name, period, system.now())
         self._buffers = Buffers(device, buffers)
-        self._sequence: int | None = None  # the driver's number of the last frame
+        self._sequence: int | None = None  # driver's number of the last frame
         self._number = 0
         self._bad = self._empty = 0
 
     def close(self) -> None:
-        """Stop the stream, and give buffers and device back."""
+        """Stop the stream, release the buffers, and close the device."""
         self._buffers.release()
         self.device.close()
 
@@ -86,7 +85,7 @@ class CaptureStream:
                 if self._stamps.is_newest:
                     return
 
-    def _frame(self, full: Full, sink: FrameSink) -> Frame | None:
+    def _frame(self, full: FilledBuffer, sink: FrameSink) -> Frame | None:
         """Return the frame in a buffer; count a buffer without a whole picture as lost."""
         steps = self._steps(full.sequence)
         if len(full.data) < self._least:
@@ -118,12 +117,12 @@ class CaptureStream:
         self._empty += 1
         if self._empty > MAX_EMPTY_IN_A_ROW:
             raise FrameSourceError(
-                f"{self._name}: its driver says that a picture is there, and gives no picture",
+                f"{self._name}: the driver reports a picture, but has none",
                 source=self._name,
             )
 
     def _steps(self, sequence: int) -> int:
-        """Return the number of frames since the last one, 1 for a driver that does not count."""
+        """Return the step of the frame number; 1 for a driver that does not count."""
         last, self._sequence = self._sequence, sequence
         if last is None:
             self._number = sequence
@@ -133,7 +132,7 @@ class CaptureStream:
         self._number += steps
         return steps
 
-    def _no_pictures(self, full: Full) -> FrameFormatError:
+    def _no_pictures(self, full: FilledBuffer) -> FrameFormatError:
         came = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
         return FrameFormatError(
             f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "

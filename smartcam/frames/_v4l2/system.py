@@ -1,4 +1,4 @@
-"""Wrap all calls of the system in one place, which tests replace."""
+"""All system calls of this package, which tests replace."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SYSFS: Final = Path("/sys/class/video4linux")
 
 
 def open(path: str) -> int:
-    """Open a device; without blocking calls."""
+    """Open a device in non-blocking mode."""
     return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
@@ -37,7 +37,7 @@ def ioctl(device: int, request: Ioctl, argument: bytearray) -> None:
 
 
 def pages(device: int, length: int, offset: int) -> mmap.mmap:
-    """Map a buffer of the driver; a slice of it is a copy."""
+    """Map a buffer of the driver; slices of the map are copies."""
     return mmap.mmap(device, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
 
 

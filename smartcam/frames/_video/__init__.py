@@ -1,1 +1,1 @@
-"""Sources that FFmpeg reads: video files, web cameras and network streams."""
+"""Read video files, web cameras and network streams by FFmpeg."""

@@ -1,4 +1,4 @@
-"""Streams and files that FFmpeg reads, through PyAV."""
+"""Use streams and files that FFmpeg reads, through PyAV, as sources of frames."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._pixels.formats import PixelFormat
-    from smartcam.frames._video.files import Read
+    from smartcam.frames._video.files import ReadPicture
 
 
 T = TypeVar("T")
 
 _log = logging.getLogger("smartcam.frames")
 
-GRACE: Final = 1.0
-"""Seconds that a thread gets beyond its own limits before it is left to itself."""
+THREAD_GRACE: Final = 1.0
+"""Seconds to wait for a thread beyond its own limits before it is abandoned."""
 
 PICTURE_RATE: Final = 10.0
-"""Pictures a second that are read from a folder, unless the URL says otherwise."""
+"""Default number of pictures per second from a folder."""
 
 MAX_PLAYBACK_DELAY: Final = 0.5
-"""Seconds that a recording may be late before its clock is set anew."""
+"""Largest delay of a recording's playback, seconds, before its clock is reset."""
 
 LIVE_OPTIONS: Final = {"fpsprobesize": "0", "probesize": "32768", "analyzeduration": "500000"}
-"""FFmpeg's options for a live stream, which it otherwise studies for a second and gives late."""
+"""FFmpeg's options for a live stream, which it otherwise analyses and delays by a second."""
 
 _COMMON: Final = ("delay", "elsewhere", "format", "name", "timeout")
 _RECORDED: Final = ("fps", "pace")
@@ -63,54 +63,54 @@ _KNOWN: Final = {
 class VideoDriver(FrameDriver):
     """A camera or file that FFmpeg reads: ``http:``, ``https:``, a path, or ``rtsp:``.
 
-    Cameras by RTSP come here with encodings alone that our own receiver has not, and web cameras
-    with all but JPEGs in parts.
+    RTSP cameras are read by FFmpeg only with codecs that smartcam's own receiver lacks, web cameras
+    with everything except multipart JPEG.
 
-    A query belongs to the server, so our parameters stand behind ``#``, also behind a path:
+    A query belongs to the server, so smartcam's parameters follow ``#``, also after a path:
     ``rtsp://admin:PASSWORD@camera/stream?channel=1#transport=udp&timeout=3``,
     ``belt.mp4#pace=none``, ``shots/*.png#fps=5``.
 
     ================= =============================================================================
-    ``transport``     of RTSP: ``tcp`` (usual), where nothing is lost, or ``udp``, where what is
-                      lost may spoil pictures until the next key frame
-    ``timeout``       seconds for connecting, and without data before it counts as dead; usual 5
-    ``format``        pixels are converted to ``RGB8``, ``BGR8`` or ``Mono8``; ``MJPEG`` or ``H264``
-                      hands the bytes on that came, where it is that; usual: as the decoder has them
+    ``transport``     of RTSP: ``tcp`` (usual), without losses, or ``udp``, where a loss may spoil
+                      pictures until the next key frame
+    ``timeout``       seconds to connect, and without data until the source counts as dead; usual 5
+    ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
+                      passes such bytes on unchanged; usual: the decoder's format
     ``delay``         of a live stream: longest time from exposure to arrival, seconds; usual 1
     ``pace``          of a recording: ``real`` (usual) by its time stamps, or ``none``: each picture
-                      when the readers have taken the last one; none is skipped
+                      as soon as the readers have taken the last one, without skips
     ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
                       files in a folder
-    ``mixed``         of files: ``yes`` takes pictures of other sizes and formats than the first
-                      one's, too, and counts damaged ones as lost; usual ``no``
+    ``mixed``         of files: ``yes`` also accepts pictures with other sizes and formats than the
+                      first one's, and counts damaged ones as lost; usual ``no``
     ``verify``        of TLS: ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
-    ``elsewhere``     of a server: ``yes`` goes where it sends us, by a redirect to another host or
-                      port or by a playlist (HLS, DASH); usual ``no``
+    ``elsewhere``     of a server: ``yes`` follows a redirect to another host or port, and a
+                      playlist (HLS, DASH); usual ``no``
     ``name``          of the camera
     ================= =============================================================================
 
-    A live stream's frames are stamped with their arrival; those that waited while FFmpeg looked
-    what comes, with when it began to. Only RTSP has a clock, ``device_time``.
-    None has numbers, so ``sequence`` counts what came, and ``lost`` what was damaged. A damaged
-    picture is never given, nor one that rests on it as far as the decoder can tell.
+    A live stream's frames have the time of their arrival; frames that FFmpeg received during its
+    analysis have the time of the stream's begin. Only RTSP has a clock, ``device_time``. Frames
+    have no numbers, so ``sequence`` counts received pictures, and ``lost`` damaged ones. Damaged
+    pictures, and pictures that depend on them as far as the decoder reports it, are dropped.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         self._path, fragment = _split(address)
-        said = address.parameters(_KNOWN[address.scheme], fragment)
+        given = address.parameters(_KNOWN[address.scheme], fragment)
         number = address.number
-        self._name = said.get("name") or _name(address, self._path)
-        self._timeout = number("timeout", said.get("timeout", "5"), 0.1, 600)
-        self._delay = number("delay", said.get("delay", "1"), 0, 600)
-        self._fps = number("fps", said["fps"], 0.01, 10_000) if "fps" in said else None
-        self._paced = one_of(address, "pace", said, ("real", "none")) == "real"
-        self._format = wanted_format(address, said.get("format"))
-        self._options = _options(address, said)
-        self._mixed = one_of(address, "mixed", said, ("no", "yes")) == "yes"
-        self._elsewhere = one_of(address, "elsewhere", said, ("no", "yes")) == "yes"
-        self._tls = tls_of(address, said)
+        self._name = given.get("name") or _name(address, self._path)
+        self._timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
+        self._delay = number("delay", given.get("delay", "1"), 0, 600)
+        self._fps = number("fps", given["fps"], 0.01, 10_000) if "fps" in given else None
+        self._paced = one_of(address, "pace", given, ("real", "none")) == "real"
+        self._format = wanted_format(address, given.get("format"))
+        self._options = _options(address, given)
+        self._mixed = one_of(address, "mixed", given, ("no", "yes")) == "yes"
+        self._elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
+        self._tls = tls_of(address, given)
         self._thread: _ReadingThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
@@ -118,15 +118,15 @@ class VideoDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """The address without password, query and fragment, or as the URL says."""
+        """Address without password, query and fragment, or the name in the URL."""
         return self._name
 
     async def open(self) -> StreamFormat:
-        """Read a picture of it, and let it go again.
+        """Read one picture, and close the source again.
 
         Raises:
-            FrameFormatError: the source is no video, or has pixels that we have no name for.
-            FrameSourceError: the source is not there, refuses, or is silent.
+            FrameFormatError: the source is no video, or its pixel format is not supported.
+            FrameSourceError: the source is missing, refuses, or does not answer.
             MissingExtraError: the extra ``video`` is not installed.
         """
         try:
@@ -139,10 +139,10 @@ class VideoDriver(FrameDriver):
         return self._stream
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect anew and read; a recording begins at its beginning.
+        """Connect and read; a recording starts at its beginning.
 
         Raises:
-            FrameSourceError: the source is gone, or silent.
+            FrameSourceError: the source is gone, or does not answer.
         """
         try:
             reading, first = await self._begin()
@@ -153,7 +153,7 @@ class VideoDriver(FrameDriver):
         self._task = asyncio.create_task(pumping, name=f"frames of {self.name}")
 
     async def stop(self) -> None:
-        """Read no longer. What hangs in a read is waited for until its timeout, no longer."""
+        """Stop reading; wait for a hanging read at most until its timeout."""
         task, self._task = self._task, None
         thread, self._thread = self._thread, None
         if thread is not None:
@@ -161,21 +161,21 @@ class VideoDriver(FrameDriver):
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
-        if thread is not None and not await thread.ended(self._timeout + GRACE):
-            _log.warning("! %s: its thread hangs, and is left to end by itself", self.name)
+        if thread is not None and not await thread.ended(self._timeout + THREAD_GRACE):
+            _log.warning("! %s: the reading thread hangs, and is abandoned", self.name)
 
     async def close(self) -> None:
         """Release everything. Idempotent."""
         await self.stop()
 
-    async def _begin(self) -> tuple[PictureReading, Read]:
+    async def _begin(self) -> tuple[PictureReading, ReadPicture]:
         """Open the video and read the first picture."""
         await self.stop()
         thread = self._thread = _ReadingThread(self.name)
         reading = await thread.open(self._opened)
         first = await thread.do(reading.read)
         if first is None:
-            raise FrameFormatError(f"{self.name}: there is no picture in it", source=self.name)
+            raise FrameFormatError(f"{self.name}: expected a picture, got none", source=self.name)
         if self._fps and reading.live:
             raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
         return reading, first
@@ -198,10 +198,10 @@ class VideoDriver(FrameDriver):
         )
         return PictureFiles(plan) if pictures else VideoReading(plan)
 
-    async def _pump(self, sink: FrameSink, reading: PictureReading, first: Read) -> None:
+    async def _pump(self, sink: FrameSink, reading: PictureReading, first: ReadPicture) -> None:
         rate, live, thread = reading.rate, reading.live, self._thread
         clock = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
-        read: Read | None = first
+        read: ReadPicture | None = first
         try:
             while read is not None and thread is not None:
                 if self._paced and not live:
@@ -212,14 +212,14 @@ class VideoDriver(FrameDriver):
                 read = await thread.do(reading.read)
         except FrameSourceError as error:
             sink.ended(error)
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - passed on to readers
             failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
             failed.__cause__ = exc
             sink.ended(failed)
         else:
             sink.ended(None)
 
-    def _frame(self, read: Read, live: bool) -> Frame:
+    def _frame(self, read: ReadPicture, live: bool) -> Frame:
         pixels, now = read.pixels, time.monotonic()
         comes = (pixels.format, pixels.width, pixels.height)
         if self._stream is not None and comes != self._stream[:3] and not self._mixed:
@@ -249,7 +249,7 @@ class VideoDriver(FrameDriver):
 
 
 class _ReadingThread:
-    """One thread, and what is read in it: it opens that, reads, and gives it back."""
+    """A thread that opens, reads and closes a source."""
 
     def __init__(self, name: str) -> None:
         self._pool = ThreadPoolExecutor(1, f"frames of {name}")
@@ -265,41 +265,41 @@ class _ReadingThread:
         return await self.do(opened)
 
     async def do(self, work: Callable[[], T]) -> T:
-        """Have something done; what is cancelled is done all the same."""
+        """Run a function in the thread; cancelled calls run nevertheless."""
         doing = asyncio.get_running_loop().run_in_executor(self._pool, work)
-        doing.add_done_callback(_looked_at)
+        doing.add_done_callback(_retrieve_error)
         return await asyncio.shield(doing)
 
     def stop(self) -> None:
-        """Have a picture that is looked for given up."""
+        """Abort the search for the next picture."""
         if self._reading is not None:
             self._reading.stopped.set()
 
     async def ended(self, within: float) -> bool:
-        """Give everything back, and return whether the thread did so in time."""
-        last = asyncio.get_running_loop().run_in_executor(self._pool, self._give_back)
-        last.add_done_callback(_looked_at)
+        """Close the source in the thread; return whether it was closed in time."""
+        last = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reading)
+        last.add_done_callback(_retrieve_error)
         self._pool.shutdown(wait=False)
         _, late = await asyncio.wait([last], timeout=within)
         return not late
 
-    def _give_back(self) -> None:
+    def _close_reading(self) -> None:
         reading, self._reading = self._reading, None
         if reading is not None:
             reading.close()
 
 
-def _looked_at(done: asyncio.Future[Any]) -> None:
+def _retrieve_error(done: asyncio.Future[Any]) -> None:
     if not done.cancelled():
-        done.exception()  # nobody may be there for it any longer
+        done.exception()  # mark the error as retrieved
 
 
 class _Playback:
-    """The times at which a recording's pictures are due.
+    """The schedule of a recording's pictures.
 
     Args:
-        fps: pictures per second; None: by their time stamps.
-        rate: rate of frames without a stamp.
+        fps: pictures per second; None: by time stamps.
+        rate: rate of frames without time stamps.
     """
 
     def __init__(self, fps: float | None, rate: float | None) -> None:
@@ -323,7 +323,7 @@ class _Playback:
 
 
 def _split(address: FrameAddress) -> tuple[str, str]:
-    """Return the path and our parameters; a path's own # is one that no parameter follows."""
+    """Split a URL into path and parameters; a # without parameters belongs to the path."""
     if address.scheme != "file":
         return address.path, address.fragment
     if "://" in address.url:
@@ -340,57 +340,57 @@ def _name(address: FrameAddress, path: str) -> str:
     return address.shown.partition("#")[0].partition("?")[0]
 
 
-def wanted_format(address: FrameAddress, said: str | None) -> PixelFormat | None:
+def wanted_format(address: FrameAddress, given: str | None) -> PixelFormat | None:
     known = [*CONVERTIBLE, "MJPEG", "H264"]
-    if said is None:
+    if given is None:
         return None
     try:
-        found = find_format(said)
+        found = find_format(given)
     except FrameFormatError:
         found = None
     if found is None or found.name not in known:
-        raise address.wrong("format", f"one of {', '.join(known)}", said)
+        raise address.wrong("format", f"one of {', '.join(known)}", given)
     return found
 
 
-def one_of(address: FrameAddress, name: str, said: dict[str, str], known: tuple[str, ...]) -> str:
+def one_of(address: FrameAddress, name: str, given: dict[str, str], known: tuple[str, ...]) -> str:
     """Return a parameter's value, by default the first of the known values."""
-    value = said.get(name, known[0])
+    value = given.get(name, known[0])
     if value not in known:
         raise address.wrong(name, " or ".join(known), value)
     return value
 
 
-def _options(address: FrameAddress, said: dict[str, str]) -> dict[str, str]:
-    """Return FFmpeg's."""
+def _options(address: FrameAddress, given: dict[str, str]) -> dict[str, str]:
+    """Return FFmpeg's options."""
     options: dict[str, str] = {}
     if address.scheme.startswith("rtsp"):
         options |= LIVE_OPTIONS | {
-            "rtsp_transport": one_of(address, "transport", said, ("tcp", "udp"))
+            "rtsp_transport": one_of(address, "transport", given, ("tcp", "udp"))
         }
     if address.scheme in ("https", "rtsps"):
-        verified = one_of(address, "verify", said, ("yes", "no")) == "yes"
+        verified = one_of(address, "verify", given, ("yes", "no")) == "yes"
         options |= (
-            {"tls_verify": "1", "ca_file": _trusted(said)} if verified else {"tls_verify": "0"}
+            {"tls_verify": "1", "ca_file": _trusted(given)} if verified else {"tls_verify": "0"}
         )
     return options
 
 
-def _trusted(said: dict[str, str]) -> str:
-    """Return the file with the certificates that are trusted."""
+def _trusted(given: dict[str, str]) -> str:
+    """Return the file of trusted certificates."""
     paths = ssl.get_default_verify_paths()
-    return said.get("ca") or paths.cafile or paths.openssl_cafile
+    return given.get("ca") or paths.cafile or paths.openssl_cafile
 
 
-def tls_of(address: FrameAddress, said: dict[str, str]) -> ssl.SSLContext | None:
-    """Return a context that checks the certificate as the URL says; None without TLS."""
+def tls_of(address: FrameAddress, given: dict[str, str]) -> ssl.SSLContext | None:
+    """Return the TLS context of a URL's settings; None without TLS."""
     if address.scheme not in ("https", "rtsps"):
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    if one_of(address, "verify", said, ("yes", "no")) == "no":
+    if one_of(address, "verify", given, ("yes", "no")) == "no":
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
-    elif trusted := _trusted(said):
-        with contextlib.suppress(OSError, ssl.SSLError):  # the connection says what is wrong
+    elif trusted := _trusted(given):
+        with contextlib.suppress(OSError, ssl.SSLError):  # connecting reports the error
             context.load_verify_locations(trusted)
     return context

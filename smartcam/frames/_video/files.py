@@ -1,4 +1,4 @@
-"""Pictures out of FFmpeg, one after the other: what runs in a video source's thread."""
+"""Read pictures by FFmpeg in a video source's thread."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ _log: Final = logging.getLogger("smartcam.frames")
 PICTURES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".jxl", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 )
-"""Suffixes of the files in a folder that count as pictures."""
+"""Suffixes of picture files in a folder."""
 
-KNOWS_REDIRECTS: Final = (62, 0, 0)
-"""Version of libavformat from which on it can be told to follow no redirect."""
+MIN_REDIRECT_VERSION: Final = (62, 0, 0)
+"""First version of libavformat with an option against redirects."""
 
 UNBUFFERED_WAIT_TIME: Final = 0.01
-"""Seconds after which a packet that was waited for came just now, and not out of a buffer."""
+"""Least waiting time, seconds, for a packet that has just arrived and was not buffered."""
 
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
-"""Codecs whose bytes are a format of smartcam, and so can be passed on unchanged."""
+"""Codecs whose bytes can be passed on unchanged, with smartcam's formats."""
 
 _ONE_BY_ONE: Final = frozenset({"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"})
-"""Codecs in which a damaged picture spoils no other picture."""
+"""Codecs with independent pictures, so damage does not spread."""
 
 _EXPLODES_AT_TAGS: Final = frozenset({"tiff"})
-"""Codecs that take each tag they do not know for damage if asked to be strict; a picture that is
-cut off, or whose strips are, is an error to them all the same."""
+"""Codecs that treat unknown tags as damage in strict mode; without it, cut pictures are still
+errors."""
 
 FORMATS: Final = (
     "asf,avi,dv,flv,gif,h264,hevc,ivf,m4v,matroska,mjpeg,mov,mpeg,mpegts,mpegvideo,mpjpeg,mxf,nut,"
     "obu,ogg,rawvideo,vc1,wtv,yuv4mpegpipe,apng,webp,bmp_pipe,j2k_pipe,jpeg_pipe,jpegls_pipe,"
     "jpegxl_pipe,pam_pipe,pbm_pipe,pgm_pipe,png_pipe,ppm_pipe,tiff_pipe,webp_pipe"
 )
-"""Formats for which FFmpeg may take bytes, all with the pictures in them. Playlists and
-descriptions (HLS, DASH, SDP, concat and others) name other places, which would be read."""
+"""Formats that FFmpeg may read, which contain their pictures. Playlists and descriptions (HLS,
+DASH, SDP, concat and others) could name other files and hosts."""
 
 PROTOCOLS: Final = {
     "file": "file",
@@ -65,10 +65,10 @@ PROTOCOLS: Final = {
     "rtsp": "rtp,tcp,udp",
     "rtsps": "rtp,tcp,tls,udp",
 }
-"""By what FFmpeg may read, by the URL's scheme; a proxy is one that the environment names."""
+"""Protocols that FFmpeg may use, by the URL's scheme; a proxy is from the environment."""
 
-ELSEWHERE: Final = "crypto,data,http,https,httpproxy,rtp,tcp,tls,udp"
-"""By what it may read where it may follow a server to other places: never this machine's files."""
+REMOTE_PROTOCOLS: Final = "crypto,data,http,https,httpproxy,rtp,tcp,tls,udp"
+"""Protocols that FFmpeg may use with ``elsewhere``, which excludes this machine's files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,10 +80,9 @@ class VideoPlan:
         url: URL for FFmpeg.
         options: options for FFmpeg.
         timeout: seconds for connecting, and for every wait after that.
-        format: format that pixels are converted to, or bytes are handed on in; None: the decoder's
-            own.
-        network: True if the video comes from a server; without a length it is a live stream.
-        elsewhere: whether FFmpeg may go where the server sends it, by a redirect or a playlist.
+        format: format to convert pixels to, or of bytes passed on; None: the decoder's format.
+        network: True if the video comes from a server; without a known length it is a live stream.
+        elsewhere: whether FFmpeg may follow redirects and playlists to other hosts.
         tls: context that checks the server's certificate; None: the default check.
         skips_damaged: whether damaged files of a folder are left out and counted as lost.
     """
@@ -99,19 +98,19 @@ class VideoPlan:
     skips_damaged: bool = False
 
     def wrong(self, text: str) -> FrameFormatError:
-        """Return the error of bytes that are not as they should be."""
+        """Return an error of the video's content."""
         return FrameFormatError(f"{self.name}: {text}", source=self.name)
 
 
-class Read(NamedTuple):
-    """A picture.
+class ReadPicture(NamedTuple):
+    """A picture read from a source.
 
     Attributes:
         pixels: pixels of the picture.
-        time: seconds by the stream's own clock; None: it has none.
-        arrived: seconds of ``time.monotonic()``, before it was decoded, or earlier.
-        lost: damaged ones that came before it.
-        clock: ``time`` is the camera's, not one that was counted up here.
+        time: time stamp, seconds of the stream's clock; None: no time stamp.
+        arrived: time of arrival or earlier, seconds of ``time.monotonic()``.
+        lost: number of damaged pictures before.
+        clock: whether ``time`` is from the camera's clock.
     """
 
     pixels: Pixels
@@ -122,10 +121,10 @@ class Read(NamedTuple):
 
 
 class PictureReading(ABC):
-    """Something that pictures are read from; its methods block, and one thread calls them.
+    """A reader of pictures; its methods block, and one thread calls them.
 
     Attributes:
-        stopped: set by whoever wants no more; then a picture that is looked for is given up.
+        stopped: event that aborts the search for the next picture.
     """
 
     def __init__(self, plan: VideoPlan) -> None:
@@ -135,31 +134,31 @@ class PictureReading(ABC):
     @property
     @abstractmethod
     def live(self) -> bool:
-        """True if the pictures go on by themselves, so that none of them can wait."""
+        """True for a live stream, whose pictures cannot wait."""
 
     @property
     @abstractmethod
     def rate(self) -> float | None:
-        """Pictures a second; None: unknown."""
+        """Pictures per second; None: unknown."""
 
     @abstractmethod
-    def read(self) -> Read | None:
-        """Return the next picture; None at the end, or when it is stopped.
+    def read(self) -> ReadPicture | None:
+        """Return the next picture; None at the end, or when stopped.
 
         Raises:
-            FrameSourceError: the source is gone, silent, or something else than it was.
+            FrameSourceError: the source is gone, does not answer, or has changed.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Close what is read. Idempotent."""
+        """Close the source. Idempotent."""
 
 
 class VideoReading(PictureReading):
-    """A stream or file, opened.
+    """A reader of an open stream or file.
 
     Raises:
-        FrameFormatError: there is no video in it.
+        FrameFormatError: the source has no video.
         FrameSourceError: the source is not there, refuses, or is silent.
         MissingExtraError: the extra ``video`` is not installed.
     """
@@ -171,11 +170,11 @@ class VideoReading(PictureReading):
         self._began = time.monotonic()
         self._container = self._opened()
         self._open_from = time.monotonic()
-        self._behind = True  # what comes has waited while FFmpeg looked what it is
+        self._is_buffered = True  # whether packets have waited during FFmpeg's analysis
         try:
             self._stream = self._first_stream()
             self._packets = self._container.demux(self._stream)
-            rate = self._stream.average_rate  # nothing may be asked for once it is closed
+            rate = self._stream.average_rate  # not readable after closing
             self._rate = float(rate) if rate else None
             self._live = self.plan.network and self._container.duration is None
         except BaseException:
@@ -183,13 +182,13 @@ class VideoReading(PictureReading):
             raise
         self._pictures: deque[tuple[Any, float]] = deque()
         self._lost = 0
-        self._failed = ""  # why the last picture could not be decoded
+        self._failed = ""  # error of the last undecodable picture
 
     def _opened(self) -> Any:
-        """Return the container that FFmpeg opens, which reads nothing but what the URL names."""
+        """Return FFmpeg's container for the URL, without access to other places."""
         plan, scheme = self.plan, self.plan.url.partition(":")[0]
         if plan.elsewhere:
-            return self._open(plan.url, {"protocol_whitelist": ELSEWHERE})
+            return self._open(plan.url, {"protocol_whitelist": REMOTE_PROTOCOLS})
         formats = {"file": f"{FORMATS},image2", "rtsp": "rtsp", "rtsps": "rtsp"}
         bounds = {
             "protocol_whitelist": PROTOCOLS[scheme],
@@ -200,7 +199,7 @@ class VideoReading(PictureReading):
         if scheme == "file":
             return self._open(plan.url, bounds)
         bounds["max_redirects"] = "0"
-        if load("av").library_versions["libavformat"] < KNOWS_REDIRECTS:
+        if load("av").library_versions["libavformat"] < MIN_REDIRECT_VERSION:
             return self._open(self._followed(), bounds)
         try:
             return self._open(plan.url, bounds)
@@ -227,13 +226,13 @@ class VideoReading(PictureReading):
             if isinstance(cause, OSError) and cause.errno == errno.EINVAL:
                 cure = "; #elsewhere=yes follows a playlist" if self.plan.network else ""
                 raise self.plan.wrong(
-                    "expected a format with the pictures in it, got one that is not known here, or "
-                    f"a playlist or another list of places{cure}"
+                    "expected a format with the pictures in it, got one that is not supported, or "
+                    f"a playlist{cure}"
                 ) from cause
             raise
 
     def _tried(self, do: Callable[[], Any]) -> Any:
-        """Return the result of a call to FFmpeg, None at the end of the video."""
+        """Return the result of a call to FFmpeg; None at the end of the video."""
         begun = time.monotonic()
         try:
             return do()
@@ -243,7 +242,7 @@ class VideoReading(PictureReading):
             failure = exc
         if isinstance(failure, EOFError) and self._given_any:
             return None
-        # raised here and not above, for what failed has the URL in its text, and so the password
+        # raised outside of the handler, since FFmpeg's error text has the URL with the password
         raise self._error(failure, time.monotonic() - begun) from _plain(failure)
 
     def _first_stream(self) -> Any:
@@ -254,30 +253,30 @@ class VideoReading(PictureReading):
         if stream.codec_context is None:
             got = self._container.format.long_name
             raise self.plan.wrong(f"expected video that FFmpeg decodes here, got {got}")
-        stream.codec_context.thread_count = 1  # more of them hold frames back
+        stream.codec_context.thread_count = 1  # more threads delay frames
         if stream.codec_context.name not in _EXPLODES_AT_TAGS:
-            stream.codec_context.options = {"err_detect": "explode"}  # refuse half a picture
+            stream.codec_context.options = {"err_detect": "explode"}  # refuse incomplete pictures
         wanted = self.plan.format
         if wanted is not None and wanted.compressed:
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
             if comes != wanted.name:
                 raise self.plan.wrong(f"expected {wanted.name}, got {comes}")
-            if comes == "H264":  # files have lengths where V4L2, and our H264, has start codes
+            if comes == "H264":  # files have lengths in place of start codes
                 bitstream = load("av.bitstream").BitStreamFilterContext
                 self._start_codes = bitstream("h264_mp4toannexb", stream)
         return stream
 
     @property
     def live(self) -> bool:
-        """True if a server sends the pictures, and does not know how many there are."""
+        """True if a server sends pictures without a known end."""
         return self._live
 
     @property
     def rate(self) -> float | None:
-        """As the stream says."""
+        """Pictures per second of the stream; None: unknown."""
         return self._rate
 
-    def read(self) -> Read | None:
+    def read(self) -> ReadPicture | None:
         """Return the next picture."""
         begun = time.monotonic()
         while not self._pictures and not self.stopped.is_set():
@@ -300,14 +299,14 @@ class VideoReading(PictureReading):
         base = picture.time_base or self._stream.time_base
         at = None if picture.pts is None else float(picture.pts * base)
         clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
-        return Read(self._pixels(picture), at, arrived, lost, clock)
+        return ReadPicture(self._pixels(picture), at, arrived, lost, clock)
 
     def _arrival(self, asked: float, now: float) -> float:
-        """Return when a packet came; at the earliest, where it waited in FFmpeg since."""
-        if self._behind:
+        """Return a packet's arrival, or the earliest possible time if FFmpeg buffered it."""
+        if self._is_buffered:
             drained = now - self._open_from > self._open_from - self._began
-            self._behind = not drained and now - asked < UNBUFFERED_WAIT_TIME
-        return self._began if self._behind else now
+            self._is_buffered = not drained and now - asked < UNBUFFERED_WAIT_TIME
+        return self._began if self._is_buffered else now
 
     def _end(self) -> None:
         if self.live:
@@ -316,10 +315,10 @@ class VideoReading(PictureReading):
             )
         if not self._given_any:
             why = f": {self._failed}" if self._failed else ""
-            raise self.plan.wrong(f"expected pictures, it ended without one{why}")
+            raise self.plan.wrong(f"expected pictures, the video ended without one{why}")
 
     def _take(self, packet: Any, arrived: float) -> None:
-        """Decode what came, or hand it on."""
+        """Decode a packet, or pass it on."""
         if self.plan.format is not None and self.plan.format.compressed:
             if packet.is_corrupt:
                 self._lost += self._given_any
@@ -334,10 +333,10 @@ class VideoReading(PictureReading):
             damaged, pictures, self._failed = True, [], _reason(exc)
         whole = [picture for picture in pictures if not picture.is_corrupt]
         if damaged or len(whole) < len(pictures):
-            self._lost += self._given_any  # before the first one it may have come in midway
+            self._lost += self._given_any  # a stream may begin midway
             if self._stream.codec_context.name not in _ONE_BY_ONE:
                 whole = []
-                self._stream.codec_context.flush_buffers()  # what follows rests on what is damaged
+                self._stream.codec_context.flush_buffers()  # dependent pictures are dropped
         self._pictures.extend((picture, arrived) for picture in whole)
 
     def _pixels(self, picture: Any) -> Pixels:
@@ -357,10 +356,10 @@ class VideoReading(PictureReading):
         self._container.close()
 
     def _error(self, failure: Exception, took: float) -> FrameSourceError:
-        """Return the error of what FFmpeg could not do; its own text has the password in it."""
+        """Return the error for a failure of FFmpeg, without its text, which has the password."""
         name, limit = self.plan.name, self.plan.timeout
         late = self.plan.network and took >= limit and isinstance(failure, ValueError)
-        if late or isinstance(failure, load("av").ExitError):  # the first is RTSP's way to say it
+        if late or isinstance(failure, load("av").ExitError):  # RTSP's own timeout
             text = f"{name}: expected an answer, got none within {limit:g} s"
             return FrameSourceError(text, source=name)
         kind = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
@@ -372,30 +371,30 @@ def _reason(failure: Exception) -> str:
 
 
 def _plain(failure: Exception) -> OSError:
-    """Return an error's cause without the URL, in which a password may stand."""
+    """Return an error's cause without the URL, which may have a password."""
     return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
 
 
 class PictureFiles(PictureReading):
-    """Pictures in files, by their names' order, each as a source of one picture."""
+    """A reader of picture files in the order of their names."""
 
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
         self._files = deque(picture_files(plan.url))
         if not self._files:
-            raise FrameSourceError(f"{plan.name}: there is no picture", source=plan.name)
+            raise FrameSourceError(f"{plan.name}: there is no picture file", source=plan.name)
 
     @property
     def live(self) -> bool:
-        """No."""
+        """Always False."""
         return False
 
     @property
     def rate(self) -> float | None:
-        """None: files do not say."""
+        """Always None: files have no rate."""
         return None
 
-    def read(self) -> Read | None:
+    def read(self) -> ReadPicture | None:
         """Return the next picture."""
         lost = 0
         while self._files and not self.stopped.is_set():
@@ -411,9 +410,9 @@ class PictureFiles(PictureReading):
                 return None if read is None else read._replace(lost=lost)
         return None
 
-    def _read(self, path: str) -> Read | None:
+    def _read(self, path: str) -> ReadPicture | None:
         if is_jpegxl(path):
-            return Read(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
+            return ReadPicture(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
         one = VideoReading(plan)
         try:
@@ -428,7 +427,7 @@ class PictureFiles(PictureReading):
 
 
 def picture_files(path: str) -> list[str]:
-    """Return the pictures of a folder or a pattern, sorted; of a file itself."""
+    """Return the sorted picture files of a folder or a pattern; for a file the file."""
     if Path(path).is_file():
         return [path]
     if Path(path).is_dir():
@@ -438,7 +437,7 @@ def picture_files(path: str) -> list[str]:
 
 
 def is_pictures(path: str) -> bool:
-    """Return True if a path is a folder, a pattern or a picture that FFmpeg does not read."""
+    """Return True for a folder, a pattern, or a picture file that FFmpeg does not read."""
     if Path(path).exists():
         return Path(path).is_dir() or is_jpegxl(path)
     return glob.has_magic(path)

@@ -43,8 +43,7 @@ _SAMPLES: Final = {
     "bayer_grbg16le": "BayerGR16",
 }
 _SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
-"""Names of the sharing of U and V, in FFmpeg and here, by pixels along a row and rows that share
-them."""
+"""Names of chroma subsampling, by pixels along a row and rows with common U and V."""
 
 _YUV: Final = {
     f"{begin}{digits}p{end}": f"I{digits}{ours}"
@@ -55,13 +54,13 @@ _YUV: Final = {
         *(("yuv", f"{depth}le", f"_{depth}") for depth in (10, 12, 16)),
     )
 } | {"nv12": "NV12", "yuyv422": "YUV422_8", "uyvy422": "YUV422_8_UYVY"}
-"""FFmpeg's formats of Y, U and V whose bytes are those of one of smartcam's formats."""
+"""FFmpeg's formats of Y, U and V with the same bytes as a format of smartcam."""
 
 _TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p": "yuv444p"}
-"""FFmpeg's formats with a plane of alpha after Y, U and V, and the same formats without it."""
+"""FFmpeg's formats with alpha after Y, U and V, and the same formats without alpha."""
 
 CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
-"""Formats that FFmpeg converts to on request, and its names for them."""
+"""Formats of conversion on request, with FFmpeg's names."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 _RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
@@ -70,8 +69,8 @@ BT709, BT601, BT2020 = 1, 6, 9  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M, AVCOL_SP
 MATRIX_OF_SPACE: Final = {
     BT709: "709", 2: "601", 3: "601", 4: "601", 5: "601", BT601: "601", BT2020: "2020",
 }  # fmt: skip
-"""Matrix of an AVColorSpace. An unspecified space (2) is taken as BT.601, as in FFmpeg; that of the
-FCC (4) is BT.601 to a third of a grey level; 0 means that there is no Y."""
+"""Matrix of an AVColorSpace. An unspecified space (2) is read as BT.601, as in FFmpeg; the FCC's
+(4) equals BT.601 within a third of a grey level; 0 means RGB."""
 
 
 class Pixels(NamedTuple):
@@ -82,7 +81,7 @@ class Pixels(NamedTuple):
         width: pixels.
         height: pixels.
         stride: bytes from row to row.
-        data: the decoder's own bytes if their layout fits, else a copy.
+        data: the decoder's bytes if their layout fits, else a copy.
     """
 
     format: PixelFormat
@@ -98,7 +97,7 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
 
     Args:
         name: name such as ``yuv420p``.
-        colour_range: AVColorRange; 0, which is unknown, is the limited one.
+        colour_range: AVColorRange; 0 (unknown) is read as limited.
         space: AVColorSpace.
 
     Raises:
@@ -125,18 +124,17 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
 
 
 def from_video(video: Any, *, apart: bool = False) -> Pixels:
-    """Return a decoded frame's pixels, in their own format or in one that holds all of them.
+    """Return a decoded frame's pixels in their own format, or in one without loss.
 
-    A palette becomes its colours, planes of red, green and blue become samples, and U and V with an
-    unsupported sharing are repeated for each pixel.
+    A palette is converted to colours, planes of red, green and blue to samples, and unsupported
+    chroma subsampling is expanded.
 
     Args:
         video: frame of FFmpeg.
-        apart: whether planes may stay where the decoder left them, as :class:`PlanesApart`, which
-            a :class:`Frame` takes for its data.
+        apart: whether planes may stay in the decoder's buffers, as :class:`PlanesApart`.
 
     Raises:
-        FrameFormatError: no format holds all of it; the text names what would be lost.
+        FrameFormatError: no format holds the pixels without loss; the text names the loss.
     """
     name = video.format.name
     if name in _TRANSPARENT and not _opaque(video):
@@ -161,7 +159,7 @@ def from_video(video: Any, *, apart: bool = False) -> Pixels:
 
 
 def _repacked(video: Any) -> Any:
-    """Return the frame in a supported format that holds all of it, or unchanged."""
+    """Return the frame in a supported format without loss, or unchanged."""
     kind = video.format
     parts = kind.components
     deep = max(part.bits for part in parts)
@@ -200,11 +198,11 @@ def _with_known_sharing(video: Any, deep: int, *, alpha: bool) -> Any:
         for axis, times in enumerate((-(-size[1] // plane.height), -(-size[0] // plane.width))):
             rows = np.repeat(rows, times, axis=axis)
         _fill(to, rows[: size[1], : size[0]])
-    return _told(made, video, full=kind.name.startswith("yuvj"))
+    return _with_colour_properties(made, video, full=kind.name.startswith("yuvj"))
 
 
 def _chroma(video: Any) -> tuple[float, float]:
-    """Return the ratios of the size of U and V to that of Y, measured on a large picture."""
+    """Return the ratios of the sizes of U and V to Y, measured on a large picture."""
     kind, whole = video.format, 1 << 10
     return (
         video.width * kind.chroma_width(whole) / whole,
@@ -215,10 +213,10 @@ def _chroma(video: Any) -> tuple[float, float]:
 def _same_colours(video: Any, name: str) -> Any:
     """Return a frame with the same samples in another layout."""
     full = video.format.name.startswith("yuvj")
-    return _told(video.reformat(format=name), video, full=full)
+    return _with_colour_properties(video.reformat(format=name), video, full=full)
 
 
-def _told(made: Any, video: Any, *, full: bool) -> Any:
+def _with_colour_properties(made: Any, video: Any, *, full: bool) -> Any:
     made.color_range = FULL if full else video.color_range
     made.colorspace = video.colorspace
     return made
@@ -255,20 +253,20 @@ def _tight(plane: Any, found: PixelFormat) -> bytes:
 @lru_cache(maxsize=256)  # called for each frame
 def colour_properties(found: PixelFormat) -> tuple[int, int]:
     """Return AVColorRange and AVColorSpace of a format."""
-    matrix = getattr(found.layout, "matrix", "601 full")  # without one: grey, or red, green, blue
+    matrix = getattr(found.layout, "matrix", "601 full")  # without a matrix: grey or RGB
     space = next((one for one in (BT709, BT2020) if MATRIX_OF_SPACE[one] in matrix), BT601)
     return FULL if matrix.endswith("full") else LIMITED, space
 
 
 def to_video(frame: Frame, before: Any = None) -> Any:
-    """Return a frame for an encoder of 4:2:0: its Y as it is; U and V of more pixels averaged.
+    """Return a frame for an encoder of 4:2:0, with Y unchanged and U and V averaged.
 
-    Grey gets a U and a V without colour. RGB becomes BT.601 of limited range.
+    Grey gets neutral U and V. RGB is converted to BT.601 with limited range.
 
     Args:
         frame: frame to encode.
-        before: frame that was returned earlier, and which the encoder no longer needs; grey of the
-            same size is written into it.
+        before: earlier returned frame that the encoder no longer uses; it is reused for grey of the
+            same size.
 
     Raises:
         FrameFormatError: this format cannot be converted, or the size is odd.
@@ -305,8 +303,7 @@ def to_video(frame: Frame, before: Any = None) -> Any:
 def to_lossless_video(frame: Frame) -> Any:
     """Return a frame for the lossless encoder FFV1, with each value unchanged.
 
-    Samples that share bytes are unpacked, Y, U and V are separated, and red, green and blue change
-    places.
+    Packed samples are unpacked, Y, U and V are separated, and RGB is reordered.
 
     Raises:
         FrameFormatError: a video cannot express the format: a Bayer pattern, distances, or
@@ -355,7 +352,7 @@ def _lossless(found: PixelFormat) -> str | None:
 
 
 _DEPTHS: Final = {10: 10, 12: 12, 14: 16, 16: 16}
-"""Bits of FFV1's grey that hold a number of bits."""
+"""Bits of FFV1's grey format, by bits of a sample."""
 
 
 def _encodable(found: PixelFormat) -> str | None:
@@ -378,7 +375,7 @@ def _from_grey(frame: Frame, before: Any) -> Any:
         *(before.width, before.height),
         *(before.color_range, before.colorspace),
     ):
-        _fill(before.planes[0], frame.array())  # a new array has a page fault for every 4 kB
+        _fill(before.planes[0], frame.array())  # a new array would cost a page fault per 4 kB
         return before
     video = _new(frame.width, frame.height, "yuv420p")
     _fill(video.planes[0], frame.array())
@@ -410,7 +407,7 @@ def _filled(frame: Frame, name: str) -> Any:
 
 def _fill(plane: Any, rows: Any) -> None:
     if rows.flags.c_contiguous and rows.nbytes == plane.buffer_size:
-        plane.update(rows)  # one copy, where the code below makes one per row
+        plane.update(rows)  # a single copy
         return
     whole = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
     whole[: rows.shape[0], : rows.shape[1]] = rows

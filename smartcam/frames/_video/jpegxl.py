@@ -1,4 +1,4 @@
-"""A file of JPEG XL, which the libraries of FFmpeg that come with PyAV do not read."""
+"""Read files of JPEG XL, which PyAV's FFmpeg does not read."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 SUFFIX: Final = ".jxl"
 
 MAX_FILE_BYTES: Final = 1 << 30
-"""Bytes of a file that is read; a larger one is refused."""
+"""Largest size of a file, bytes; a larger file is refused."""
 
 MAX_PICTURE_PIXELS: Final = 1 << 28
-"""Pixels of a picture that is read; a larger one is refused before it takes memory."""
+"""Largest number of pixels of a picture; a larger one is refused before it takes memory."""
 
 
 def is_jpegxl(path: str) -> bool:
-    """Return True if a file's name says that it is a JPEG XL."""
+    """Return True if a file has the suffix of JPEG XL."""
     return Path(path).suffix.lower() == SUFFIX
 
 
 def read_jpegxl(path: str, wanted: PixelFormat | None) -> Pixels:
-    """Return the pixels of a file, as they are or converted.
+    """Return the pixels of a file, unchanged or converted.
 
     Raises:
         FrameFormatError: the file holds no whole JPEG XL, or too large a picture.

@@ -1,8 +1,8 @@
-"""JPEGs cut from the parts of a web camera's stream, each as soon as its last byte is there.
+"""Cut JPEGs from a web camera's multipart stream, each as soon as its last byte has come.
 
-A picture ends where its own markers say so. Boundaries and lengths are not relied on: cameras put
-boundaries before or behind a part, leave them out, or say one and write another. A length helps
-where a picture has no end of its own.
+A picture's own markers give its end. Boundaries and lengths are not reliable: cameras put
+boundaries before or after a part, omit them, or announce another one. A length is used if a picture
+has no end marker.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
 MAX_PICTURE_BYTES: Final = 32 << 20
 
 MAX_BETWEEN_BYTES: Final = 1 << 20
-"""Bytes in a row that belong to no picture, after which it is no stream of pictures."""
+"""Largest number of bytes in a row outside of pictures."""
 
 MAX_HEAD_BYTES: Final = 8 << 10
-"""Largest number of bytes before a picture in which its length is looked for."""
+"""Number of bytes before a picture that are searched for its length."""
 
 MAX_STRAY_BYTES: Final = 4 << 10
-"""Bytes between two segments of a picture's head that belong to neither."""
+"""Largest number of surplus bytes between two segments of a picture's header."""
 
 START, END = b"\xff\xd8", b"\xff\xd9"
-BEGINS: Final = START + b"\xff"
-"""Bytes that a picture begins with, and no segment but a thumbnail's has in it."""
+PICTURE_START: Final = START + b"\xff"
+"""First bytes of a picture, which otherwise occur only in thumbnails."""
 
 SCAN, MIN_SEGMENT = 0xDA, 0xC0
-"""Markers of a scan, and the first one that a segment can have."""
+"""Marker of a scan, and the first marker of a segment."""
 
 BOUNDARY_BEGINS: Final = (b"\r\n", b"--", b"\n-")
-"""Bytes that follow a picture in its part."""
+"""Possible bytes after a picture."""
 
-ALONE: Final = frozenset((0x01, *range(0xD0, 0xD8)))
+MARKERS_WITHOUT_SEGMENT: Final = frozenset((0x01, *range(0xD0, 0xD8)))
 """Markers without a segment."""
 
 _NEXT_MARKER: Final = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -44,25 +44,25 @@ _LENGTH: Final = re.compile(rb"(?i)content-length[ \t]*:[ \t]*([0-9]{1,9})[ \t\r
 
 
 class PictureCutter:
-    """Cuts pictures from bytes that come in any pieces.
+    """Cut pictures from a stream of bytes.
 
     Attributes:
-        damaged: pictures that began and are not whole, since the last whole one.
+        damaged: number of incomplete pictures since the last complete one.
     """
 
     def __init__(self) -> None:
         self.damaged = 0
         self._data = bytearray()
-        self._seen = 0  # bytes of what is no picture, or of a picture, that were looked at
+        self._seen = 0  # number of examined bytes
         self._between = 0
         self._begun = self._in_scan = self._over = False
-        self._length: int | None = None  # length of the current picture, by the head of its part
+        self._length: int | None = None  # length of the current picture from the header of its part
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Take bytes, and yield the pictures that are whole with them.
+        """Add bytes, and yield the pictures that they complete.
 
         Raises:
-            MessageError: a picture without an end, or too much between two.
+            MessageError: a picture has no end, or too many bytes lie between two.
         """
         self._data += data
         while self._begun or self._begins():
@@ -81,7 +81,7 @@ class PictureCutter:
             self._seen = 0
 
     def _begins(self) -> bool:
-        """Find the next picture; what is before it is thrown away."""
+        """Find the next picture; bytes before it are dropped."""
         place = self._data.find(START, self._seen)
         if place < 0:
             self._seen = max(0, len(self._data) - 1)
@@ -102,9 +102,9 @@ class PictureCutter:
             raise MessageError(f"{self._between} bytes came that belong to no picture")
 
     def _end(self) -> int | None:
-        """Return the end of the picture; None: that did not come yet.
+        """Return the end of the picture; None: the end has not come yet.
 
-        Below 0 it is not one, and the next one may begin at that place.
+        A negative number means that it is no picture, and that the next may begin at its magnitude.
         """
         while (after := self._segment()) is not None:
             if self._length is not None and abs(after) > self._length and self._ends_at_length():
@@ -119,14 +119,14 @@ class PictureCutter:
         return None
 
     def _ends_at_length(self) -> bool:
-        """Return True if a boundary follows where the picture ends by its length."""
+        """Return True if a boundary follows the picture's end by its length."""
         place = self._length or 0
         return place > len(START) and bytes(self._data[place : place + 2]) in BOUNDARY_BEGINS
 
     def _segment(self) -> int | None:
-        """Return the end of the next segment; None: that did not come yet; below 0: none is there.
+        """Return the end of the next segment; None: the end has not come yet; negative: no segment.
 
-        What is encoded behind the head of a scan is passed over.
+        Encoded data after the header of a scan are skipped.
         """
         data, at = self._data, self._seen
         if self._in_scan:
@@ -138,8 +138,8 @@ class PictureCutter:
         while data[at : at + 2] == b"\xff\xff":
             at += 1
         if len(data) > at + 1 and (data[at] != 0xFF or not data[at + 1]):  # as some webcams send
-            if data.find(BEGINS, len(START), at + len(BEGINS) - 1) >= 0:
-                return -at  # a segment that was cut short went on into another picture
+            if data.find(PICTURE_START, len(START), at + len(PICTURE_START) - 1) >= 0:
+                return -at  # a cut segment ran into another picture
             found = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
             if found is None:
                 return None if len(data) < at + MAX_STRAY_BYTES else -at
@@ -151,7 +151,7 @@ class PictureCutter:
         if len(data) < at + 4:
             return None
         kind = data[at + 1]
-        if kind in ALONE:
+        if kind in MARKERS_WITHOUT_SEGMENT:
             return at + 2
         end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if data[at] != 0xFF or kind < MIN_SEGMENT or kind == 0xD8 or end < at + 4:

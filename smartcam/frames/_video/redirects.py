@@ -1,7 +1,7 @@
 """Follow a server's redirects for a URL, on the server's own host and port only.
 
-FFmpeg goes wherever a server's redirect points, also to this machine's own ports. It is kept from
-that in HTTP; in RTSP it cannot be, so a server is asked before FFmpeg asks it.
+FFmpeg follows every redirect, even to this machine's own ports. In HTTP it has an option against
+this; in RTSP it has none, so smartcam sends the first requests itself.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 MAX_REDIRECTS: Final = 5
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Largest number of bytes of the head of an answer, or of a body that is skipped."""
+"""Largest size of an answer's header, or of a skipped body, bytes."""
 
 REDIRECTS: Final = range(300, 400)
-"""Statuses with which FFmpeg follows a ``Location``."""
+"""Statuses of redirects for FFmpeg."""
 
 _PORTS: Final = {"http": 80, "https": 443, "rtsp": 554, "rtsps": 322}
 
@@ -36,21 +36,22 @@ _PORTS: Final = {"http": 80, "https": 443, "rtsp": 554, "rtsps": 322}
 class _Answer(NamedTuple):
     status: int
     headers: Mapping[str, Sequence[str]]  # values by the headers' names in lower case
-    peer: str  # the address that it came from
+    peer: str  # address of the sender
 
 
 def follow_redirects(
     url: str, *, name: str, timeout: float, tls: ssl.SSLContext | None = None
 ) -> str:
-    """Return the URL that a server's redirects lead to; the same one where it sends none.
+    """Return the URL after a server's redirects.
 
-    It blocks. A server that does not answer is not opened: what it would tell FFmpeg is not known.
+    The call blocks. A server that does not answer is an error, since it could still redirect
+    FFmpeg.
 
     Args:
         url: ``http:``, ``https:``, ``rtsp:`` or ``rtsps:``; may have user and password.
         name: name of the source, for errors; without a password.
-        timeout: seconds for all of it.
-        tls: how the server shows who it is, where it is asked by TLS.
+        timeout: seconds for all requests.
+        tls: TLS context that checks the server's certificate.
 
     Raises:
         FrameSourceError: a redirect leads to another host or port, there are too many, or there is
@@ -64,7 +65,7 @@ def follow_redirects(
             text = f"{name}: expected an answer, got none within {timeout:g} s"
             raise FrameSourceError(text, source=name) from None
         except (OSError, ValueError) as exc:
-            # not with the error itself, whose text may have a URL with a password
+            # without the error as the cause, whose text may have a URL with a password
             raise FrameSourceError(f"{name}: cannot be read: {why(exc)}", source=name) from None
         location = next(iter(answer.headers.get("location", ())), "")
         if answer.status not in REDIRECTS or not location:
@@ -74,21 +75,21 @@ def follow_redirects(
 
 
 def why(failure: Exception) -> str:
-    """Return why there is no answer, in the system's words and without a URL."""
+    """Return the reason of a failure in the system's words, without a URL."""
     number = getattr(failure, "errno", None)
     if number is not None and number > 0:
         return os.strerror(number)
-    said = getattr(failure, "strerror", None)
-    return str(said or "it gives no answer that can be understood")
+    text = getattr(failure, "strerror", None)
+    return str(text or "the answer is not readable")
 
 
 def followed(url: str, location: str, peer: str, name: str) -> str:
-    """Return the URL that a redirect leads to, with the user of the URL that was asked.
+    """Return a redirect's URL, with the user of the requested URL.
 
     Args:
-        url: URL that was asked.
+        url: requested URL.
         location: header of the answer.
-        peer: address that the answer came from.
+        peer: address of the answer's sender.
         name: name of the source, for errors.
 
     Raises:
@@ -117,7 +118,7 @@ def _place(parts: SplitResult) -> tuple[str, str, int]:
 
 
 def _asked(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
-    """Return the answer to the requests that FFmpeg begins with: the first redirect, or the last.
+    """Send FFmpeg's first requests; return the first redirect, or the last answer.
 
     Raises:
         OSError, ValueError: there is no answer, or it cannot be read.
@@ -131,13 +132,14 @@ def _asked(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
         link: socket.socket | None = None
         for method in ("GET",) if web else ("OPTIONS", "DESCRIBE"):
             while True:
-                # a web server may end what it refused; an RTSP server's challenge is for this one
+                # a web server may close after a refusal; an RTSP server's challenge is for this
+                # connection
                 if link is None or web:
                     link = opened.enter_context(_connected(scheme, host, port, end, tls))
                 number += 1
                 shown = _authorization(url, plain, method, challenges)
                 link.settimeout(_left(end))
-                peer = str(link.getpeername()[0])  # none any more once it has hung up
+                peer = str(link.getpeername()[0])  # not available after the server has closed
                 link.sendall(_head(method, plain, number, shown).encode())
                 answer = _read(link, peer, end, web=web)
                 if answer.status in REDIRECTS:
@@ -165,17 +167,17 @@ def _connected(
 def _authorization(
     url: SplitResult, plain: SplitResult, method: str, challenges: Sequence[str]
 ) -> str:
-    """Return the header that answers a challenge; "" if there is none that we know."""
+    """Return the header that answers a challenge; "" without a supported challenge."""
     user, password = unquote(url.username or ""), unquote(url.password or "")
     for challenge in challenges:
-        scheme, _, said = challenge.partition(" ")
+        scheme, _, text = challenge.partition(" ")
         if scheme.lower() == "digest":
             passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
             passwords.add_password(None, plain.geturl(), user, password)
             request = urllib.request.Request(plain.geturl(), method=method)  # noqa: S310 - not sent
             if method != "GET":
                 request.selector = plain.geturl()
-            words = (one.partition("=") for one in urllib.request.parse_http_list(said))
+            words = (one.partition("=") for one in urllib.request.parse_http_list(text))
             parts = {key: value.removeprefix('"').removesuffix('"') for key, _, value in words}
             made = urllib.request.HTTPDigestAuthHandler(passwords).get_authorization(request, parts)
             return f"Authorization: Digest {made}" if made else ""
@@ -205,9 +207,9 @@ def _head(method: str, url: SplitResult, number: int, authorization: str) -> str
 
 
 def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
-    """Return an answer; its body is skipped where another answer may follow it.
+    """Read an answer, and skip its body if another answer may follow.
 
-    A server may end its lines by one character, or put more of the other in, as FFmpeg takes it.
+    Like FFmpeg, it accepts lines that end with LF, or with several CRs.
     """
     head = bytearray()  # without carriage returns
     size = 0
@@ -227,7 +229,7 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
     answer = _Answer(int(status.partition(" ")[2][:3]), headers, peer)
     if not web:
         left = int(headers.get("content-length", ("0",))[0])
-        # the last piece holds the body's beginning, carriage returns included, behind these lines
+        # the last piece also holds the begin of the body, with carriage returns
         lines_of_head = came.count(b"\n") - head.count(b"\n", found + 2)
         left -= len(came.split(b"\n", lines_of_head)[-1])
         while left > 0:
@@ -238,10 +240,10 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
 
 
 def _receive(link: socket.socket, end: float, before: int) -> bytes:
-    """Return the next bytes of an answer, of which so many came before.
+    """Return the next bytes of an answer; ``before``: number of bytes received so far.
 
     Raises:
-        OSError, ValueError: there are none, or too many.
+        OSError, ValueError: there are no bytes, or too many.
     """
     link.settimeout(_left(end))
     came = link.recv(4096)

@@ -1,4 +1,4 @@
-"""Web cameras: streams of JPEGs on our own, and what else a web server has through FFmpeg."""
+"""Use web cameras as sources of frames: JPEG streams directly, other streams by FFmpeg."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
 
 
-WITH_BODY: Final = (200, 203, 206)
-"""Status of answers with a stream."""
+STREAM_STATUSES: Final = (200, 203, 206)
+"""Status codes of answers with a stream."""
 
 
 class WebDriver(VideoDriver):
-    """A web camera or a recording on a web server; parameters as :class:`VideoDriver` has them.
+    """A web camera or a recording on a web server; parameters as in :class:`VideoDriver`.
 
-    The parts of a stream of JPEGs are cut here, so that each picture comes with its last byte.
+    A multipart stream of JPEGs is read without FFmpeg, so that each picture comes with its last
+    byte.
     """
 
     _playing: _PartsStream | None = None
@@ -43,7 +44,7 @@ class WebDriver(VideoDriver):
         """Read one picture, and close the connection again.
 
         Raises:
-            FrameFormatError: the source is no video, or has pixels that we have no name for.
+            FrameFormatError: the source is no video, or has an unknown pixel format.
             FrameSourceError: the source is not there, refuses, or is silent.
             MissingExtraError: the extra ``video`` is not installed.
         """
@@ -62,28 +63,28 @@ class WebDriver(VideoDriver):
         return StreamFormat(frame.format, *self._size)
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect anew and read; a recording begins at its beginning.
+        """Connect and read; a recording starts at its beginning.
 
         Raises:
-            FrameSourceError: the source is gone, or silent.
+            FrameSourceError: the source is gone, or does not answer.
         """
         if not self._is_parts:
             await super().start(sink)
         elif not await self._begin_parts(sink):
             raise FrameFormatError(
-                f"{self.name}: expected parts, as it was opened, got something else: open it anew",
+                f"{self.name}: expected parts as at the opening, got another answer: open it anew",
                 source=self.name,
             )
 
     async def stop(self) -> None:
-        """Read no longer."""
+        """Stop reading."""
         playing, self._playing = self._playing, None
         if playing is not None:
             await playing.end()
         await super().stop()
 
     async def _begin_parts(self, sink: FrameSink) -> bool:
-        """Begin to read; return False for another stream, or where a proxy has to be asked."""
+        """Start reading parts; return False for other streams, or if a proxy is needed."""
         if self._elsewhere or _by_proxy(self.address.scheme, self.address.host):
             return False
         url = self.address.url.partition("#")[0]
@@ -108,12 +109,12 @@ class WebDriver(VideoDriver):
 
     def _check(self, stream: WebStream) -> None:
         answer = stream.answer
-        if answer.status not in WITH_BODY:
+        if answer.status not in STREAM_STATUSES:
             shown = f"{answer.status} {answer.reason}".strip()
             raise self._wrong(f"cannot be read: {shown}")
         coding = answer.header("content-encoding").lower()
         if answer.is_pictures and coding not in ("", "identity"):
-            raise self._wrong(f"expected bytes as they are, got Content-Encoding: {coding[:40]}")
+            raise self._wrong(f"expected no encoding, got Content-Encoding: {coding[:40]}")
         if answer.is_pictures and self._format is not None and self._format.name == "H264":
             raise self._wrong("expected H264, got MJPEG")
 
@@ -141,7 +142,7 @@ class _PartsStream:
         self._shown = self._heard = self._loop.time()
 
     async def begin(self) -> None:
-        """Cut and decode what comes."""
+        """Start cutting and decoding pictures."""
         await self._decoding.begin(self)
         self._tasks = [
             asyncio.create_task(work, name=f"{what} of {self._name}")
@@ -149,7 +150,7 @@ class _PartsStream:
         ]
 
     async def end(self) -> None:
-        """End all; the sink hears no more."""
+        """Stop; the sink is not called any more."""
         self._stream.close()
         for task in self._tasks:
             task.cancel()
@@ -164,10 +165,10 @@ class _PartsStream:
         return None
 
     def want_picture(self) -> None:
-        """Do nothing: each picture is whole."""
+        """Do nothing: every picture is a key frame."""
 
     def shown(self) -> None:
-        """Note that a picture could be decoded."""
+        """Note that a picture was decoded."""
         self._shown = self._loop.time()
 
     async def _read(self) -> None:
@@ -205,10 +206,10 @@ def _size_in(picture: bytes) -> tuple[int, int] | None:
     try:
         width, height, _ = jpeg_header(picture, "a part")
     except FrameFormatError:
-        return None  # of the last one: what is wrong shows when it is decoded
+        return None  # decoding reports the error
     return width, height
 
 
 def _by_proxy(scheme: str, host: str) -> bool:
-    """Return True if the environment names a proxy for a host, which FFmpeg asks."""
+    """Return True if the environment names a proxy for a host, which FFmpeg uses."""
     return bool(urllib.request.getproxies().get(scheme)) and not urllib.request.proxy_bypass(host)

@@ -1,4 +1,4 @@
-"""Request a web camera's stream: with redirects on its own host, passwords, and its bytes."""
+"""Request a web camera's stream, with redirects on its host, and passwords."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ MAX_HEAD_BYTES: Final = 64 << 10
 """Largest number of bytes of an answer's head."""
 
 MAX_REFUSALS: Final = 3
-"""Largest number of refusals for a password, such as by a nonce that is too old."""
+"""Largest number of refusals of a request's authorization, such as for an old nonce."""
 
 MAX_LINE_BYTES: Final = 4096
-"""Largest number of bytes of a line before a chunk."""
+"""Largest number of bytes of the line with a chunk's size."""
 
 PIECE_BYTES: Final = 64 << 10
 """Largest number of bytes that are read at a time."""
 
 INTERIM: Final = range(100, 200)
-"""Status codes of answers that only announce another one."""
+"""Status codes of interim answers."""
 
 PORTS: Final = {"http": 80, "https": 443}
 
 _PICTURES: Final = re.compile(r"(?i)\s*(?:multipart/|video/(?:x-)?(?:m|motion-?)?jpe?g\b)")
 
 MAX_INTERIM_ANSWERS: Final = 8
-"""Largest number of answers (1xx) that only announce another one."""
+"""Largest number of interim answers (1xx)."""
 
 _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
-    """An answer whose body is still being read; the names of its headers are in lower case."""
+    """An answer without its body; header names are in lower case."""
 
     status: int
     reason: str
@@ -66,7 +66,7 @@ class WebStream:
         tls: options for checking the server's certificate.
 
     Attributes:
-        answer: head of the server's answer; there once :meth:`open` has returned.
+        answer: header of the server's answer, set by :meth:`open`.
     """
 
     answer: WebAnswer
@@ -78,14 +78,14 @@ class WebStream:
         self._rest = b""
 
     async def open(self) -> None:
-        """Send the request; follow redirects on its host and port, and send the password.
+        """Send the request; follow redirects on the same host and port, and answer challenges.
 
         Raises:
-            FrameSourceError: the answer is a redirect to another host, or the last of too many.
+            FrameSourceError: there is a redirect to another host, or too many redirects.
             OSError: there is no connection.
-            ValueError: the address is no web server.
+            ValueError: the server is no web server.
 
-        Cancellation: :meth:`close` ends what has begun.
+        Cancellation: :meth:`close` cleans up.
         """
         parts = urlsplit(self._url)
         credentials = Credentials(unquote(parts.username or ""), unquote(parts.password or ""))
@@ -117,10 +117,10 @@ class WebStream:
             writer.transport.abort()
 
     async def pieces(self) -> AsyncGenerator[bytes, None]:
-        """Yield the body as it comes.
+        """Yield the body's bytes as they come.
 
         Raises:
-            MessageError: its chunks are not valid.
+            MessageError: a chunk is not valid.
             OSError: the connection is lost.
         """
         if "chunked" not in self.answer.header("transfer-encoding").lower():
@@ -188,10 +188,10 @@ class WebStream:
                 return 0
             if len(line) > MAX_LINE_BYTES:
                 raise MessageError("HTTP: a chunk: expected its size, got a line without an end")
-        said = bytes(line).partition(b";")[0].strip()
-        if not re.fullmatch(rb"[0-9A-Fa-f]{1,8}", said):
-            raise MessageError(f"HTTP: a chunk: expected its size, got {said[:20]!r}")
-        return int(said, 16)
+        size = bytes(line).partition(b";")[0].strip()
+        if not re.fullmatch(rb"[0-9A-Fa-f]{1,8}", size):
+            raise MessageError(f"HTTP: a chunk: expected its size, got {size[:20]!r}")
+        return int(size, 16)
 
 
 def _answer(head: bytes) -> WebAnswer:

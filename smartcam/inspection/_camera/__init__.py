@@ -1,1 +1,1 @@
-"""Software cameras: programs that look at a source of frames, behind the wire of a smart camera."""
+"""Software cameras: programs that inspect a source of frames, with a smart camera's protocol."""

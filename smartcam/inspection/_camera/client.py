@@ -1,4 +1,4 @@
-"""A software camera in this process: a client, and the device that it has a session with."""
+"""A software camera in this process: a client with a device of its own."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam._client._inside import TriggerRequest
-    from smartcam.inspection._camera.eyes import Judged
+    from smartcam.inspection._camera.frame_inspector import Judged
     from smartcam.inspection._cell import CellCamera
     from smartcam.observers import Observer
 
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 class SoftwareCamera(SmartCamera[ValueT]):
     """A camera whose pictures are inspected in this process: ``software:cell.yaml#line1/cam1``.
 
-    It is a client of a device that it starts and stops itself, so triggers, statuses, errors and
-    streams are those of a camera on the wire. Results are read by the programs' layouts unless
-    ``interpret_as`` says otherwise; an application may be named by number or by name.
+    The client starts and stops a device in this process, so triggers, statuses, errors and streams
+    work as with a camera on the network. Results are read by the programs' layouts unless
+    ``interpret_as`` gives others. An application is given by number or by name.
 
     Args:
         url: address of the camera, ``software:FILE#CAMERA``.
@@ -46,8 +46,8 @@ class SoftwareCamera(SmartCamera[ValueT]):
         observers: observers of the session.
 
     Raises:
-        ConfigurationError: the file or an option cannot work.
-        MissingExtraError: what it needs is not installed.
+        ConfigurationError: the file or an option is wrong.
+        MissingExtraError: an extra is not installed.
     """
 
     def __init__(
@@ -67,9 +67,9 @@ class SoftwareCamera(SmartCamera[ValueT]):
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
         self._pairs = JudgedResults(
-            self._device.last_sent, lambda: self.statistics().received, self._tell_picture
+            self._device.last_sent, lambda: self.statistics().received, self._report_picture
         )
-        self._device.eyes.viewers.add(self._pairs.take)
+        self._device.inspector.viewers.add(self._pairs.take)
         settings = CameraSettings.of(address, given)
         super().__init__(settings, observers=[self._pairs, *observers])
 
@@ -79,13 +79,13 @@ class SoftwareCamera(SmartCamera[ValueT]):
 
     @property
     def judged(self) -> Judged | None:
-        """The last picture that was judged, with the findings about it; None before the first."""
-        return self._device.eyes.judged
+        """The last inspected picture with its findings; None before the first."""
+        return self._device.inspector.judged
 
     @property
     def trouble_seeing(self) -> str:
-        """The reason for which no frames come; "" if they come."""
-        return self._device.eyes.trouble
+        """Reason why no frames come; "" if they come."""
+        return self._device.inspector.trouble
 
     async def open(self) -> Self:
         try:
@@ -113,13 +113,13 @@ class SoftwareCamera(SmartCamera[ValueT]):
         try:
             return await super()._trigger(application, request, timeout)
         except CameraFaultError as exc:
-            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is over'}") from exc
+            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is closed'}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
         return await self._picture(timeout, drawn=False)
 
     async def read_drawn_image(self, *, timeout: float | None = None) -> bytes:
-        """Return the last picture that was judged with the marks of its tools, a PNG's bytes.
+        """Return the last inspected picture with the marks of its tools, as a PNG's bytes.
 
         Raises:
             UnsupportedError: no picture was judged yet.
@@ -133,19 +133,19 @@ class SoftwareCamera(SmartCamera[ValueT]):
     async def read_judged_image(
         self, result: Result[Any], *, drawn: bool = False, timeout: float | None = None
     ) -> bytes:
-        """Return the picture that a result was made of, a PNG's bytes.
+        """Return the picture from which a result was made, as a PNG's bytes.
 
-        The pictures of the last 8 results are there. A recorder among the camera's observers keeps
-        them all.
+        The pictures of the last 8 results are kept. A recorder among the camera's observers keeps
+        all.
 
         Args:
             result: result of this camera.
-            drawn: with the marks of the tools.
-            timeout: seconds; default the camera's ``request_timeout``.
+            drawn: whether to draw the marks of the tools.
+            timeout: time limit, seconds; default the camera's ``request_timeout``.
 
         Raises:
-            ConfigurationError: an argument is of another kind.
-            UnsupportedError: the result's picture is not known, or not any more.
+            ConfigurationError: an argument has another type.
+            UnsupportedError: the result's picture is unknown, or no longer kept.
             ResponseTimeoutError: the picture was not made in time.
 
         Cancellation: safe.
@@ -161,7 +161,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
             )
         return await self._png(judged, limit, drawn=drawn)
 
-    def _tell_picture(self, result: Result[Any], judged: Judged) -> None:
+    def _report_picture(self, result: Result[Any], judged: Judged) -> None:
         if self._observers.see_pictures:
             self._observers.picture(result, judged.marked_frame)
 
@@ -186,7 +186,8 @@ def find_camera(url: str) -> CellCamera:
     """Return the camera of an address, ``software:FILE`` or ``software:FILE#CAMERA``.
 
     Raises:
-        ConfigurationError: the file is wrong, or has no such camera, or several and none is named.
+        ConfigurationError: the file is wrong, has no such camera, or has several and the address
+            names none.
     """
     path, mark, name = url.strip()[len(SOFTWARE_SCHEME) :].partition("#")
     if not path:
@@ -205,4 +206,4 @@ def find_camera(url: str) -> CellCamera:
             f"{path} has no software camera {name!r:.80}; it has {there}"
             f"{did_you_mean(name, cameras)}"
         )
-    raise ConfigurationError(f"{path} has several software cameras: name one of {there} behind #")
+    raise ConfigurationError(f"{path} has several software cameras: name one of {there} after #")

@@ -1,4 +1,4 @@
-"""A software camera as a device on a port: an emulated camera that has eyes."""
+"""A software camera as a device on a port: an emulated camera that inspects frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartcam._server import Server
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.emulator._inside import InspectedApplication, InspectedJob, Inspector
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection._camera.eyes import Eyes
+from smartcam.inspection._camera.frame_inspector import FrameInspector
 from smartcam.inspection._camera.keeper import PictureKeeper
 from smartcam.inspection._cell import CellCamera
 from smartcam.layout import Layout
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 MAX_RECORDS: Final = 32
-"""Largest number of records of a list that an In-Sight camera has cells for."""
+"""Largest number of a list's records for which an In-Sight camera has cells."""
 
 NO_VALUE: Final = "#ERR"
 """Text of a cell without a value."""
@@ -42,27 +42,27 @@ _RECORDED: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-9+.-]*:)|
 
 
 class SoftwareDevice(Server):
-    """A camera that inspects the frames of a source, and speaks as a smart camera does.
+    """A device that inspects the frames of a source, with a smart camera's protocol.
 
-    It is in run mode from the beginning. A source that is lost is a System Error until it is back;
-    an inspection under way is BUSY, and a trigger meanwhile Overtriggered.
+    The device starts in run mode. A lost source is a System Error until it is back. The device is
+    BUSY during an inspection; a trigger during this time is Overtriggered.
 
     Args:
         camera: programs of the camera, and the address of the frames.
         protocol: ``"bvs"`` or ``"insight"``.
-        host: address to listen on; nothing but this.
+        host: address to listen on.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``, of ``bvs``; default ``"tcp"``.
         dialect: name of the dialect of ``bvs``; default ``handbook``.
-        quirks: options of the emulated camera for what is not known of real ones.
-        seed: the start of the emulated camera's random numbers.
+        quirks: options of the emulated camera for unknown behaviour of real cameras.
+        seed: seed of the emulated camera's random numbers.
 
     Raises:
-        ConfigurationError: something of it cannot work.
+        ConfigurationError: an argument or the camera's file is wrong.
 
     Attributes:
         camera: programs of the camera, and the address of the frames.
-        eyes: inspector of the frames.
+        inspector: inspector of the frames.
         emulator: the device and its port.
     """
 
@@ -87,21 +87,21 @@ class SoftwareDevice(Server):
             check_kind(quirks, Mapping, "quirks", "a mapping, or None", "SoftwareDevice")
         recorded = _RECORDED.match(camera.frames) is not None
         make = partial(source_of, camera.frames, recorded=recorded)
-        make()  # what cannot work is told now
-        self.eyes: Eyes = Eyes(
+        make()  # raises errors of the address now
+        self.inspector: FrameInspector = FrameInspector(
             camera.name,
             make,
             camera.programs,
             recorded=recorded,
             grey=protocol == "insight",
-            on_sight=self._note_sight,
+            on_trouble=self._report_trouble,
         )
         self._keeper: PictureKeeper | None = None
         if camera.keep is not None:
             self._keeper = PictureKeeper(
                 camera.name, camera.folder / camera.keep.folder, camera.keep
             )
-            self.eyes.viewers.add(self._keeper.take)
+            self.inspector.viewers.add(self._keeper.take)
         self.emulator: WireCamera
         if protocol == "insight":
             for name, value in (("transport", transport), ("dialect", dialect)):
@@ -116,7 +116,7 @@ class SoftwareDevice(Server):
                 quirks=quirks,
                 seed=seed or 0,
             )
-            self.emulator.device.sight = self._sight
+            self.emulator.device.sight = self._last_picture
         else:
             self.emulator = EmulatedCamera(
                 [self._application(program) for program in camera.programs.values()],
@@ -140,7 +140,7 @@ class SoftwareDevice(Server):
                 "layout": program.layout.text,
                 "rate": self.camera.rates.get(program.application),
                 "processing_time": 0.0,
-                "inspector": self.eyes,
+                "inspector": self.inspector,
             },
             f"{self.camera.name}: application {program.application}",
         )
@@ -155,7 +155,7 @@ class SoftwareDevice(Server):
                 "cells": dict.fromkeys(cell_names(program), NO_VALUE),
                 "rate": self.camera.rates.get(program.application),
                 "load_time": 0.01,
-                "inspector": _CellInspector(self.eyes, program),
+                "inspector": _CellInspector(self.inspector, program),
                 "application": program.application,
             },
             f"{self.camera.name}: application {program.application}",
@@ -163,18 +163,18 @@ class SoftwareDevice(Server):
 
     @property
     def url(self) -> str:
-        """Its address on the wire."""
+        """Address of the device for clients."""
         return self.emulator.url
 
     @property
     def interpret_as(self) -> dict[int, str]:
-        """The layout of the results of each application."""
+        """Layout of the results of each application."""
         return {number: one.interpret_as for number, one in self.camera.programs.items()}
 
     def last_sent(self) -> tuple[int, LastReport | None]:
-        """Return the number of the session, 0 without one, and the last report of a run.
+        """Return the session's number (0: no session), and the last report of a run.
 
-        Of a BVS camera: others send no containers.
+        Only BVS cameras have reports: others send no containers.
         """
         device = self.emulator.device
         return (device.sessions if device.connected else 0), device.last_report
@@ -182,14 +182,14 @@ class SoftwareDevice(Server):
     async def start(self) -> None:
         """Open the source of the frames, then the port.
 
-        A source that is not there is a System Error.
+        A missing source is a System Error.
 
         Raises:
-            ConfigurationError: the device cannot listen there.
+            ConfigurationError: the device cannot listen on the port.
 
         Cancellation: leaves it stopped.
         """
-        await self.eyes.start()
+        await self.inspector.start()
         if self._keeper is not None:
             self._keeper.start()
         try:
@@ -209,40 +209,40 @@ class SoftwareDevice(Server):
             await self._rest()
 
     async def _rest(self) -> None:
-        """Stop what looks, and what keeps pictures."""
+        """Stop the inspector and the keeper of pictures."""
         try:
-            await self.eyes.stop()
+            await self.inspector.stop()
         finally:
             if self._keeper is not None:
                 await self._keeper.stop()
 
-    def _note_sight(self, trouble: str) -> None:
+    def _report_trouble(self, trouble: str) -> None:
         device = self.emulator.device
         if isinstance(self.emulator, EmulatedInSight):
             device.set_blind(bool(trouble))
         else:
             device.set_condition(Status.SYSTEM_ERROR, bool(trouble))
 
-    def _sight(self) -> Any:
-        """Return the last judged picture's grey levels; before the first a black pixel."""
+    def _last_picture(self) -> Any:
+        """Return the grey levels of the last inspected picture; a black pixel before the first."""
         import numpy as np
 
-        judged = self.eyes.judged
+        judged = self.inspector.judged
         if judged is None or judged.inspection is None:
             return np.zeros((1, 1), np.uint8)
         return judged.inspection.picture.grey
 
 
 class _CellInspector(Inspector):
-    """Has the values of a program in the units of its layout, as the cells show them.
+    """Convert a program's values to the units of its layout, as In-Sight cells show them.
 
     Args:
-        eyes: inspector of the frames.
-        program: program whose values they are.
+        inspector: inspector of the frames.
+        program: program whose values are converted.
     """
 
-    def __init__(self, eyes: Eyes, program: Program) -> None:
-        self._eyes, self._layout = eyes, program.layout
+    def __init__(self, inspector: FrameInspector, program: Program) -> None:
+        self._inspector, self._layout = inspector, program.layout
         plain = [str(replace(field, unit=None)) for field in program.layout.fields]
         if program.layout.repeat is None:
             text = ", ".join(plain)
@@ -258,7 +258,7 @@ class _CellInspector(Inspector):
         seen: Callable[[], None],
         done: Callable[[Values | None], None],
     ) -> None:
-        """Begin an inspection, as the eyes do."""
+        """Start an inspection, whose values are converted."""
         number = None if self._layout.sequence_field is None else order.number & 0x7FFFFFFF
 
         def converted(found: Values | None) -> None:
@@ -268,18 +268,18 @@ class _CellInspector(Inspector):
                     data = self._layout.build(found, sequence=number)
                     values = _as_mapping(self._plain.parse(data))
             except Exception:  # noqa: BLE001 - the run has to end
-                _log.exception("%s ! a result does not fit its cells", self._eyes.name)
+                _log.exception("%s ! a result does not fit its cells", self._inspector.name)
             done(values)
 
-        self._eyes.begin(order, seen, converted)
+        self._inspector.begin(order, seen, converted)
 
     def cancel(self) -> None:
-        """Give up the inspection under way."""
-        self._eyes.cancel()
+        """Cancel the running inspection."""
+        self._inspector.cancel()
 
 
 def _as_mapping(record: Any) -> dict[str, Any]:
-    """Return a record, and the records in it, as mappings."""
+    """Return a record with its nested records as mappings."""
     return {
         name: [_as_mapping(one) for one in value] if isinstance(value, list) else value
         for name, value in record._asdict().items()
@@ -287,10 +287,10 @@ def _as_mapping(record: Any) -> dict[str, Any]:
 
 
 def source_of(address: str, *, recorded: bool) -> FrameSource:
-    """Return the source of an address; a recording waits until a run takes its next picture.
+    """Return the source of an address; a recording is read only as fast as runs need pictures.
 
     Raises:
-        ConfigurationError: the address cannot work.
+        ConfigurationError: the address is wrong.
     """
     for name, value in (("pace", "none"), ("mixed", "yes")) if recorded else ():
         if re.search(rf"#(.*&)?{name}=", address) is None:
@@ -300,7 +300,7 @@ def source_of(address: str, *, recorded: bool) -> FrameSource:
 
 
 def cell_names(program: Program) -> list[str]:
-    """Return the names of the cells that a program's values are in on an In-Sight camera."""
+    """Return the names of the In-Sight cells that hold a program's values."""
     layout = program.layout
     if layout.repeat is None:
         return [field.name for field in layout.fields]

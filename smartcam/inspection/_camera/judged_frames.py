@@ -1,4 +1,4 @@
-"""The judged pictures of a software camera, as a source of frames."""
+"""Offer the inspected pictures of a software camera as a source of frames."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
 
 if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSink
-    from smartcam.inspection._camera.eyes import Eyes, Judged
+    from smartcam.inspection._camera.frame_inspector import FrameInspector, Judged
 
 _log: Final = logging.getLogger("smartcam.inspection")
 
 
 class JudgedDriver(FrameDriver):
-    """Gives each picture that was judged, the newest where they come faster than they are drawn.
+    """Deliver inspected pictures; if they come faster than they are drawn, only the newest.
 
     Args:
-        eyes: the camera's eyes.
-        drawn: with the marks of the tools, as RGB8; else as they came.
+        inspector: inspector of the camera's frames.
+        drawn: whether to draw the tools' marks, as RGB8; else the pictures are unchanged.
     """
 
-    def __init__(self, eyes: Eyes, *, drawn: bool) -> None:
+    def __init__(self, inspector: FrameInspector, *, drawn: bool) -> None:
         super().__init__(FrameAddress.parse("judged://"))
-        self._eyes, self._drawn = eyes, drawn
+        self._inspector, self._drawn = inspector, drawn
         self._next: asyncio.Queue[Judged] = asyncio.Queue(1)
         self._task: asyncio.Task[None] | None = None
         self._sink: FrameSink | None = None
@@ -35,33 +35,33 @@ class JudgedDriver(FrameDriver):
     @property
     def name(self) -> str:
         """The camera's name."""
-        return self._eyes.name
+        return self._inspector.name
 
     async def open(self) -> StreamFormat:
-        """Return the format of the source's frames, RGB8 of that size where they are drawn.
+        """Return the format of the source's frames; RGB8 of the same size for drawn pictures.
 
         Raises:
-            FrameSourceError: the source was not there yet.
+            FrameSourceError: the source was never open.
         """
-        form = self._eyes.format
+        form = self._inspector.format
         if form is None:
             raise FrameSourceError(
-                f"{self.name}: no pictures yet: {self._eyes.trouble}", source=self.name
+                f"{self.name}: no pictures yet: {self._inspector.trouble}", source=self.name
             )
         kind = find_format("RGB8") if self._drawn else form.format
         return StreamFormat(kind, form.width, form.height)
 
     async def start(self, sink: FrameSink) -> None:
-        """Give what is judged from now on, after the last picture that was."""
+        """Deliver the last inspected picture, then all later ones."""
         self._sink = sink
-        self._eyes.viewers.add(self._take)
-        if self._eyes.judged is not None:
-            self._take(self._eyes.judged)
+        self._inspector.viewers.add(self._take)
+        if self._inspector.judged is not None:
+            self._take(self._inspector.judged)
         self._task = asyncio.create_task(self._give(sink), name=f"judged frames of {self.name}")
 
     async def stop(self) -> None:
-        """Give nothing more."""
-        self._eyes.viewers.discard(self._take)
+        """Stop delivering pictures."""
+        self._inspector.viewers.discard(self._take)
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -97,9 +97,9 @@ class JudgedDriver(FrameDriver):
         return await asyncio.to_thread(_drawn, judged) if self._drawn else judged.marked_frame
 
 
-def judged_source(eyes: Eyes, *, drawn: bool) -> FrameSource:
-    """Return a source of the pictures that a camera's eyes judge, unopened."""
-    return FrameSource(JudgedDriver(eyes, drawn=drawn), timeout=None, stall=None, linger=2.0)
+def judged_source(inspector: FrameInspector, *, drawn: bool) -> FrameSource:
+    """Return the unopened source of a camera's inspected pictures."""
+    return FrameSource(JudgedDriver(inspector, drawn=drawn), timeout=None, stall=None, linger=2.0)
 
 
 def _drawn(judged: Judged) -> Frame:

@@ -1,4 +1,4 @@
-"""Keeping judged pictures in a folder, with the findings about them."""
+"""Keep inspected pictures in a folder, with their findings."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from smartcam.models import jsonable
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.inspection._camera.eyes import Judged
+    from smartcam.inspection._camera.frame_inspector import Judged
     from smartcam.inspection._cell import Keep
 
 _log: Final = logging.getLogger("smartcam.inspection")
 
-MAX_WAITING: Final = 16
-"""Largest number of pictures that wait to be written; more are not kept, and counted."""
+MAX_WAITING_PICTURES: Final = 16
+"""Largest number of pictures that wait to be written; more are dropped and counted."""
 
-_UNFIT: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')  # for the name of a file
+_FORBIDDEN: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')  # in names of files
 
 
 class PictureKeeper:
-    """Writes judged pictures as PNG files into a folder, each with a JSON file beside it.
+    """Write inspected pictures into a folder as PNG files, each with a JSON file.
 
-    The camera's oldest ones in the folder make room; other files there are left alone. A folder
-    that cannot be written costs the pictures, and nothing else.
+    The camera's oldest pictures in the folder are deleted to make room; other files are not
+    touched. If the folder cannot be written, pictures are lost, but inspection goes on.
 
     Args:
         name: name of the camera, for logs.
-        folder: folder for the pictures; it is created if needed.
+        folder: folder for the pictures, which is created if needed.
         keep: settings of keeping.
 
     Attributes:
-        missed: pictures that were not kept, since others were still being written.
+        missed: number of pictures that were dropped while others were written.
     """
 
     def __init__(self, name: str, folder: Path, keep: Keep) -> None:
         self._name, self._folder, self._keep = name, folder, keep
-        self._called = _UNFIT.sub("-", name)  # in the names of its files
+        self._file_prefix = _FORBIDDEN.sub("-", name)  # in the names of its files
         self._own = re.compile(
-            rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._called)}-\d+-(ok|bad)\.png"
+            rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._file_prefix)}-\d+-(ok|bad)\.png"
         )
         self.missed: int = 0
         self._waiting: collections.deque[Judged] = collections.deque()
@@ -56,12 +56,12 @@ class PictureKeeper:
         self._failed = False
 
     def start(self) -> None:
-        """Begin to write what comes."""
+        """Start the writer of queued pictures."""
         if self._task is None:
             self._task = asyncio.create_task(self._write_all(), name=f"pictures of {self._name}")
 
     async def stop(self) -> None:
-        """Write what waits, which is bounded, and end. Idempotent."""
+        """Write the queued pictures, and end the writer. Idempotent."""
         task, self._task = self._task, None
         if task is None:
             return
@@ -71,11 +71,11 @@ class PictureKeeper:
             await asyncio.to_thread(self._write, self._waiting.popleft())
 
     def take(self, judged: Judged) -> None:
-        """Keep a picture, unless only those that are not ok are kept and it is."""
+        """Queue a picture, unless it is ok and only bad pictures are kept."""
         ok = judged.inspection is not None and judged.inspection.ok
         if ok and self._keep.which == "bad":
             return
-        if len(self._waiting) >= MAX_WAITING:
+        if len(self._waiting) >= MAX_WAITING_PICTURES:
             self.missed += 1
             return
         self._waiting.append(judged)
@@ -90,13 +90,13 @@ class PictureKeeper:
             await self._wake.wait()
 
     def _write(self, judged: Judged) -> None:
-        """Write a picture, and delete those that are too many."""
+        """Write a picture, and delete the oldest beyond the limit."""
         inspection = judged.inspection
         ok = inspection is not None and inspection.ok
         at = datetime.fromtimestamp(judged.frame.utc, UTC)
         verdict = "ok" if ok else "bad"
-        stem = f"{at:%Y%m%d-%H%M%S-%f}-{self._called}-{judged.application}-{verdict}"
-        said: dict[str, Any] = {
+        stem = f"{at:%Y%m%d-%H%M%S-%f}-{self._file_prefix}-{judged.application}-{verdict}"
+        record: dict[str, Any] = {
             "camera": self._name,
             "application": judged.application,
             "number": judged.number,
@@ -107,14 +107,14 @@ class PictureKeeper:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             (self._folder / f"{stem}.png").write_bytes(png_of(judged, drawn=False))
-            text = json.dumps(said, indent=1)
+            text = json.dumps(record, indent=1)
             (self._folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
             kept = sorted(one for one in self._folder.iterdir() if self._own.fullmatch(one.name))
             for old in kept[: max(0, len(kept) - self._keep.most)]:
                 old.unlink(missing_ok=True)
                 old.with_suffix(".json").unlink(missing_ok=True)
         except (OSError, ValueError, SmartCamError) as exc:
-            if not self._failed:  # once is enough
+            if not self._failed:  # log the first failure only
                 _log.error("%s ! pictures are not kept: %s", self._name, exc)
             self._failed = True
         else:

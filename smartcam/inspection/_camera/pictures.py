@@ -1,4 +1,4 @@
-"""Judged pictures as files."""
+"""Encode inspected pictures as files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from smartcam._extras import load
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.inspection._camera.eyes import Judged
+    from smartcam.inspection._camera.frame_inspector import Judged
 
 
 def png_of(judged: Judged, *, drawn: bool) -> bytes:
-    """Return a judged picture as a PNG's bytes; ``drawn``: with the marks of the tools.
+    """Return an inspected picture as a PNG's bytes; ``drawn``: with the marks of the tools.
 
-    Levels of 9 to 15 bits are spread over 16, so that white is white to whoever reads the file.
+    Levels of 9 to 15 bits are scaled to 16 bits, so that white is white in every viewer.
 
     Raises:
         FrameFormatError: the frame's bytes are wrong.
@@ -29,9 +29,9 @@ def png_of(judged: Judged, *, drawn: bool) -> bytes:
         pixels = inspection.drawn()
     elif inspection is not None:
         picture = inspection.picture
-        pixels = picture.rgb if picture.has_colours else _whole(picture.levels, picture.depth)
+        pixels = picture.rgb if picture.has_colours else _full_range(picture.levels, picture.depth)
     else:
-        pixels = _whole(judged.frame.rgb(), judged.frame.format.depth)
+        pixels = _full_range(judged.frame.rgb(), judged.frame.format.depth)
     cv2 = load("cv2", "inspection needs")
     if pixels.ndim == 3:
         pixels = pixels[:, :, ::-1]
@@ -39,8 +39,8 @@ def png_of(judged: Judged, *, drawn: bool) -> bytes:
     return bytes(data)
 
 
-def _whole(levels: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Return levels of so many bits with all bits of their type in use; 8 bits are as they are."""
+def _full_range(levels: NDArray[Any], depth: int) -> NDArray[Any]:
+    """Return levels of ``depth`` bits scaled to the full range of their type."""
     if levels.dtype != np.uint16 or depth >= 16:
         return levels
     depth = max(depth, 8)

@@ -1,4 +1,4 @@
-"""A thread for tools: one that never ends keeps no process from its end."""
+"""A thread for tools that does not keep the process from exiting."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_TURN_SECONDS: Final = 0.001
-"""Seconds that a tool's Python goes on while the event loop waits for its turn. Python's own 5 ms
-were all that a loop may be held; NumPy, OpenCV and zxing-cpp let the loop run meanwhile."""
+"""Python's switch interval, seconds, while tools run: the longest time that Python code of a tool
+delays the event loop. NumPy, OpenCV and zxing-cpp release the GIL."""
 
 
 class ToolThread:
-    """Does what it is given, one after the other, in a daemon thread.
+    """Run jobs one after the other in a daemon thread.
 
     Args:
         name: name of the thread.
@@ -27,9 +27,8 @@ class ToolThread:
 
     def __init__(self, name: str) -> None:
         self._jobs: collections.deque[tuple[Future[Any], Callable[[], Any]]] = collections.deque()
-        self._lock = threading.Lock()  # of the jobs
-        # Locked while there is nothing to do. A condition would wake the thread into its own lock,
-        # which takes one change of threads more.
+        self._lock = threading.Lock()  # guards the jobs
+        # Locked while there are no jobs. A condition would cost one more switch of threads.
         self._bell = threading.Lock()
         self._bell.acquire()
         self._closing = False
@@ -39,11 +38,11 @@ class ToolThread:
 
     @property
     def at_work(self) -> bool:
-        """Something was begun that has not ended."""
+        """True while a job is running."""
         return self._at_work
 
     def submit(self, do: Callable[[], Any]) -> Future[Any]:
-        """Have something done, after all that waits; what was cancelled waits no longer."""
+        """Queue a job, and drop cancelled jobs from the queue."""
         future: Future[Any] = Future()
         with self._lock:
             if self._jobs:
@@ -54,12 +53,12 @@ class ToolThread:
         return future
 
     def close(self) -> None:
-        """Have the thread end after the work that waits, and return at once."""
+        """End the thread after its queued jobs; return at once."""
         self._closing = True
         self._ring()
 
     def _ring(self) -> None:
-        with contextlib.suppress(RuntimeError):  # it has been rung, and the thread will look
+        with contextlib.suppress(RuntimeError):  # already released: the thread will look for jobs
             self._bell.release()
 
     def _run(self) -> None:
@@ -67,7 +66,7 @@ class ToolThread:
             self._bell.acquire()
             while (job := self._next_job()) is not None:
                 self._do(*job)
-                del job  # it holds a picture
+                del job  # releases its picture
             if self._closing and not self._jobs:
                 return
 
@@ -85,7 +84,7 @@ class ToolThread:
         try:
             with short_turns(MAX_TURN_SECONDS):
                 result = do()
-        except BaseException as exc:  # noqa: BLE001 - it is whose who waits for it
+        except BaseException as exc:  # noqa: BLE001 - passed on by the future
             self._at_work = False
             future.set_exception(exc)
         else:

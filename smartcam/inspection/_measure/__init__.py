@@ -1,1 +1,1 @@
-"""Measure in pictures: edges to a fraction of a pixel, lines, circles, lengths and angles."""
+"""Measure subpixel edges, lines, circles, lengths and angles in pictures."""

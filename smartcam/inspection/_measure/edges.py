@@ -1,8 +1,8 @@
-"""Find edges in strips, to a fraction of a pixel and with a standard deviation.
+"""Find edges in strips with subpixel accuracy and a standard deviation.
 
-The derivative of a Gaussian along the profile of a strip says where edges are; a fit of blurred
-steps to the strip's pixels says where exactly. Pixels are not interpolated for it, so their noise
-stays independent.
+The derivative of a Gaussian along the profile of a strip finds edges; a fit of blurred steps to the
+strip's pixels locates them exactly. The fit does not interpolate pixels, so their noise stays
+independent.
 """
 
 from __future__ import annotations
@@ -36,83 +36,82 @@ Polarity: TypeAlias = Literal["any", "rising", "falling"]
 """``rising``: from dark to light along the strip; ``falling``: from light to dark."""
 
 Choice: TypeAlias = Literal["single", "first", "last", "strongest", "nearest"]
-"""The edge that counts, of several. ``single``: there must not be several; ``nearest``: to the
-middle of the strip."""
+"""Choice among several edges. ``single``: several are an error; ``nearest``: nearest to the middle
+of the strip."""
 
 PairChoice: TypeAlias = Literal["single", "first", "last", "strongest", "outermost"]
-"""The pair of edges that counts, of several. ``single``: there must be two edges, no more."""
+"""Choice among several pairs of edges. ``single``: there must be exactly two edges."""
 
 PIXEL_VARIANCE: Final = 1 / 12
-"""Variance of a place in a pixel of width 1, which adds to the blur's, pixels^2."""
+"""Variance of a uniform distribution over a pixel, which adds to the blur's, pixels^2."""
 
-SIGNIFICANCE = 6.0
-"""An edge must stand out from the noise by this many of its standard deviations."""
+MIN_EDGE_SIGMAS = 6.0
+"""Least height of an edge, in standard deviations of the noise."""
 
-MIN_PART = 0.2
-"""Height of the weakest edge of a strip in parts of the strongest one; weaker ones are none."""
+MIN_RELATIVE_HEIGHT = 0.2
+"""Least height of an edge, as a share of the strongest edge's in its strip."""
 
 MAX_SAMPLES = 8_000_000
 """Largest number of pixels in all strips of a search together."""
 
 MAX_WIDTH_PX = 250.0
-"""Pixels that a strip may be wide."""
+"""Largest width of a strip, pixels."""
 
 MAX_EDGES = 12
-"""Largest number of edges of a strip that are fitted, the strongest ones."""
+"""Largest number of edges that are fitted in a strip; the strongest are used."""
 
-MAX_TOGETHER = 4
-"""Largest number of edges that are fitted together, where they are so near that their blurs
-overlap."""
+MAX_GROUP_EDGES = 4
+"""Largest number of edges with overlapping blurs that are fitted together."""
 
-NEAR_PX = 8.0
-"""Pixels between two edges below which they are fitted together."""
+MAX_GROUP_GAP_PX = 8.0
+"""Distance, pixels, below which two edges are fitted together."""
 
-BLURS_APART = 7.0
-"""Blurs between two edges below which they are fitted together."""
+MAX_GROUP_GAP_BLURS = 7.0
+"""Distance, in blurs, below which two edges are fitted together."""
 
-BLURS_BESIDE = 1.5
-"""Blurs that must be visible at each side of an edge; the fit gets its levels from there."""
+MIN_SIDE_BLURS = 1.5
+"""Least visible length on each side of an edge, in blurs, from which the fit gets its levels."""
 
-BLURS_REACH, REACH_PX = 4.0, 8.0
-"""Blurs and pixels to each side of an edge whose pixels are fitted. The place of an edge is known
-as well as the levels beside it: with 3 pixels its sigma is 8 % larger than with 15, with 8 it is
-2 % larger; far away the levels may be others."""
+FIT_REACH_BLURS, FIT_REACH_PX = 4.0, 8.0
+"""Reach of a fit to each side of an edge, in blurs and in pixels; the larger one is used. Compared
+with 15 pixels, sigma is 8 % larger with 3 pixels, and 2 % larger with 8. Farther away the levels
+may differ."""
 
-FIRST_REACH_PX = 12.0
-"""Pixels to each side of an edge that are fitted while the blur is not known."""
+FIRST_FIT_REACH_PX = 12.0
+"""Reach of the first fit to each side of an edge, pixels, while the blur is unknown."""
 
 MAX_SIGMA_PX = 0.5
-"""Pixels of standard deviation up to which an edge is one."""
+"""Largest standard deviation of an accepted edge, pixels."""
 
-MAX_MISFIT = 0.15
-"""Rms of the residuals in parts of an edge's height up to which the picture shows a step."""
+MAX_RELATIVE_MISFIT = 0.15
+"""Largest RMS residual of a step, as a share of the edge's height."""
 
-MISFIT_NOISES = 3.0
-"""Rms of the residuals in parts of the picture's noise below which it is always a step."""
+ALLOWED_MISFIT_NOISES = 3.0
+"""RMS residual up to which a step is always accepted, as a multiple of the picture's noise."""
 
-MISFIT_SEEN = 1.3
-"""Rms of the residuals in parts of the picture's noise from which on they show that the edge is not
-quite a blurred step, as a lens, sharpening or compression make it."""
+MIN_MISFIT_NOISES = 1.3
+"""RMS residual, as a multiple of the picture's noise, above which the edge is not exactly a blurred
+step, because of lens, sharpening or compression."""
 
-MAX_CUT_OFF = 0.03
-"""Part of an edge's pixels that may be black or white to the limit: more of them move the edge by
-more than a tenth of its standard deviation (simulated)."""
+MAX_SATURATED_SHARE = 0.03
+"""Largest share of saturated pixels of an edge: in simulations, more pixels move the edge by more
+than a tenth of its standard deviation."""
 
-LEAST_NOISE = 0.5
-"""Grey steps of noise from which on pixels of one level differ, unless it is cut off."""
+MIN_UNSATURATED_NOISE = 0.5
+"""Noise, in steps of grey levels, from which pixels of a uniform area differ unless saturated."""
 
-NOISE_KEPT = 0.5
-"""Part of the dark side's noise that the bright side has at least: a tone curve takes some."""
+MIN_BRIGHT_NOISE_SHARE = 0.5
+"""Least ratio of the bright side's noise to the dark side's: a tone curve reduces it."""
 
-CHANCE = 1e-4
-"""Probability that noise leaves so many pixels at the largest level and none above it, below which
-that level is where the picture is cut off."""
+MAX_PLATEAU_CHANCE = 1e-4
+"""Probability of the pixels at the largest level without saturation, below which they are
+saturated."""
 
 ROUNDING: Final = math.sqrt(1 / 12)
-"""Standard deviation of a rounded grey level: the least noise of a picture."""
+"""Standard deviation of rounding a grey level, the least noise of a picture."""
 
-FINE_SAMPLE = 1 << 16
-"""Pixels from which a picture's noise is estimated at most."""
+MAX_NOISE_SAMPLE = 1 << 16
+"""Largest number of pixels from which a picture's noise is estimated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,14 +119,14 @@ class EdgeSettings:
     """Settings of the search for edges.
 
     Attributes:
-        polarity: kind of step that is looked for.
+        polarity: direction of the step.
         smoothing: standard deviation of the Gaussian whose derivative finds edges, pixels.
-        contrast: grey levels from one side of an edge to the other one at least.
-        most_blur: pixels of blur that an edge may have.
-        black: least grey level that the picture can have.
-        white: largest grey level that the picture can have.
-        cut_off: whether edges beside levels that are cut off at black or white count.
-        clipped: mask (H, W) of other pixels that are cut off, as of one colour; None: of none.
+        contrast: least height of an edge, grey levels.
+        most_blur: largest blur of an edge, pixels.
+        black: least possible grey level of the picture.
+        white: largest possible grey level of the picture.
+        cut_off: whether edges beside saturated levels are measured.
+        clipped: mask (H, W) of other saturated pixels, as of one colour; None: no pixel.
     """
 
     polarity: Polarity = "any"
@@ -143,16 +142,16 @@ class EdgeSettings:
 class Edge(NamedTuple):
     """One edge in a strip."""
 
-    place: float  # along the strip, from its middle, pixels
-    # (K + 1, K + 1), for noise of one grey level: of the places of the K edges that were fitted
-    # together, and of their tilt; K edges share one array
+    place: float  # place along the strip, from its middle, pixels
+    # covariance (K + 1, K + 1) for noise of one grey level: of the places of the K edges that were
+    # fitted together, and of their tilt; the K edges share one array
     unit_covariance: Array
-    number: int  # index of the edge among these
+    number: int  # index of the edge among the K edges
     noise: float  # standard deviation of the pixels about the fit, grey levels
-    height: float  # grey levels from before to behind it; negative from light to dark
+    height: float  # grey levels after minus before the edge
     blur: float  # standard deviation of the lens' blur, pixels
-    tilt: float  # tangent of the angle out of the strip
-    misfit: float  # pixels by which the place may be wrong, as the edge is no blurred step
+    tilt: float  # tangent of the edge's rotation in the strip
+    misfit: float  # possible error of the place from a wrong model of the edge, pixels
 
     @property
     def sigma(self) -> float:
@@ -166,37 +165,37 @@ class Edge(NamedTuple):
 
 
 class JudgedEdge(NamedTuple):
-    """An edge, and the reason why its place cannot be told, or None."""
+    """An edge, and the reason why its place is not usable, or None."""
 
     edge: Edge
     trouble: NotMeasuredError | None
 
 
 class StripEdges(NamedTuple):
-    """The edges of one strip that are looked for, in their order; or the reason for none."""
+    """The wanted edges of one strip in their order, or the reason why there are none."""
 
     edges: tuple[JudgedEdge, ...]
     trouble: NotMeasuredError | None = None
-    too_many: NotMeasuredError | None = None  # there are more, weaker ones that were not fitted
+    too_many: NotMeasuredError | None = None  # error if more, weaker edges were not fitted
 
 
 def noise_of(image: NDArray[np.generic]) -> float:
     """Return the standard deviation of the noise of a picture's pixels (H, W), grey levels.
 
-    Where the picture has edges, most of the second differences along both axes, of which this is
-    the median, see none.
+    It is estimated from the median second difference along both axes, since most differences are
+    not at edges.
     """
     height, width = image.shape
     if height < 3 or width < 3:
         return ROUNDING
-    step = max(1, math.ceil(height * width / FINE_SAMPLE))
+    step = max(1, math.ceil(height * width / MAX_NOISE_SAMPLE))
     rows = image if step == 1 else np.concatenate([image[i : i + 3] for i in _blocks(height, step)])
     levels = rows.astype(np.float64)
     twice = levels[:-2] - 2 * levels[1:-1] + levels[2:]
-    if step > 1:  # where two blocks meet there are no neighbours
+    if step > 1:  # rows at the border of two blocks are no neighbours
         twice = twice[::3]
     cross = twice[:, :-2] - 2 * twice[:, 1:-1] + twice[:, 2:]
-    # the coefficients' squares add up to 36, and the median of a normal magnitude is 0.6745 sigma
+    # the squares of the coefficients sum to 36; the median of a normal magnitude is 0.6745 sigma
     return max(float(np.median(np.abs(cross))) / (6 * 0.6745), ROUNDING)
 
 
@@ -211,10 +210,10 @@ def find_edges(
     *,
     tilted: bool = False,
 ) -> list[StripEdges]:
-    """Return all edges of each strip whose contrast is enough, of the wanted polarity.
+    """Return all edges of each strip with the wanted contrast and polarity.
 
-    ``image`` (H, W), grey levels. ``tilted``: whether edges may be turned out of their strips;
-    those of lines and circles cross their strips at right angles.
+    ``image`` (H, W), grey levels. ``tilted``: whether edges may cross their strips at other than
+    right angles, which edges of lines and circles do not.
     """
     number = len(strips.middles)
     fits = inside(image, strips)
@@ -250,13 +249,13 @@ def find_edges(
 def _of_strip(
     steps: list[_FittedStep], settings: EdgeSettings, noise: float, *, crowded: bool, count: int
 ) -> StripEdges:
-    """Return the edges of a strip with a count of possible edges, of which not all were fitted."""
+    """Return the edges of a strip; ``count``: possible edges, of which not all may be fitted."""
     if crowded:
-        text = f"more than {MAX_TOGETHER} edges that are too near to each other to be told apart"
+        text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be told apart"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
     there = [one for one in steps if wanted(one.edge, settings) or not one.settled]
     too_many = None
-    # where one of the strongest has too little contrast already, none is left out
+    # if a fitted edge has too little contrast, the weaker edges have, too
     if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
         text = f"{count} edges in one strip, {MAX_EDGES} at most are told apart"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
@@ -271,7 +270,7 @@ def _of_strip(
 
 
 def _around(image: NDArray[np.generic], strips: Strips | Sectors) -> NDArray[np.generic]:
-    """Return the part of the picture in which strips lie."""
+    """Return the part of the picture that contains strips."""
     reach = math.hypot(strips.length, strips.width) / 2 + 1
     low = np.floor(strips.middles.min(axis=0) - reach).astype(int).clip(0)
     high = np.ceil(strips.middles.max(axis=0) + reach).astype(int)
@@ -281,20 +280,20 @@ def _around(image: NDArray[np.generic], strips: Strips | Sectors) -> NDArray[np.
 def _candidates(
     levels: Array, strips: Strips | Sectors, settings: EdgeSettings, noise: float
 ) -> tuple[list[Array], list[int]]:
-    """Return the places of possible edges in each strip, ascending, by profiles (N, T).
+    """Return the ascending places of possible edges in each strip, from profiles (N, T).
 
-    They are the strongest ones; the second list has the number of all in each strip.
+    Only the strongest are returned; the second list has the number of all possible edges.
     """
     smooth = settings.smoothing
     slopes = _slopes(levels, smooth)
-    # The noise of a mean over the width, behind a derivative of a Gaussian: the integral of its
-    # square is 1 / (4 sqrt(pi) smooth^3).
+    # The noise of a mean over the width after a Gaussian's derivative, the integral of whose square
+    # is 1 / (4 sqrt(pi) smooth^3).
     of_mean = noise / math.sqrt(max(strips.width, 1.0))
     floor = of_mean / math.sqrt(4 * math.sqrt(math.pi) * smooth**3)
     middle = (levels.shape[1] - 1) / 2
     found, counts = [], []
     for row in slopes:
-        least = max(SIGNIFICANCE * floor, 0.5 * MIN_PART * float(np.abs(row).max()))
+        least = max(MIN_EDGE_SIGMAS * floor, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max()))
         peaks = [(at, side) for side in (row, -row) for at in _peaks(side, least)]
         strongest = sorted(peaks, key=lambda one: -one[1][one[0]])[:MAX_EDGES]
         found.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
@@ -303,26 +302,26 @@ def _candidates(
 
 
 def _slopes(levels: Array, smooth: float) -> Array:
-    """Return profiles (N, T) behind the derivative of a Gaussian; they go on as they end."""
+    """Return profiles (N, T) filtered by a Gaussian's derivative, with constant continuation."""
     reach = math.ceil(4 * smooth)
     at = np.arange(-reach, reach + 1, dtype=np.float64)
     kernel: Array = at * np.exp(-(at**2) / (2 * smooth**2))
-    kernel = kernel / float((kernel * at).sum())  # a ramp of 1 has the slope 1
+    kernel = kernel / float((kernel * at).sum())  # so that a ramp of 1 has the slope 1
     padded = np.pad(levels, ((0, 0), (reach, reach)), mode="edge")
     slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(at), axis=1) @ kernel
     return slopes
 
 
 def _peaks(slopes: Array, least: float) -> list[int]:
-    """Return the places of peaks (T,) of a height, each half of that above what is around it."""
+    """Return the places of peaks of a least height, whose prominence is at least half of it."""
     after, before = np.append(slopes[1:], -np.inf), np.insert(slopes[:-1], 0, -np.inf)
     found = []
     for at in np.flatnonzero((slopes > before) & (slopes >= after) & (slopes >= least)).tolist():
         higher = np.flatnonzero(slopes > slopes[at])
         left = higher[higher < at].max(initial=-1)
         right = higher[higher > at].min(initial=len(slopes))
-        # a peak is as prominent as it stands above the higher one of the valleys to both sides
-        # that are between it and higher ones; the end of the strip is no valley
+        # prominence: height above the higher one of the valleys between the peak and higher peaks
+        # on both sides; the end of the strip is no valley
         valleys = [slopes[left + 1 : at + 1].min()] if left >= 0 else []
         valleys += [slopes[at:right].min()] if right < len(slopes) else []
         if not valleys or slopes[at] - max(valleys) >= least / 2:
@@ -331,7 +330,7 @@ def _peaks(slopes: Array, least: float) -> list[int]:
 
 
 def _peak(slopes: Array, at: int) -> float:
-    """Return the top of a parabola through a peak and its neighbours."""
+    """Return the place of the maximum of a parabola through a peak and its neighbours."""
     if not 0 < at < len(slopes) - 1:
         return float(at)
     before, top, after = slopes[at - 1 : at + 2]
@@ -342,20 +341,20 @@ def _peak(slopes: Array, at: int) -> float:
 class _EdgeGroup(NamedTuple):
     """Edges of one strip that are fitted together."""
 
-    owner: int  # the strip
+    owner: int  # index of the strip
     places: tuple[float, ...]
-    low: float  # the pixels from here on, along the strip
-    high: float  # up to here
+    low: float  # first place of the fitted pixels along the strip
+    high: float  # last place
 
 
 class _FittedStep(NamedTuple):
-    """A fitted step, before anything is asked about it."""
+    """A fitted step that was not judged yet."""
 
-    owner: int  # the strip
+    owner: int  # index of the strip
     edge: Edge
-    beside: float  # pixels of the strip that are visible beside it at the shorter side
-    misfit: float  # rms of the residuals, grey levels
-    cut_off: tuple[float, float]  # part of the pixels that is black, and white, to the limit
+    beside: float  # visible length of the strip on the shorter side, pixels
+    misfit: float  # RMS residual, grey levels
+    cut_off: tuple[float, float]  # shares of pixels saturated at black and at white
     settled: bool
 
 
@@ -383,23 +382,23 @@ def _steps(
     *,
     tilted: bool,
 ) -> list[_FittedStep]:
-    """Return the steps: fitted once to find the blur, and once to the pixels that it asks for."""
+    """Return steps fitted in two passes: the first finds the blur, which sets the reach."""
     number, half = len(candidates), strips.length / 2
-    near, reach = np.full(number, NEAR_PX), np.full(number, FIRST_REACH_PX)
+    near, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
     blurs = np.ones(number)
     groups = _groups(candidates, half, near, reach)
     for one in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
         if one.settled:
             seen = _seen_blur(min(one.edge.blur, settings.most_blur))
-            near[one.owner] = max(near[one.owner], BLURS_APART * seen)
-            reach[one.owner] = BLURS_REACH * seen + REACH_PX
+            near[one.owner] = max(near[one.owner], MAX_GROUP_GAP_BLURS * seen)
+            reach[one.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
             blurs[one.owner] = one.edge.blur
     groups = _groups(candidates, half, near, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
 
 def _seen_blur(blur: float) -> float:
-    """Return the standard deviation of an edge's slope: the lens' blur, and the pixels' area."""
+    """Return the standard deviation of an edge's slope from the lens' blur and the pixels' area."""
     return math.sqrt(blur * blur + PIXEL_VARIANCE)
 
 
@@ -413,14 +412,14 @@ def _fit_groups(
     tilted: bool,
     blurs: Array | None = None,
 ) -> list[_FittedStep]:
-    """Return the fitted steps of all groups; ``blurs`` (N,) of the strips, or None: not known."""
+    """Return the fitted steps of all groups; ``blurs`` (N,) of the strips; None: unknown."""
     found = []
     for count in sorted({len(one.places) for one in groups}):
         some = [one for one in groups if len(one.places) == count]
         owners = np.array([one.owner for one in some])
         low, high = (np.array([one[end] for one in some]) for end in (2, 3))
         pixels = cut(image, strips.some(owners), low, high)
-        if count > MAX_TOGETHER:
+        if count > MAX_GROUP_EDGES:
             continue
         places = np.array([one.places for one in some])
         known = None if blurs is None else blurs[owners]
@@ -476,33 +475,33 @@ def _steps_of(
 
 
 def _part(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
-    """Return the part (N,) of each strip's pixels that a mask (N, P) has."""
+    """Return the share (N,) of each strip's pixels in a mask (N, P)."""
     part: Array = (mask * pixels.weights).sum(axis=1) / np.maximum(pixels.counts, 1.0)
     return part
 
 
 def _cut_off(pixels: StripPixels, settings: EdgeSettings) -> Array:
-    """Return the parts (N, 2) of the pixels that are black, and white, to the limit."""
+    """Return the shares (N, 2) of the pixels saturated at black and at white."""
     black, white = pixels.levels <= settings.black, pixels.levels >= settings.white
     return np.column_stack([_part(black, pixels), _part(white, pixels)])
 
 
 def _plateaus(pixels: StripPixels, fits: StepFits) -> Array:
-    """Return the part (N,) of the pixels at the largest level, where that cuts others off; else 0.
+    """Return the share (N,) of the pixels at the largest level if it is a saturation level, else 0.
 
-    White may be less than the pixels' type can say. There is no such test of black: a camera's
-    dark pixels may well be equal, as there is no light whose noise they could have.
+    White may be below the largest value of the pixels' type. Black is not tested in this way: dark
+    pixels may be equal without saturation, since they have no photon noise.
     """
     levels = np.where(pixels.weights > 0, pixels.levels, -np.inf)
     parts = _part(levels == levels.max(axis=1, keepdims=True), pixels)
-    for i in np.flatnonzero(parts > MAX_CUT_OFF).tolist():
+    for i in np.flatnonzero(parts > MAX_SATURATED_SHARE).tolist():
         if not _is_plateau(pixels.some(np.array([i])), fits, i):
             parts[i] = 0.0
-    return np.where(parts > MAX_CUT_OFF, parts, 0.0)
+    return np.where(parts > MAX_SATURATED_SHARE, parts, 0.0)
 
 
 def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
-    """Return True if noise as that of the darkest level does not explain how the brightest ends."""
+    """Return True if the dark side's noise does not explain so many pixels at the largest level."""
     there = pixels.weights[0] > 0
     levels, beside = pixels.levels[0][there], pixels.beside[0][there]
     along = pixels.along[0][there] - float(fits.tilts[strip]) * beside
@@ -513,62 +512,62 @@ def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
     flat = np.abs(along[:, None] - places).min(axis=1) > apart
     level = np.searchsorted(places, along)
     dark, bright = (flat & (level == one) for one in (heights.argmin(), heights.argmax()))
-    noise = NOISE_KEPT * _noise_in_steps(levels[dark], along[dark], beside[dark])
+    noise = MIN_BRIGHT_NOISE_SHARE * _noise_in_steps(levels[dark], along[dark], beside[dark])
     values, counts = np.unique(levels[bright], return_counts=True)
-    if noise < NOISE_KEPT * LEAST_NOISE or not len(values):
+    if noise < MIN_BRIGHT_NOISE_SHARE * MIN_UNSATURATED_NOISE or not len(values):
         return False
     most = int(counts[-1])
-    if values[-1] < levels.max() or most < counts.max():  # it would be the commonest, too
+    if values[-1] < levels.max() or most < counts.max():  # saturation has most pixels
         return False
-    # Were the level's noise normal, its mean would be where the part of the pixels from the largest
-    # value on says, or in the middle of that value if these are nearly all.
+    # With normal noise, the share of pixels at the largest value gives the mean of the level, which
+    # is the middle of this value if the share is nearly 1.
     special = load("scipy.special")
     part = min(most / len(levels[bright]), float(special.ndtr(0.5 / noise)))
     above = float(special.ndtr(special.ndtri(part) - 1 / noise)) / part
-    return most * math.log1p(-above) < math.log(CHANCE)
+    return most * math.log1p(-above) < math.log(MAX_PLATEAU_CHANCE)
 
 
 def _noise_in_steps(levels: Array, along: Array, beside: Array) -> float:
-    """Return the standard deviation of pixels about a plane, without that of rounding, in steps.
+    """Return the standard deviation of pixels about a plane, without rounding, in steps.
 
-    A step is the least difference of two levels: those of 12 bits in 16 are 16 apart.
+    A step is the least difference of two levels: 16 for levels of 12 bits in 16.
     """
     values = np.unique(levels)
     if len(values) < 2 or len(levels) < 8:
         return 0.0
     plane = np.column_stack([np.ones(len(levels)), along, beside])
     off = levels - plane @ np.linalg.lstsq(plane, levels, rcond=None)[0]
-    twice = np.diff(off, 2)  # of neighbours mostly: what JPEG leaves is no noise from each to each
+    twice = np.diff(off, 2)  # differences of neighbours, since JPEG's errors are correlated
     variance = min(float(off @ off) / (len(levels) - 3), float(twice @ twice) / (6 * len(twice)))
     return math.sqrt(max(variance / float(np.diff(values).min()) ** 2 - ROUNDING**2, 0.0))
 
 
 def _misfit(edge: Edge, noise: float) -> float:
-    """Return the residuals beyond the noise in pixels, where the edge is steepest."""
+    """Return the residuals beyond the noise, converted to pixels by the edge's largest slope."""
     beyond = edge.noise**2 - noise**2
     steepest = abs(edge.height) / (math.sqrt(2 * math.pi) * _seen_blur(edge.blur))
-    if edge.noise < MISFIT_SEEN * noise or steepest == 0.0:
+    if edge.noise < MIN_MISFIT_NOISES * noise or steepest == 0.0:
         return 0.0
     return math.sqrt(beyond) / steepest
 
 
 def _trouble(step: _FittedStep, settings: EdgeSettings, noise: float) -> NotMeasuredError | None:
-    """Return the reason why a step is no edge whose place can be told, or None."""
+    """Return the reason why a step is no usable edge, or None."""
     edge, (black, bright) = step.edge, step.cut_off
     height = abs(edge.height)
     if step.settled and edge.blur > settings.most_blur:
         text = f"the edge is blurred by {edge.blur:.1f} px, {settings.most_blur:g} px are allowed"
         return NotMeasuredError(NoValueReason.BLURRED, text)
-    if step.beside < BLURS_BESIDE * _seen_blur(min(edge.blur, settings.most_blur)) + 0.5:
+    if step.beside < MIN_SIDE_BLURS * _seen_blur(min(edge.blur, settings.most_blur)) + 0.5:
         text = f"the edge is {max(step.beside, 0.0):.1f} px from the end of its region"
         return NotMeasuredError(NoValueReason.AT_BORDER, text)
     if not step.settled:
         return NotMeasuredError(NoValueReason.NO_STEP, "the grey levels are none of a blurred step")
-    if max(black, bright) > MAX_CUT_OFF and not settings.cut_off:
+    if max(black, bright) > MAX_SATURATED_SHARE and not settings.cut_off:
         end, part = ("black", black) if black > bright else ("white", bright)
         text = f"{100 * part:.0f} % of the pixels beside the edge are {end} to the limit"
         return NotMeasuredError(NoValueReason.SATURATED, text)
-    if step.misfit > MISFIT_NOISES * noise and step.misfit > MAX_MISFIT * height:
+    if step.misfit > ALLOWED_MISFIT_NOISES * noise and step.misfit > MAX_RELATIVE_MISFIT * height:
         text = f"the grey levels are {step.misfit:.1f} from a step of {height:.0f}"
         return NotMeasuredError(NoValueReason.NO_STEP, text)
     if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _seen_blur(edge.blur)):
@@ -578,13 +577,13 @@ def _trouble(step: _FittedStep, settings: EdgeSettings, noise: float) -> NotMeas
 
 
 def wanted(edge: Edge, settings: EdgeSettings) -> bool:
-    """Return True if an edge has the contrast and the polarity that are looked for."""
+    """Return True if an edge has the wanted contrast and polarity."""
     rises = settings.polarity == "any" or (edge.height > 0) == (settings.polarity == "rising")
     return rises and abs(edge.height) >= settings.contrast
 
 
 def choose(found: StripEdges, which: Choice) -> Edge:
-    """Return the edge that counts; NotMeasuredError: there is none, or no telling which."""
+    """Return the chosen edge; raise NotMeasuredError if there is none, or no clear choice."""
     if found.trouble is not None:
         raise found.trouble
     if found.too_many is not None and which != "strongest":
@@ -600,7 +599,7 @@ def choose(found: StripEdges, which: Choice) -> Edge:
 
 
 def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
-    """Return the two edges of a bar; NotMeasuredError: there is none, or no telling which."""
+    """Return the two edges of a bar; raise NotMeasuredError as :func:`choose`."""
     if found.trouble is not None:
         raise found.trouble
     if found.too_many is not None:
@@ -631,7 +630,7 @@ def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
 
 
 def sound(found: JudgedEdge) -> Edge:
-    """Return an edge whose place can be told; NotMeasuredError: the reason why not."""
+    """Return the edge if its place is usable; else raise NotMeasuredError."""
     if found.trouble is not None:
         raise found.trouble
     return found.edge

@@ -1,7 +1,6 @@
 """Find edges, lines and circles in a picture's regions.
 
-Regions are in pixels. What comes back are edges in pixels, which a plane turns into points, lines
-and circles.
+Regions and edges are in pixels; a plane turns edges into points, lines and circles.
 """
 
 from __future__ import annotations
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.inspection._measure.edges import (
-    BLURS_REACH,
+    FIT_REACH_BLURS,
+    FIT_REACH_PX,
     PIXEL_VARIANCE,
-    REACH_PX,
     Edge,
     choose,
     choose_pair,
@@ -33,40 +32,40 @@ if TYPE_CHECKING:
     Image = NDArray[np.generic]
 
 MIN_TILT_WIDTH_PX = 5.0
-"""Pixels that a strip is wide at least for the tilt of its edge to be told."""
+"""Least width of a strip, pixels, to fit the tilt of its edge."""
 
-MIN_FOUND = 0.5
-"""Part of the strips of a line or a circle that must have an edge."""
+MIN_FOUND_SHARE = 0.5
+"""Least share of the strips of a line or a circle that must have an edge."""
 
-NOISE_APART = 2.0
-"""The noise of an edge in parts of the noise of most edges, from which on it counts as its own."""
+OWN_NOISE_FACTOR = 2.0
+"""Ratio of an edge's noise to the median noise, above which its own noise is used."""
 
 
 class FoundPoint(NamedTuple):
     """An edge where it crosses the middle of its strip."""
 
-    strip: Strips  # one
+    strip: Strips  # a single strip
     edge: Edge
 
     @property
     def pixel(self) -> Array:
-        """(2,), the place in the picture."""
+        """Place in the picture, (2,)."""
         at: Array = self.strip.points(np.array([self.edge.place]), np.zeros(1))[0]
         return at
 
 
 class FoundShape(NamedTuple):
-    """The edges of a line or a circle, in pixels."""
+    """Edges of a line or a circle, in pixels."""
 
     edges: Edges
     troubles: tuple[NotMeasuredError, ...]  # errors of the strips without an edge
-    blur: float  # standard deviation of most edges' slopes, pixels
-    misfit: float  # pixels by which all edges may be wrong on the same side
-    kept: NDArray[np.bool_] | None = None  # (N,), the edges that count; None: not known yet
+    blur: float  # median standard deviation of the edges' slopes, pixels
+    misfit: float  # possible common error of all edges, pixels
+    kept: NDArray[np.bool_] | None = None  # (N,), mask of inliers; None: not known yet
 
 
 def strip_between(start: Array, end: Array, width: float) -> Strips:
-    """Return the strip from a point to another one."""
+    """Return the strip between two points."""
     ahead = end - start
     length = float(np.hypot(*ahead))
     return Strips((start + end)[None] / 2, ahead[None] / length, length, width)
@@ -99,16 +98,16 @@ def find_line(
     settings: EdgeSettings,
     which: Choice,
 ) -> FoundShape:
-    """Return the edges of a line that runs near the one from ``start`` to ``end``.
+    """Return the edges of a line near the line from ``start`` to ``end``.
 
-    Strips cross it, ``search`` pixels long, from its left to its right as one goes along it.
+    Strips of ``search`` pixels cross the line from its left to its right side.
     """
     parts = (np.arange(count) + 0.5) / count
     strips = _across(start, end - start, parts, search, width)
     first = _collected(image, strips, settings, which)
     ahead = end - start
     line = fit_line(first.edges, ahead).shape
-    # the strips again, at right angles to the line that they showed, so that edges are not tilted
+    # strips again, at right angles to the found line, so that edges are not tilted
     begin, stop = (
         line.at + ((one - line.at) @ line.direction) * line.direction for one in (start, end)
     )
@@ -134,16 +133,16 @@ def find_circle(
     settings: EdgeSettings,
     which: Choice,
 ) -> FoundShape:
-    """Return the edges of a circle that lies near the one given.
+    """Return the edges of a circle near the given circle.
 
-    Strips cross it from inside to outside, ``search`` pixels long; ``arc``: angles between which
-    they stand, radians from u to v.
+    Strips of ``search`` pixels cross the circle from inside to outside; ``arc``: angles that limit
+    the strips, radians from u to v.
     """
     angles = arc[0] + (np.arange(count) + 0.5) / count * (arc[1] - arc[0])
     strips = Sectors(centre, radius, angles, search, width)
     first = _collected(image, strips, settings, which)
     circle = fit_circle(first.edges).shape
-    off = strips.middles - circle.centre  # the same places as before, seen from the better centre
+    off = strips.middles - circle.centre  # the same places, relative to the better centre
     angles = np.arctan2(off[:, 1], off[:, 0])
     width *= min(circle.radius / radius, 1.0)
     strips = Sectors(circle.centre, circle.radius, angles, min(search, _short(first)), width)
@@ -153,7 +152,7 @@ def find_circle(
 def _collected(
     image: Image, strips: Strips | Sectors, settings: EdgeSettings, which: Choice
 ) -> FoundShape:
-    """Return an edge of each strip that has one; NotMeasuredError: too few have."""
+    """Return the chosen edge of each strip; raise NotMeasuredError if too few strips have one."""
     owners, edges, troubles = [], [], []
     for owner, found in enumerate(find_edges(image, strips, settings)):
         try:
@@ -163,16 +162,16 @@ def _collected(
         else:
             owners.append(owner)
     number = len(edges) + len(troubles)
-    if len(edges) < MIN_FOUND * number:
+    if len(edges) < MIN_FOUND_SHARE * number:
         raise _few(troubles, number)
     places = np.array([one.place for one in edges])
     noises = np.array([one.noise for one in edges])
     noise = float(np.median(noises))
-    noises = np.where(noises > NOISE_APART * noise, noises, noise)
+    noises = np.where(noises > OWN_NOISE_FACTOR * noise, noises, noise)
     blur = math.sqrt(float(np.median([one.blur for one in edges])) ** 2 + PIXEL_VARIANCE)
     some, middle = strips.some(np.array(owners)), np.zeros(len(owners))
     if isinstance(strips, Sectors):
-        # a blur draws the rim of a disc inwards, as heat flows: by s^2 / (2 r)
+        # blur moves the rim of a disc inwards by s^2 / (2 r)
         places = places + blur**2 / (2 * (strips.radius + places))
     unit = np.array([one.unit_sigma for one in edges])
     seen = Edges(some.points(places, middle), np.array(some.ahead(middle)), unit * noises)
@@ -181,7 +180,7 @@ def _collected(
 
 
 def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
-    """Return the error of a line or a circle most of whose strips have no edge."""
+    """Return the error for a line or a circle with too few strips with an edge."""
     kinds = [one.why for one in troubles]
     most = max(kinds, key=kinds.count)
     example = next(one for one in troubles if one.why is most)
@@ -190,5 +189,5 @@ def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
 
 
 def _short(found: FoundShape) -> float:
-    """Return the length of a strip that shows one edge and both of its sides, pixels."""
-    return 2 * (BLURS_REACH * found.blur + REACH_PX)
+    """Return the length of a strip that contains an edge and both sides, pixels."""
+    return 2 * (FIT_REACH_BLURS * found.blur + FIT_REACH_PX)

@@ -1,12 +1,11 @@
-"""Fit lines and circles to edges, some of which may be wrong.
+"""Fit lines and circles to edges with outliers.
 
-An edge is known across only: how far it lies from a line or a circle is measured along its own
-direction, in its own standard deviations. The start is the line or circle through two or three
-edges from which the median edge is least far (least median of squares), so that up to half of the
-edges may lie anywhere. Edges that lie too far from it are left out; a least-squares fit to the
-others, weighted by their sigmas, is the most likely answer.
+An edge has a position only along its normal, so residuals are measured along the normal, in the
+edge's standard deviations. The start is the line or circle through two or three edges with the
+least median residual (least median of squares), so up to half of the edges may be outliers. The
+result is a least-squares fit to the inliers, weighted by their sigmas.
 
-Units are those of the points: pixels or millimetres.
+Units are the units of the points: pixels or millimetres.
 """
 
 from __future__ import annotations
@@ -29,19 +28,19 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MAX_STARTS = 600
-"""Largest number of lines or circles through two or three edges that are tried."""
+"""Largest number of samples of two or three edges that are tried."""
 
-GATE = 3.5
-"""Standard deviations to a line or a circle from which on an edge is left out."""
+OUTLIER_SIGMAS = 3.5
+"""Residual, in standard deviations, from which an edge is an outlier."""
 
 MAX_ROUNDS = 10
-"""Times that edges are left out and a fit is made again, at most; two or three are usual."""
+"""Largest number of alternations between fitting and choosing inliers; two or three are usual."""
 
 MAX_STEPS = 30
 """Largest number of steps of a fit; three to five are usual."""
 
-MOST_LEFT_OUT = 0.5
-"""Part of the edges that may be left out."""
+MAX_OUTLIER_SHARE = 0.5
+"""Largest share of outliers."""
 
 
 class Edges(NamedTuple):
@@ -52,26 +51,26 @@ class Edges(NamedTuple):
     sigmas: Array  # (N,), along the normals
 
     def some(self, which: Mask) -> Edges:
-        """Return some of them."""
+        """Return a selection of the edges."""
         return Edges(*(one[which] for one in self))
 
 
 class Line(NamedTuple):
     """A straight line."""
 
-    at: Array  # (2,), the middle of its edges
+    at: Array  # (2,), middle of the edges
     direction: Array  # (2,), of length 1
-    # (2, 2), of the offset along the normal at that middle, and of the angle in radians
+    # (2, 2), of the offset along the normal at the middle, and of the angle in radians
     covariance: Array
-    reach: float  # distance from the middle to the edges at both ends
+    reach: float  # distance from the middle to the outermost edges
 
     @property
     def normal(self) -> Array:
-        """(2,), the direction turned by a right angle from the first axis to the second one."""
+        """Unit normal (2,): the direction turned by 90 degrees, from first to second axis."""
         return np.array([-self.direction[1], self.direction[0]])
 
     def offset_variance(self, point: Array) -> float:
-        """Return the variance of the line's place along its normal, beside a point."""
+        """Return the variance of the line's offset at the foot of a point."""
         lever = np.array([1.0, float((point - self.at) @ self.direction)])
         return float(lever @ self.covariance @ lever)
 
@@ -88,18 +87,18 @@ ShapeT = TypeVar("ShapeT", Line, Circle)
 
 
 class ShapeFit(NamedTuple, Generic[ShapeT]):
-    """A line or a circle, and the edges that it is of."""
+    """A line or a circle fitted to edges."""
 
     shape: ShapeT
-    kept: Mask  # (N,), the edges that agree with it
-    residuals: Array  # (N,), distances of the edges from it along their normals
-    excess: float  # ratio of the edges' spread to that by their sigmas, at least 1
+    kept: Mask  # (N,), mask of inliers
+    residuals: Array  # (N,), distances along the edges' normals
+    excess: float  # ratio of the residuals' spread to the edges' sigmas, at least 1
 
 
 def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[Line]:
     """Return the line through edges, with its direction near ``ahead`` (2,).
 
-    ``kept`` (N,): the edges to use; None: those that agree.
+    ``kept`` (N,): the edges to use; None: the inliers.
 
     Raises:
         NotMeasuredError: FEW_EDGES; NO_AGREEMENT.
@@ -108,7 +107,7 @@ def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[L
 
 
 def fit_circle(edges: Edges, kept: Mask | None = None) -> ShapeFit[Circle]:
-    """Return the circle through edges; ``kept`` and errors are as of :func:`fit_line`."""
+    """Return the circle through edges; ``kept`` and errors as in :func:`fit_line`."""
     return _robust(edges, kept, _circles_through, _circle, 3)
 
 
@@ -119,7 +118,7 @@ def _robust(
     fit: Callable[[Edges, Array], tuple[ShapeT, Array]],
     least: int,
 ) -> ShapeFit[ShapeT]:
-    """Return the fit; ``through`` makes values (H, 3) of points (H, least, 2)."""
+    """Return a robust fit; ``through`` computes H shapes (H, 3) from points (H, least, 2)."""
     number = len(edges.points)
     if number <= least:
         text = f"{number} edges, more than {least} are needed"
@@ -127,22 +126,24 @@ def _robust(
     if kept is not None:
         return _fitted(edges, kept, fit, _start(edges.some(kept), through, least), least)
     start = _start(edges, through, least)
-    everybody = np.ones(number, dtype=np.bool_)
-    found = _fitted(edges, everybody, fit, start, least)
+    all_edges = np.ones(number, dtype=np.bool_)
+    found = _fitted(edges, all_edges, fit, start, least)
     far = np.abs(found.residuals) / edges.sigmas
-    if found.excess == 1.0 and far.max() <= GATE:
+    if found.excess == 1.0 and far.max() <= OUTLIER_SIGMAS:
         return found
-    # edges that are far from two or three others may still agree with all
+    # outliers of the start may be inliers of the fit
     far = np.abs(_distances(start[None], edges)[0]) / edges.sigmas
-    agree = far <= GATE * max(1.4826 * (1 + 5 / (number - least)) * float(np.median(far)), 1.0)
+    agree = far <= OUTLIER_SIGMAS * max(
+        1.4826 * (1 + 5 / (number - least)) * float(np.median(far)), 1.0
+    )
     seen = set()
     for _ in range(MAX_ROUNDS):
-        if np.count_nonzero(agree) < max(least, math.ceil((1 - MOST_LEFT_OUT) * number)):
+        if np.count_nonzero(agree) < max(least, math.ceil((1 - MAX_OUTLIER_SHARE) * number)):
             text = f"{np.count_nonzero(agree)} of {number} edges agree, half of them are needed"
             raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
         found = _fitted(edges, agree, fit, start, least)
         far = np.abs(found.residuals) / edges.sigmas
-        again = far <= GATE * _spread(far[agree])
+        again = far <= OUTLIER_SIGMAS * _spread(far[agree])
         if (again == agree).all() or again.tobytes() in seen:
             break
         seen.add(agree.tobytes())
@@ -151,9 +152,9 @@ def _robust(
 
 
 def _spread(far: Array) -> float:
-    """Return by how much edges spread more than their sigmas say, 1 where chance may do it.
+    """Return the ratio of the edges' spread to their sigmas, 1 if chance may explain it.
 
-    ``far`` (N,): magnitudes of their distances, in sigmas. An edge of a real part is not quite
+    ``far`` (N,): magnitudes of the residuals, in sigmas. Edges of real parts are not exactly
     straight or round.
     """
     spread = 1.4826 * float(np.median(far))
@@ -172,7 +173,7 @@ def _fitted(
     residuals = _distances(values[None], edges)[0]
     freedom = int(np.count_nonzero(kept)) - least
     squares = float(((residuals[kept] / some.sigmas) ** 2).sum())
-    # chance alone gives more than three sigmas of a sum of squares once in several hundred fits
+    # by chance, a sum of squares exceeds three sigmas once in several hundred fits
     much = freedom > 0 and squares > freedom + 3 * math.sqrt(2 * freedom)
     excess = math.sqrt(squares / freedom) if much else 1.0
     shape = shape._replace(covariance=shape.covariance * excess**2)
@@ -180,12 +181,12 @@ def _fitted(
 
 
 def _start(edges: Edges, through: Callable[[Array], Array], least: int) -> Array:
-    """Return the values (3,) from which the median edge is least far, in sigmas."""
+    """Return the shape (3,) with the least median residual, in sigmas."""
     number = len(edges.points)
     if math.comb(number, least) <= MAX_STARTS:
         drawn = np.array(list(itertools.combinations(range(number), least)))
     else:
-        # the same each time, so that a picture has one answer; each edge of another part
+        # a fixed seed, so that results are repeatable; each edge comes from another section
         random = np.random.default_rng(number)
         drawn = np.argsort(random.random((MAX_STARTS, number)), axis=1)[:, :least]
     with np.errstate(all="ignore"):
@@ -201,10 +202,10 @@ def _start(edges: Edges, through: Callable[[Array], Array], least: int) -> Array
 
 
 def _distances(values: Array, edges: Edges) -> Array:
-    """Return the distances (H, N) of edges along their normals.
+    """Return the distances (H, N) of edges from H shapes along the edges' normals.
 
-    ``values`` (H, 3) of lines are a unit normal's angle, the offset along it and NaN; of circles
-    the centre and the radius.
+    ``values`` (H, 3): for lines the angle of the unit normal, the offset along it and NaN; for
+    circles the centre and the radius.
     """
     points, normals = edges.points, edges.normals
     first, second, third = values.T[:, :, None]
@@ -228,7 +229,7 @@ def _lines_through(points: Array) -> Array:
 
 
 def _circles_through(points: Array) -> Array:
-    # |p - c|^2 is the same for three points: (p_k - p_0) . c' = |p_k - p_0|^2 / 2, c' = c - p_0
+    # |p - c|^2 is equal for three points: (p_k - p_0) . c' = |p_k - p_0|^2 / 2, c' = c - p_0
     first = points[:, 0]
     (a, b), (c, d) = (points[:, 1] - first).T, (points[:, 2] - first).T
     doubled = 2 * (a * d - b * c)
@@ -260,7 +261,7 @@ def _line(edges: Edges, start: Array, ahead: Array) -> tuple[Line, Array]:
     normal = np.array([math.cos(angle), math.sin(angle)])
     direction = np.array([normal[1], -normal[0]])
     covariance: Array = np.linalg.inv(hessian)
-    if direction @ ahead < 0:  # offsets count along the direction's normal, which turns with it
+    if direction @ ahead < 0:  # offsets are along the normal, which flips with the direction
         direction, covariance = -direction, covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
     along = off @ direction
     at = middle + offset * normal

@@ -1,12 +1,12 @@
 """Define the planes in which lengths are measured: the picture, in pixels, or a calibrated plane.
 
-Edges are mapped to the plane, and lengths are measured there, in millimetres for a calibrated one.
-So neither a camera's tilt nor, with a lens in the calibration, its distortion bends a line or
-shortens a length.
+Edges are mapped to the plane, and lengths are measured in it, in millimetres for a calibrated
+plane. So the camera's tilt and, with a lens in the calibration, its distortion do not change lines
+or lengths.
 
-A calibration has errors of its own, the same ones for all edges of a picture. They consist of
-independent parts, each of one standard deviation; the effect of a part on a result is the
-difference between maps with and without it.
+A calibration has errors that are common to all edges of a picture. They are independent components,
+each of one standard deviation; the effect of a component on a result is the difference between maps
+with and without it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 STEP_PX = 0.5
-"""A map's derivative is taken between points this many pixels to each side."""
+"""Step of a map's numerical derivative to each side, pixels."""
 
 MM = 1000.0
 """Millimetres per metre."""
@@ -39,13 +39,13 @@ class Plane(NamedTuple):
     unit: str  # "px" or "mm"
     # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
-    # maps that are off by one standard deviation each, in independent ways
+    # maps with one component of the calibration's error each
     variants: tuple[Callable[[Array], Array], ...] = ()
-    # unknown errors of the map, for people
+    # description of errors that are unknown
     remark: str = ""
 
     def points(self, pixels: Array) -> Array:
-        """Map pixels (N, 2) to the plane; raise NotMeasuredError if it does not reach there."""
+        """Map pixels (N, 2) to the plane; raise NotMeasuredError outside of the calibration."""
         try:
             return self.map(pixels)
         except CalibrationError as exc:
@@ -62,8 +62,8 @@ class Plane(NamedTuple):
     def edges(self, edges: Edges) -> Edges:
         """Map edges of the picture to the plane."""
         slopes = self.slopes(edges.points)
-        # an edge's line has the direction t; what moves it by s along its normal n moves the
-        # mapped line by s |det J| / |J t| across
+        # an edge has the direction t; a shift by s along its normal n moves the mapped edge by s
+        # |det J| / |J t| along the mapped normal
         turned = edges.normals[:, ::-1] * [-1.0, 1.0]
         lines = np.einsum("nij,nj->ni", slopes, turned)
         lengths = np.linalg.norm(lines, axis=1)
@@ -75,19 +75,19 @@ class Plane(NamedTuple):
 
 
 PIXELS = Plane("px", lambda points: points)
-"""The picture itself."""
+"""The plane of the picture's pixels."""
 
 
 def picture_of(calibration: Any) -> Plane:
-    """Return the picture as the plane, without the distortion of a lens that is known."""
+    """Return the picture as the plane, without distortion if the lens is known."""
     camera = getattr(calibration, "camera", None)
     return PIXELS if camera is None else Plane("px", camera.undistort)
 
 
 def robot_plane_of(calibration: Any) -> Plane:
-    """Return the plane of a calibration in the robot's x and y, millimetres, as :func:`plane_of`.
+    """Return the plane of a calibration in the robot's x and y, in millimetres.
 
-    The plane must be nearly level: then the robot's z follows from its x and y.
+    The plane must be nearly level, so that the robot's z follows from x and y.
     """
     return plane_of(calibration, robot=True)
 
@@ -95,13 +95,13 @@ def robot_plane_of(calibration: Any) -> Plane:
 def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
     """Return the plane of a calibration, in millimetres.
 
-    ``robot``: whether its axes are the robot's x and y; else they lie in it.
+    ``robot``: whether the axes are the robot's x and y; else they lie in the plane.
 
     ``calibration``: a :class:`~smartcam.calibration.PlaneCalibration` of pixels or a
-    :class:`~smartcam.calibration.SheetCalibration`; a lens alone has no length.
+    :class:`~smartcam.calibration.SheetCalibration`; a lens alone has no scale.
 
     Raises:
-        ConfigurationError: another calibration.
+        ConfigurationError: another kind of calibration.
     """
     kind = getattr(calibration, "kind", None)
     if kind == "plane":
@@ -145,7 +145,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
 
 
 def _remark(calibration: Any, plane: Any) -> str:
-    """Return the errors that sigma does not include; "" if all are known."""
+    """Return a text about errors that sigma does not include; "" if it includes all."""
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")

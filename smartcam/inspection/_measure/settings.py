@@ -1,4 +1,4 @@
-"""Settings of a measurement in a program, as pydantic models."""
+"""Pydantic models of a measurement's settings."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from smartcam.inspection._measure.tolerances import Tolerance
 from smartcam.inspection._tool import ToolSettings
 
 MAX_COORDINATE_PX: Final = 100_000.0
-"""Pixels that a coordinate may have; no picture is larger."""
+"""Largest magnitude of a coordinate, pixels; no picture is larger."""
 
 MAX_LENGTH_PX: Final = 4_000.0
-"""Pixels that a strip may be long."""
+"""Largest length of a strip, pixels."""
 
 MAX_STRIPS: Final = 500
-"""StripSearch of a line or a circle."""
+"""Largest number of strips of a line or a circle."""
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
 Place = tuple[Coordinate, Coordinate]
@@ -32,11 +32,11 @@ def _apart(given: tuple[Place, Place]) -> tuple[Place, Place]:
 
 
 Way = Annotated[tuple[Place, Place], AfterValidator(_apart)]
-"""A point, and the point that leads to."""
+"""Start and end point of a path."""
 
 
 class EdgeSearch(BaseModel):
-    """Settings of every search for edges."""
+    """Common settings of searches for edges."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -44,31 +44,30 @@ class EdgeSearch(BaseModel):
 
     polarity: Polarity = Field(
         "any",
-        description="rising: from dark to light along the way; falling: from light to dark; any",
+        description="rising: from dark to light along the strip; falling: from light to dark; any",
     )
     contrast: float = Field(
-        10.0, gt=0, le=255, description="grey levels of 255 from one side to the other, at least"
+        10.0, gt=0, le=255, description="least height of an edge, in grey levels of 255"
     )
     smoothing: float = Field(
         1.2,
         ge=0.5,
         le=10,
-        description="pixels over which the search for edges smooths; places do not depend on it",
+        description="smoothing of the search for edges, pixels; places do not depend on it",
     )
     blur: float = Field(
-        5.0, gt=0, le=10, description="pixels of blur that an edge may have; more is an error"
+        5.0, gt=0, le=10, description="largest blur of an edge, pixels; more is an error"
     )
     cut_off: bool = Field(
         False,
-        description="measure edges beside black or white that is cut off, too: they may be wrong "
-        "by more than their sigma says",
+        description="measure edges beside saturated levels, too, whose error may exceed sigma",
     )
 
 
 class Across(EdgeSearch):
-    """One edge, across which a strip leads."""
+    """A search for one edge that crosses a strip."""
 
-    across: Way = Field(description="where the strip begins and ends, [[x, y], [x, y]]")
+    across: Way = Field(description="start and end of the strip, [[x, y], [x, y]]")
     strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
     which: Choice = Field(
         "single",
@@ -78,9 +77,9 @@ class Across(EdgeSearch):
 
 
 class AcrossPair(EdgeSearch):
-    """The two edges of a bar, across which a strip leads."""
+    """A search for the two edges of a bar that crosses a strip."""
 
-    across: Way = Field(description="where the strip begins and ends, [[x, y], [x, y]]")
+    across: Way = Field(description="start and end of the strip, [[x, y], [x, y]]")
     strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
     which: PairChoice = Field(
         "single",
@@ -90,34 +89,34 @@ class AcrossPair(EdgeSearch):
 
 
 class StripSearch(EdgeSearch):
-    """Many edges, along which strips stand."""
+    """A search for many edges, each in a strip."""
 
     search: float = Field(
         20.0, ge=4, le=MAX_LENGTH_PX, description="length of the strips across, pixels"
     )
-    strips: int = Field(24, ge=4, le=MAX_STRIPS, description="how many strips there are")
+    strips: int = Field(24, ge=4, le=MAX_STRIPS, description="number of strips")
     strip: float | None = Field(
         None,
         ge=1,
         le=MAX_WIDTH_PX,
-        description="width of a strip, pixels; default, and at most: as wide as they are apart",
+        description="width of a strip, pixels; default and largest: the distance between strips",
     )
-    which: Choice = Field("single", description="which edge of several in a strip counts")
+    which: Choice = Field("single", description="choice among several edges in a strip")
 
 
 class LineSearch(StripSearch):
-    """A straight line."""
+    """A search for a straight line."""
 
     along: Way = Field(description="two points near the line, [[x, y], [x, y]]")
 
 
 class CircleSearch(StripSearch):
-    """A circle, or an arc of one."""
+    """A search for a circle or an arc."""
 
-    centre: Place = Field(description="its centre, [x, y], roughly")
-    radius: float = Field(ge=2, le=MAX_COORDINATE_PX, description="its radius, pixels, roughly")
+    centre: Place = Field(description="approximate centre, [x, y]")
+    radius: float = Field(ge=2, le=MAX_COORDINATE_PX, description="approximate radius, pixels")
     arc: tuple[float, float] = Field(
-        (0.0, 360.0), description="degrees from x towards y between which it is to be seen"
+        (0.0, 360.0), description="visible angles [from, to], degrees from x towards y"
     )
 
     @model_validator(mode="after")
@@ -134,7 +133,7 @@ class CircleSearch(StripSearch):
 
 
 class FeatureSearch(BaseModel):
-    """One thing whose distance or angle to another one is measured."""
+    """A feature for a distance: an edge, a line or a circle."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -155,7 +154,7 @@ class FeatureSearch(BaseModel):
 
 
 class Between(BaseModel):
-    """Two things whose distance is measured."""
+    """Two features whose distance is measured."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -166,13 +165,13 @@ class Between(BaseModel):
 
 
 class LineFeature(BaseModel):
-    """A line whose angle to another one is measured."""
+    """A line for an angle."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
     )
 
-    line: LineSearch = Field(description="a line; it has the direction of its two points")
+    line: LineSearch = Field(description="a line, with the direction of its two points")
 
 
 class BetweenLines(BaseModel):
@@ -196,11 +195,11 @@ def _tolerance(given: Any) -> Tolerance:
 
 
 KINDS: Final = ("width", "edge", "line", "circle", "distance", "angle")
-"""Kinds of measurement; a tool does one of them."""
+"""Kinds of measurement; a tool has one kind."""
 
 
 class MeasureSettings(ToolSettings):
-    """One thing to measure, and the values that are good."""
+    """A measurement with its tolerance."""
 
     width: AcrossPair | None = Field(None, description="the width of a bar")
     edge: Across | None = Field(None, description="the place of an edge in its strip")
@@ -209,23 +208,23 @@ class MeasureSettings(ToolSettings):
     distance: Between | None = Field(None, description="the distance of two things")
     angle: BetweenLines | None = Field(None, description="the angle between two lines")
     tolerance: Annotated[Tolerance, PlainValidator(_tolerance)] | None = Field(
-        None, description="the values that are good, such as 12.00 +- 0.05 mm; default: any"
+        None, description="good values, such as 12.00 +- 0.05 mm; default: any"
     )
     guard: float = Field(
         2.0,
         ge=0,
         le=10,
-        description="sigmas by which a value has to be inside of its tolerance; 0: none",
+        description="distance of a good value from its limits, in sigmas",
     )
     unit: Literal["mm", "px"] | None = Field(
         None,
         description="mm, by the camera's calibration, or px; default: as the tolerance, else mm "
-        "where there is a calibration of a plane",
+        "if a plane is calibrated",
     )
 
     @property
     def kind(self) -> str:
-        """The name of what is measured, one of :data:`KINDS`."""
+        """Kind of the measurement, one of :data:`KINDS`."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @model_validator(mode="after")

@@ -1,13 +1,13 @@
-"""Fit blurred steps to the pixels of many strips, side by side.
+"""Fit blurred steps to the pixels of many strips at once.
 
-A step from one grey level to another one, seen by a lens that blurs by a Gaussian of width ``s``,
-and by square pixels that take the mean over their own area. Seen from the side at an angle, a pixel
-is a trapezoid: two boxes, as wide as the sine and the cosine of the angle, one over the other. The
-share of a pixel that lies behind a step at a distance d is the Gaussian's integral under that
-trapezoid, which has a closed form: differences of the Gaussian's second integral.
+The model is a step between two grey levels, blurred by the lens as by a Gaussian of width ``s``,
+and averaged over the area of square pixels. Projected along an edge at an angle, a pixel's area is
+a trapezoid: the convolution of two boxes with the widths sine and cosine of the angle. The share of
+a pixel after a step at distance d is the trapezoid convolved with the Gaussian's integral, with a
+closed form: differences of the Gaussian's second integral.
 
-The fit is one of Levenberg and Marquardt. Its covariance is that of the Cramer-Rao bound with the
-noise that the residuals show; no estimate without a bias can be better.
+The fit is by Levenberg and Marquardt. Its covariance is the Cramer-Rao bound with the noise of the
+residuals; no unbiased estimate can be better.
 """
 
 from __future__ import annotations
@@ -28,39 +28,39 @@ if TYPE_CHECKING:
     from smartcam.inspection._measure.strips import StripPixels
 
 MIN_BLUR_PX = 0.05
-"""Pixels of blur that a fit may have at least: no lens is sharper, and 0 would be divided by."""
+"""Least blur of a fit, pixels: no lens is sharper, and 0 would be a divisor."""
 
 MAX_BLUR_PX = 20.0
-"""Pixels of blur that a fit may have at most."""
+"""Largest blur of a fit, pixels."""
 
 MAX_TILT = 0.7
-"""Tangent of the angle to which a step may be turned out of its strip."""
+"""Largest tangent of the angle between a step and the line across its strip."""
 
 MAX_STEPS = 25
 """Largest number of steps of a fit; most fits take four to eight."""
 
-STILL_PX = 1e-4
-"""A fit ends when a step moves places by at most this many pixels."""
+CONVERGED_PX = 1e-4
+"""Largest change of places, pixels, in the last iteration of a fit."""
 
 MIN_SIDE_PX = 1e-3
-"""Pixels that a pixel is wide at least, seen along an edge; 0 would be divided by."""
+"""Least width of a box of a pixel, pixels; 0 would be a divisor."""
 
-STARTS_PX = (0.4, 0.8, 1.6, 3.2, 5.0)
-"""Pixels of blur that are tried before a fit; the best one begins it."""
+START_BLURS_PX = (0.4, 0.8, 1.6, 3.2, 5.0)
+"""Blurs, pixels, that are tried as the start of a fit."""
 
 
 class StepFits(NamedTuple):
-    """K steps in each of N strips.
+    """Fits of K steps in each of N strips.
 
-    The values are the K places, the tangent of the tilt that the steps of a strip share, their
-    blur, K heights, and the level before the first step.
+    The values of a strip are K places, the common tangent of the tilt, the common blur, K heights,
+    and the level before the first step.
     """
 
     values: Array  # (N, 2 K + 3)
     cost: Array  # (N,), sum of the squared residuals
     hessian: Array  # (N, M, M)
-    counts: Array  # (N,), pixels
-    settled: NDArray[np.bool_]  # (N,), whether it came to rest
+    counts: Array  # (N,), number of pixels
+    settled: NDArray[np.bool_]  # (N,), whether the fit converged
 
     @property
     def steps(self) -> int:
@@ -69,35 +69,35 @@ class StepFits(NamedTuple):
 
     @property
     def places(self) -> Array:
-        """(N, K), along the strips, pixels."""
+        """Places along the strips, (N, K), pixels."""
         return self.values[:, : self.steps]
 
     @property
     def tilts(self) -> Array:
-        """(N,), tangents of the angle between an edge and the line across its strip."""
+        """Tangents (N,) of the angle between an edge and the line across its strip."""
         tilts: Array = self.values[:, self.steps]
         return tilts
 
     @property
     def blurs(self) -> Array:
-        """(N,), pixels; the pixels' own area is not in it."""
+        """Blurs of the lens (N,), pixels, without the pixels' area."""
         blurs: Array = self.values[:, self.steps + 1]
         return blurs
 
     @property
     def heights(self) -> Array:
-        """(N, K), grey levels behind each step less those before it."""
+        """Grey levels after minus before each step, (N, K)."""
         return self.values[:, self.steps + 2 : -1]
 
     @property
     def freedom(self) -> Array:
-        """(N,), pixels less values, 1 at least."""
+        """Degrees of freedom (N,), at least 1."""
         freedom: Array = np.maximum(self.counts - self.values.shape[1], 1.0)
         return freedom
 
     @property
     def variance(self) -> Array:
-        """(N,), of a pixel, as the residuals show it."""
+        """Variance of a pixel from the residuals, (N,)."""
         variance: Array = self.cost / self.freedom
         return variance
 
@@ -111,7 +111,7 @@ class StepFits(NamedTuple):
 
 
 def share(distance: Array, blur: Array, sides: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-    """Return the share of pixels behind a step, and its derivatives by distance and by blur."""
+    """Return the share of pixels after a step, and its derivatives by distance and by blur."""
     # With the trapezoid of half widths p = (a + b) / 2 and m = (a - b) / 2 the share is
     #     [R(d + p) - R(d + m) - R(d - m) + R(d - p)] / (a b),
     # R'' = F, the Gaussian's distribution: R = ((x^2 + s^2) F + s x f) / 2, R' = x F + s f, with f
@@ -142,20 +142,20 @@ def share(distance: Array, blur: Array, sides: tuple[Array, Array]) -> tuple[Arr
 def fit_steps(
     pixels: StripPixels, places: Array, *, tilted: bool, blurs: Array | None = None
 ) -> StepFits:
-    """Return the steps (N, K) that fit best, from places (N, K) that are known to a pixel or two.
+    """Return the best fit of steps from start places (N, K) with errors of a pixel or two.
 
-    ``tilted``: whether the tilt is fitted, too; else it is 0. ``blurs`` (N,): where those are known
-    roughly; None: several are tried.
+    ``tilted``: whether the tilt is fitted, too; else it is 0. ``blurs`` (N,): approximate blurs;
+    None: several are tried.
     """
     steps = places.shape[1]
-    starts = STARTS_PX if blurs is None else (blurs,)
+    starts = START_BLURS_PX if blurs is None else (blurs,)
     free = np.ones(2 * steps + 3, dtype=np.bool_)
     free[steps] = tilted
     return _solve(pixels, _best_start(pixels, places, starts), free)
 
 
 def _best_start(pixels: StripPixels, places: Array, starts: Sequence[float | Array]) -> Array:
-    """Return the values (N, M) at one of several blurs, with the heights that fit best."""
+    """Return start values (N, M) with the best one of several blurs, and fitted heights."""
     number, steps = places.shape
     best = np.zeros((number, 2 * steps + 3))
     least = np.full(number, np.inf)
@@ -203,7 +203,7 @@ def _normal_equations(pixels: StripPixels, values: Array) -> tuple[Array, Array,
 
 
 def _sides(ahead: Array, tilt: Array, cosine: Array) -> tuple[Array, Array]:
-    """Return the widths (N, P) of the two boxes that pixels are, seen along a tilted edge."""
+    """Return the widths (N, P) of the two boxes of pixels, projected along a tilted edge."""
     u, v = ahead[..., 0], ahead[..., 1]
     return (
         np.maximum(np.abs(cosine * (u + tilt * v)), MIN_SIDE_PX),
@@ -219,14 +219,14 @@ def _solve(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepF
     damping = np.full(number, 1e-3)
     settled = np.zeros(number, dtype=np.bool_)
     part = pixels
-    held = np.flatnonzero(~free)
+    fixed = np.flatnonzero(~free)
     for _ in range(MAX_STEPS):
         slope, curve = gradient[active].copy(), hessian[active].copy()
-        slope[:, held] = 0.0
-        curve[:, held, :] = 0.0
-        curve[:, :, held] = 0.0
+        slope[:, fixed] = 0.0
+        curve[:, fixed, :] = 0.0
+        curve[:, :, fixed] = 0.0
         diagonal = np.einsum("nii->ni", curve).copy()
-        diagonal[:, held] = 1.0
+        diagonal[:, fixed] = 1.0
         diagonal = np.maximum(diagonal, 1e-12)
         scale = np.sqrt(diagonal)
         unit = curve / scale[:, :, None] / scale[:, None]
@@ -242,14 +242,14 @@ def _solve(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepF
         values[chosen], cost[chosen] = trial[better], tried[0][better]
         hessian[chosen], gradient[chosen] = tried[1][better], tried[2][better]
         damping[active] *= np.where(better, 0.1, 10.0)
-        still = (moved < STILL_PX) | (damping[active] > 1e8)
+        still = (moved < CONVERGED_PX) | (damping[active] > 1e8)
         settled[active[still]] = True
         if still.any():
             active, part = active[~still], part.some(~still)
         if not len(active):
             break
-    if held.size:
-        hessian[:, held, :] = 0.0
-        hessian[:, :, held] = 0.0
-        hessian[:, held, held] = 1.0
+    if fixed.size:
+        hessian[:, fixed, :] = 0.0
+        hessian[:, :, fixed] = 0.0
+        hessian[:, fixed, fixed] = 1.0
     return StepFits(values, cost, hessian, pixels.counts, settled)

@@ -1,11 +1,11 @@
-"""Strips: the narrow parts of a picture in which edges are looked for.
+"""Strips: narrow parts of a picture in which edges are searched.
 
-A strip begins at a point, has a direction, a length and a width. Places in it are ``along`` its
-direction from its middle, and ``beside`` the line through its middle. An edge crosses a strip at
-about a right angle. Those of a circle are bent: ``along`` counts from the circle outwards, and
-``beside`` along it, so that a circle's edge is straight in its strips.
+A strip has a middle, a direction, a length and a width. Coordinates in a strip are ``along`` its
+direction from its middle, and ``beside``, across it. An edge crosses a strip at about a right
+angle. Strips of a circle are bent: ``along`` is the distance from the circle outwards, ``beside``
+the arc length, so that a circle's edge is straight in its strips.
 
-Pixels are points: (0, 0) is the middle of the upper left one, u points right and v down.
+The origin is the middle of the upper left pixel; u points right and v down.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Strips(NamedTuple):
         return du * u + dv * v, du * v - dv * u
 
     def some(self, which: NDArray[np.intp]) -> Strips:
-        """Return some of the strips."""
+        """Return a selection of the strips."""
         return self._replace(middles=self.middles[which], directions=self.directions[which])
 
 
@@ -59,13 +59,13 @@ class Sectors(NamedTuple):
 
     centre: Array  # (2,)
     radius: float
-    angles: Array  # (N,), of the strips' middles, radians, from u to v
+    angles: Array  # (N,), angles of the strips' middles, radians, from u to v
     length: float
     width: float
 
     @property
     def middles(self) -> Array:
-        """(N, 2), the middles of the strips."""
+        """Middles of the strips, (N, 2)."""
         return self.points(np.zeros(len(self.angles)), np.zeros(len(self.angles)))
 
     def points(self, along: Array, beside: Array) -> Array:
@@ -86,22 +86,22 @@ class Sectors(NamedTuple):
         return np.hypot(off[..., 0], off[..., 1]) - self.radius, turned * self.radius
 
     def some(self, which: NDArray[np.intp]) -> Sectors:
-        """Return some of the strips."""
+        """Return a selection of the strips."""
         return self._replace(angles=self.angles[which])
 
 
 class StripPixels(NamedTuple):
-    """Pixels of N strips, P of each; those that do not count have the weight 0."""
+    """P pixels of each of N strips; unused pixels have the weight 0."""
 
     along: Array  # (N, P), place along the strip
     beside: Array  # (N, P)
-    ahead: Array  # (N, P, 2), direction of the strip there
+    ahead: Array  # (N, P, 2), direction of the strip at the pixel
     levels: Array  # (N, P)
     weights: Array  # (N, P), 1 or 0
 
     @property
     def counts(self) -> Array:
-        """(N,), how many pixels of each strip count."""
+        """Number of used pixels of each strip, (N,)."""
         counts: Array = self.weights.sum(axis=1)
         return counts
 
@@ -111,10 +111,10 @@ class StripPixels(NamedTuple):
 
 
 def profiles(image: NDArray[np.generic], strips: Strips | Sectors) -> Array:
-    """Return the mean grey level (N, T) across each strip, a pixel apart along it.
+    """Return the mean grey levels (N, T) across each strip at steps of a pixel along it.
 
     Levels between pixels are interpolated linearly. T is the strips' length in whole pixels plus 1;
-    the middle one is at their middle. The strips lie inside of the picture.
+    the middle value is at the strip's middle. The strips must lie inside of the picture.
     """
     count, across = steps_of(strips.length), steps_of(strips.width)
     along: Array = np.arange(count, dtype=float) - (count - 1) / 2
@@ -136,7 +136,7 @@ def profiles(image: NDArray[np.generic], strips: Strips | Sectors) -> Array:
 
 
 def steps_of(length: float) -> int:
-    """Return the number of points, a pixel apart, that fit into a length."""
+    """Return the number of points at steps of a pixel that fit into a length."""
     return max(int(length + 1e-9) + 1, 1)
 
 

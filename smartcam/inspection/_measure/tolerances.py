@@ -1,4 +1,4 @@
-"""Parse tolerances as people write them: ``12.00 +- 0.05 mm``."""
+"""Parse tolerances such as ``12.00 +- 0.05 mm``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNITS: Final = {
     "px": ("px", 1.0),
     "deg": ("deg", 1.0),
 }
-"""Units of a tolerance: the unit of the measurement, and its number in one of these."""
+"""Units of a tolerance: the unit of the measurement, and the factor into it."""
 
 _NUMBER = r"(\d{1,12}(?:\.\d{0,12})?|\.\d{1,12})"
 _SIGNED = rf"([+-]?\s?{_NUMBER})"
@@ -43,10 +43,10 @@ class Tolerance(NamedTuple):
     """The limits of a value.
 
     Attributes:
-        least: smallest value that is good; minus infinity: any.
-        most: largest value that is good; infinity: any.
-        unit: unit of both: ``mm``, ``px`` or ``deg``.
-        text: as it was written.
+        least: smallest good value; minus infinity: no limit.
+        most: largest good value; infinity: no limit.
+        unit: unit of the limits: ``mm``, ``px`` or ``deg``.
+        text: original text.
     """
 
     least: float
@@ -59,7 +59,7 @@ class Tolerance(NamedTuple):
         """Return the tolerance of a text.
 
         Raises:
-            ConfigurationError: there is no such text, or the larger limit first.
+            ConfigurationError: the text is no tolerance, or has the larger limit first.
         """
         plain = check_text(text, "tolerance", most=100).strip()
         unit = plain[len(plain.rstrip(_LETTERS)) :]
@@ -80,27 +80,27 @@ class Tolerance(NamedTuple):
 
     @property
     def written_unit(self) -> str:
-        """The unit that the text has, one of :data:`UNITS`."""
+        """Unit in the text, one of :data:`UNITS`."""
         return self.text[len(self.text.rstrip(_LETTERS)) :]
 
     def complaint(self, value: float, sigma: float, guard: float) -> str:
         """Return the reason why a value is not good; "" if it is good.
 
-        It has to be inside by ``guard`` times its sigma: otherwise it may be outside, as well.
-        Degrees are compared whatever turns of 360 are between them.
+        The value must be inside by ``guard`` times its sigma, since it may be outside otherwise.
+        Degrees are compared modulo 360.
         """
         if self.unit == "deg" and all(map(math.isfinite, (self.least, self.most, value))):
             middle = (self.least + self.most) / 2
             value = middle + math.remainder(value - middle, 360.0)
         digits = digits_of(sigma)
-        said = f"{value:.{digits}f} {self.unit}"
+        shown = f"{value:.{digits}f} {self.unit}"
         if value > self.most:
-            return f"{said} is above {self.most:.{digits}f} {self.unit}"
+            return f"{shown} is above {self.most:.{digits}f} {self.unit}"
         if value < self.least:
-            return f"{said} is below {self.least:.{digits}f} {self.unit}"
-        # NaN is not inside, either
+            return f"{shown} is below {self.least:.{digits}f} {self.unit}"
+        # also true for NaN
         if not min(self.most - value, value - self.least) >= guard * sigma:
-            return f"{said} is too near to the limit: sigma is {sigma:.2g} {self.unit}"
+            return f"{shown} is too near to the limit: sigma is {sigma:.2g} {self.unit}"
         return ""
 
 
@@ -124,7 +124,7 @@ def _number(text: str) -> float:
 
 
 def digits_of(sigma: float) -> int:
-    """Return the decimals of a value with a sigma: the sigma's first two digits."""
+    """Return the number of decimals that shows two digits of a sigma."""
     if not 0 < sigma < math.inf:
         return 3
     return min(max(1 - math.floor(math.log10(sigma)), 0), 6)

@@ -1,4 +1,4 @@
-"""The tool `measure`: one width, distance, line, circle or angle, and its verdict."""
+"""The tool `measure`: a width, distance, line, circle or angle, with a verdict."""
 
 from __future__ import annotations
 
@@ -64,26 +64,26 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 CIRCLE_CORNERS: Final = 72
-"""Corners of the polygon that a circle is drawn as."""
+"""Number of corners of the polygon that draws a circle."""
 
-METRES: Final = {"mm": 1e-3, "px": 1.0, "deg": math.pi / 180}
-"""SI units of the units that people see; pixels stay pixels."""
+SI_PER_UNIT: Final = {"mm": 1e-3, "px": 1.0, "deg": math.pi / 180}
+"""Factors from displayed units to SI units; pixels stay pixels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """The details of a measurement, beyond the fields of its result.
+    """Details of a measurement, beyond the fields of its result.
 
     Attributes:
-        trouble: reason why there is no value; None: there is one.
-        value: measured value in ``unit``; NaN without one.
-        sigma: standard deviation of the value, in ``unit``: of the picture's noise and, with a
-            calibration, of that.
+        trouble: reason why there is no value; None: there is a value.
+        value: measured value in ``unit``; NaN without a value.
+        sigma: standard deviation of the value, in ``unit``, from the picture's noise and, if there
+            is a calibration, its errors.
         unit: ``mm``, ``px`` or ``deg``.
-        edges: places of the edges that count, (N, 2), pixels.
-        left_out: places of edges that do not agree with the line or circle, (K, 2), pixels.
-        missed: strips without an edge, and why.
-        remark: remark for people on what ``sigma`` does not know; mostly empty.
+        edges: places of the used edges, (N, 2), pixels.
+        left_out: places of outliers of the line or circle, (K, 2), pixels.
+        missed: reasons of the strips without an edge.
+        remark: text about errors that ``sigma`` does not include; mostly empty.
     """
 
     trouble: NoValueReason | None = None
@@ -97,13 +97,13 @@ class Measurement:
 
 
 class Measure(Tool[MeasureSettings]):
-    """One measurement with its sigma."""
+    """Measure one value with its sigma."""
 
     settings_model = MeasureSettings
 
     def __init__(self, settings: MeasureSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "measure needs")  # now, so that the first picture need not wait
+        load("scipy.special", "measure needs")  # spares the first picture the wait
         calibration, tolerance = setup.calibration, settings.tolerance
         unit = settings.unit
         if unit is None and tolerance is not None and tolerance.unit != "deg":
@@ -115,7 +115,7 @@ class Measure(Tool[MeasureSettings]):
 
     @property
     def fields(self) -> str:
-        """The value, which has the name of its kind, with its sigma; and where it is."""
+        """Fields: the value, named after its kind, its sigma and its place."""
         kind, unit = self.settings.kind, self._unit
         name = {"edge": "place", "line": "angle", "circle": "diameter"}.get(kind, kind)
         text = f"{name}: real32 {unit}, sigma: real32 {unit}"
@@ -141,7 +141,7 @@ class Measure(Tool[MeasureSettings]):
         return self._judged(look, measured)
 
     def _judged(self, look: _EdgeFinder, measured: _MeasuredValue) -> Finding:
-        settings, si = self.settings, METRES[self._unit]
+        settings, si = self.settings, SI_PER_UNIT[self._unit]
         found = (
             Value(*(one / si for one in measured.value)) if self._unit == "deg" else measured.value
         )
@@ -169,7 +169,7 @@ class _MeasuredValue(NamedTuple):
 
 
 class _EdgeFinder:
-    """One look at a picture: finds edges, and keeps what people are shown."""
+    """Find edges in one picture, and collect marks and details."""
 
     def __init__(self, view: View, plane: Plane) -> None:
         self.plane = plane
@@ -178,14 +178,14 @@ class _EdgeFinder:
         self._top = 2**view.picture.depth - 1
         self._ends = view.picture.ends
         self._clipped = view.picture.clipped
-        self._regions: list[Array] = []  # corners
+        self._regions: list[Array] = []  # corners of each region
         self._edges: list[Array] = []
         self._left_out: list[Array] = []
         self._missed: list[str] = []
         self._shapes: list[Array] = []
 
     def at(self, places: object) -> Array:
-        """Return places of the settings in the picture's pixels."""
+        """Return coordinates of the settings in the picture's pixels."""
         return self.reference.to_picture(np.asarray(places, dtype=np.float64))
 
     def _settings(self, search: EdgeSearch) -> EdgeSettings:
@@ -223,7 +223,7 @@ class _EdgeFinder:
         return found
 
     def line(self, search: LineSearch) -> tuple[FoundShape, ShapeFit[Line]]:
-        """Return the edges of a line, and the line in the picture."""
+        """Return the edges of a line, and the line in the picture's pixels."""
         way, scale = self.at(search.along), self.reference.scale
         across = (way[1] - way[0])[::-1] * [-1.0, 1.0] / math.dist(*way) * search.search / 2 * scale
         self._regions.append(np.array([*(way - across), *(way[::-1] + across)]))
@@ -244,7 +244,7 @@ class _EdgeFinder:
         return found, fit
 
     def circle(self, search: CircleSearch) -> tuple[FoundShape, ShapeFit[Circle]]:
-        """Return the edges of a circle, and the circle in the picture."""
+        """Return the edges of a circle, and the circle in the picture's pixels."""
         centre, scale = self.at(search.centre), self.reference.scale
         begin, end = (math.radians(one) + self.reference.angle for one in search.arc)
         radius, reach = search.radius * scale, search.search / 2 * scale
@@ -274,7 +274,7 @@ class _EdgeFinder:
         self._missed += map(str, found.troubles)
 
     def details(self, found: Value | None, unit: str, why: NoValueReason | None) -> Measurement:
-        """Return the details for programs."""
+        """Return the details of the measurement."""
         none = [np.zeros((0, 2))]
         value, sigma = (math.nan, math.nan) if found is None else found
         return Measurement(
@@ -289,7 +289,7 @@ class _EdgeFinder:
         )
 
     def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:
-        """Return the marks for people."""
+        """Return the marks to draw."""
         role: Role = "wrong" if wrong else "found"
         marks = [Drawing("polygon", _corners(one), "region") for one in self._regions]
         marks += [Drawing("points", _corners(one), role) for one in self._edges]
@@ -301,7 +301,7 @@ class _EdgeFinder:
 
 
 def _width_of(search: StripSearch, length: float, scale: float) -> float:
-    """Return the width of strips along a length; they do not overlap: a pixel counts once."""
+    """Return the width of strips along a length without overlap, so that each pixel counts once."""
     apart = length / search.strips
     wanted = MAX_WIDTH_PX if search.strip is None else search.strip * scale
     return max(min(wanted, apart), 1.0)

@@ -1,4 +1,4 @@
-"""Say why something could not be measured."""
+"""Reasons for a missing measurement."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ class NoValueReason(enum.Enum):
     OUTSIDE = "outside"
     """A part of the region lies outside of the picture."""
     TOO_LARGE = "too large"
-    """The region has more pixels than are looked at."""
+    """The region has more pixels than the limit."""
     NO_EDGE = "no edge"
-    """No grey levels change as an edge of the wanted kind does."""
+    """The grey levels show no edge of the wanted kind."""
     TWO_EDGES = "two edges"
-    """There are several edges where one was expected, or several pairs of them."""
+    """There are several edges, or pairs of edges, where one was expected."""
     AT_BORDER = "at border"
-    """The edge lies at the end of its region: one of its sides cannot be seen."""
+    """The edge lies at the end of its region: one side is not visible."""
     SATURATED = "saturated"
-    """Grey levels beside the edge are cut off at black or at white, which moves the edge."""
+    """Grey levels beside the edge are saturated, which moves the edge."""
     BLURRED = "blurred"
     """The edge is more blurred than the settings allow."""
     NOISY = "noisy"
-    """Noise leaves the edge's place open by more than is useful."""
+    """The edge's standard deviation from noise is too large."""
     NO_STEP = "no step"
-    """Grey levels change, but not from one level to another one as an edge does."""
+    """Grey levels change, but not as a step between two levels."""
     FEW_EDGES = "few edges"
     """Too few edges were found for a line or a circle."""
     NO_AGREEMENT = "no agreement"
     """No line or circle agrees with enough of the edges."""
     UNCERTAIN = "uncertain"
-    """The edges leave the result open: an arc that is too short, lines that are nearly parallel."""
+    """The edges do not determine the result: the arc is too short, or lines are nearly parallel."""
     OFF_CALIBRATION = "off calibration"
-    """The calibration says nothing about this part of the picture."""
+    """The calibration does not cover this part of the picture."""
 
 
 class NotMeasuredError(Exception):
-    """There is no value.
+    """Error for a missing value.
 
     Args:
-        why: reason for programs.
-        text: reason for people.
+        why: reason as an enum.
+        text: reason as a text.
     """
 
     def __init__(self, why: NoValueReason, text: str) -> None:

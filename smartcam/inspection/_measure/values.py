@@ -1,4 +1,4 @@
-"""Lengths and angles of edges, lines and circles in a plane, each with its standard deviation."""
+"""Compute lengths and angles of edges, lines and circles in a plane, with standard deviations."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from smartcam.inspection._measure.planes import Plane
 
 STEP: float = 1e-3
-"""Pixels, and tangents of an angle, by which values are moved to see what a result does."""
+"""Step of numerical derivatives, in pixels and tangents of angles."""
 
-MAX_RADIUS_SIGMA = 0.05
-"""Standard deviation of a radius in parts of it, above which an arc does not tell its circle."""
+MAX_RELATIVE_RADIUS_SIGMA = 0.05
+"""Largest relative standard deviation of a radius; a larger one means that the arc is too short."""
 
-MAX_SPREAD_PX = 1.5
-"""Rms of the distances of edges from their line or circle, in pixels, up to which it is one."""
+MAX_RMS_PX = 1.5
+"""Largest RMS distance of edges from their line or circle, in pixels."""
 
-MAX_LINES_APART = math.radians(10.0)
-"""Angle between two lines up to which they have a distance."""
+MAX_PARALLEL_ANGLE = math.radians(10.0)
+"""Largest angle, radians, between two lines that have a distance."""
 
 
 class Point(NamedTuple):
@@ -56,7 +56,7 @@ class Value(NamedTuple):
 
 
 def point_of(found: FoundPoint, plane: Plane) -> Point:
-    """Return an edge in a plane; it is uncertain along its strip only."""
+    """Return an edge as a point of a plane, with uncertainty along its strip only."""
     pixel = found.pixel[None]
     sigma = math.hypot(found.edge.sigma, found.edge.misfit)
     way = plane.slopes(pixel)[0] @ found.strip.directions[0] * sigma
@@ -64,9 +64,9 @@ def point_of(found: FoundPoint, plane: Plane) -> Point:
 
 
 def line_of(found: FoundShape, ahead: Array, plane: Plane) -> ShapeFit[Line]:
-    """Return the line of edges in a plane.
+    """Fit a line to edges in a plane.
 
-    ``ahead`` (2, 2): pixels of two points, from one of which the line leads to the other one.
+    ``ahead`` (2, 2): pixels of two points that give the line's direction.
     """
     start, end = plane.points(ahead)
     fit = fit_line(plane.edges(found.edges), end - start, found.kept)
@@ -74,15 +74,15 @@ def line_of(found: FoundShape, ahead: Array, plane: Plane) -> ShapeFit[Line]:
 
 
 def circle_of(found: FoundShape, plane: Plane) -> ShapeFit[Circle]:
-    """Return the circle of edges in a plane.
+    """Fit a circle to edges in a plane.
 
     Raises:
-        NotMeasuredError: UNCERTAIN: the arc is too short to tell the radius.
+        NotMeasuredError: UNCERTAIN: the arc is too short to determine the radius.
     """
     fit = fit_circle(plane.edges(found.edges), found.kept)
     circle = fit.shape
     sigma = math.sqrt(float(circle.covariance[2, 2]))
-    if sigma > MAX_RADIUS_SIGMA * circle.radius:
+    if sigma > MAX_RELATIVE_RADIUS_SIGMA * circle.radius:
         text = (
             f"the arc is too short: its radius is {circle.radius:.3g} {plane.unit}, give or take "
             f"{sigma:.2g} {plane.unit}"
@@ -94,14 +94,14 @@ def circle_of(found: FoundShape, plane: Plane) -> ShapeFit[Circle]:
 def _checked(
     fit: ShapeFit[ShapeT], found: FoundShape, plane: Plane, which: int
 ) -> ShapeFit[ShapeT]:
-    """Return a fit whose offset or radius may be wrong by what all edges may be wrong.
+    """Return the fit with the edges' common error added to the variance of offset or radius.
 
     Raises:
-        NotMeasuredError: NO_AGREEMENT: its edges are of several lines or circles.
+        NotMeasuredError: NO_AGREEMENT: the edges belong to several lines or circles.
     """
     scale = float(np.median(plane.edges(found.edges).sigmas / found.edges.sigmas))
     spread = float(np.sqrt(np.mean(fit.residuals[fit.kept] ** 2))) / scale
-    if spread > MAX_SPREAD_PX:
+    if spread > MAX_RMS_PX:
         text = f"the edges are {spread:.1f} px (rms) from one line or circle"
         raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
     covariance = fit.shape.covariance.copy()
@@ -110,7 +110,7 @@ def _checked(
 
 
 def with_calibration(measure: Callable[[Plane], Value], plane: Plane) -> Value:
-    """Return a value whose sigma has the calibration's own errors in it."""
+    """Return the measured value with a sigma that includes the calibration's errors."""
     found = measure(plane)
     variance = found.sigma**2
     for variant in plane.variants:
@@ -120,7 +120,7 @@ def with_calibration(measure: Callable[[Plane], Value], plane: Plane) -> Value:
 
 
 def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
-    """Return the distance between two edges of one strip, at right angles to them."""
+    """Return the distance between two edges of one strip, perpendicular to the edges."""
     strip = first.strip
 
     ahead = strip.directions[0]
@@ -146,7 +146,7 @@ def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
 
 
 def _joint(first: FoundPoint, second: FoundPoint) -> tuple[Array, Array]:
-    """Return place and tilt of two edges (4,), and their covariance (4, 4)."""
+    """Return places and tilts of two edges (4,), and their covariance (4, 4)."""
     edges = first.edge, second.edge
     values = np.array([one for edge in edges for one in (edge.place, edge.tilt)])
     covariance = np.zeros((4, 4))
@@ -163,8 +163,8 @@ def _joint(first: FoundPoint, second: FoundPoint) -> tuple[Array, Array]:
 def distance(first: Feature, second: Feature) -> Value:
     """Return the distance of two points, of a point and a line, or of two parallel lines.
 
-    A circle counts as its centre. Two lines are compared halfway between their middles, at right
-    angles to the mean of their directions.
+    A circle is represented by its centre. Two lines are compared halfway between their middles,
+    perpendicular to the mean of their directions.
 
     Raises:
         NotMeasuredError: UNCERTAIN: lines that are not parallel.
@@ -201,7 +201,7 @@ def _from_line(line: Line, point: Point) -> Value:
 def _between_lines(first: Line, second: Line) -> Value:
     ahead = second.direction if first.direction @ second.direction > 0 else -second.direction
     apart = math.acos(min(1.0, float(first.direction @ ahead)))
-    if apart > MAX_LINES_APART:
+    if apart > MAX_PARALLEL_ANGLE:
         text = f"the lines are not parallel: {math.degrees(apart):.1f} degrees apart"
         raise NotMeasuredError(NoValueReason.UNCERTAIN, text)
     mean = (first.direction + ahead) / np.linalg.norm(first.direction + ahead)
@@ -209,16 +209,16 @@ def _between_lines(first: Line, second: Line) -> Value:
     middle = (first.at + second.at) / 2
     places, variance = [], 0.0
     for line in (first, second):
-        # where the line passes the middle, along the mean's normal
+        # offset of the line at the common middle, along the mean normal
         places.append(float((line.at - middle) @ line.normal / (line.normal @ normal)))
         variance += line.offset_variance(middle)
     return Value(abs(places[1] - places[0]), math.sqrt(variance))
 
 
 def direction(line: Line, pixel: Array, axis: Array, plane: Plane) -> Value:
-    """Return the angle from an axis of the picture to a line, more than -pi, at most pi.
+    """Return the angle from an axis of the picture to a line, above -pi, up to pi.
 
-    ``axis`` (2,) is a direction at ``pixel`` (2,); angles go from the picture's x to its y.
+    ``axis`` (2,) is a direction at ``pixel`` (2,); angles count from the picture's x to its y.
     """
     slopes = plane.slopes(pixel[None])[0]
     start = slopes @ axis

@@ -1,1 +1,1 @@
-"""The tool `read`: codes, by zxing-cpp."""
+"""The tool `read`: read codes by zxing-cpp."""

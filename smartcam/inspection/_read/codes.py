@@ -1,4 +1,4 @@
-"""Codes as zxing-cpp reads them."""
+"""Read codes by zxing-cpp."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Point = tuple[float, float]
 Corners = tuple[Point, Point, Point, Point]
 
-USE: Final = "reading codes needs"
+PURPOSE: Final = "reading codes needs"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,17 +30,17 @@ class ReadCode:
     Attributes:
         kind: kind of the code, such as ``DataMatrix``.
         data: bytes that the code holds; in a GS1 code with GS (0x1D) between elements.
-        text: the bytes as text, by the character set that the code says.
-        gs1: application identifier and value of each GS1 element; empty: it is no GS1 code.
+        text: the bytes as text, by the character set that the code gives.
+        gs1: application identifier and value of each GS1 element; empty for other codes.
         symbology: symbology identifier of ISO/IEC 15424, such as ``]d2``.
-        corners: upper left, upper right, lower right, lower left of the code as it is printed,
+        corners: upper left, upper right, lower right and lower left corner of the printed code,
             pixels of the picture.
-        angle: direction of its upper edge, radians from x towards y.
+        angle: direction of the upper edge, radians from x towards y.
         unused_correction: share of the code's error correction that reading did not need, 0 to 1;
-            None: the kind has none.
+            None: none.
         level: error correction level, such as ``H``; "" if the kind has none.
         version: size of the symbol, such as ``12x26``; "" if the kind has none.
-        prepared: what had to be done to the picture before; "" for nothing.
+        prepared: preparation of the picture that reading needed; "": none.
     """
 
     kind: str
@@ -68,18 +68,18 @@ def kinds() -> dict[str, Any]:
     Raises:
         MissingExtraError: zxing-cpp is not installed.
     """
-    zxing = load("zxingcpp", USE)
+    zxing = load("zxingcpp", PURPOSE)
     return {one.name: one for one in zxing.barcode_formats_list(zxing.BarcodeFormat.AllReadable)}
 
 
 def formats_of(names: Sequence[str]) -> Any:
-    """Return zxing-cpp's set of the kinds with these names; all where none is named.
+    """Return zxing-cpp's set of the named kinds; all kinds if there are no names.
 
     Raises:
         ValueError: a name is unknown.
         MissingExtraError: zxing-cpp is not installed.
     """
-    zxing = load("zxingcpp", USE)
+    zxing = load("zxingcpp", PURPOSE)
     known = kinds()
     for name in names:
         if name not in known:
@@ -101,13 +101,13 @@ def read_codes(
     """Return the codes in a picture.
 
     Args:
-        grey: (H, W), in one block.
-        formats: as :func:`formats_of` gives them.
-        back: (2, 3), where its pixels are in the picture that corners are of.
-        binarizer: zxing-cpp's name for how it tells dark from light.
-        prepared: what was done to the picture before.
+        grey: picture, (H, W), contiguous.
+        formats: kinds from :func:`formats_of`.
+        back: affine map (2, 3) from ``grey`` to the picture of the corners.
+        binarizer: zxing-cpp's name of the binarizer.
+        prepared: name of the picture's preparation.
     """
-    zxing = load("zxingcpp", USE)
+    zxing = load("zxingcpp", PURPOSE)
     found = zxing.read_barcodes(
         grey,
         formats=formats,
@@ -119,7 +119,7 @@ def read_codes(
 
 
 def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:
-    place = one.position  # whole numbers, which name pixels
+    place = one.position  # indices of pixels
     corners = [
         (float(x), float(y))
         for x, y in (

@@ -1,7 +1,7 @@
-"""GS1 element strings, cut into application identifiers and values.
+"""Split GS1 element strings into application identifiers and values.
 
 GS1 General Specifications, 7.8: an element whose first two digits are in the table of predefined
-lengths has that length; every other one ends at GS or at the end.
+lengths has that length; every other element ends at GS or at the end.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ _PREDEFINED: Final = {
     **{str(one): 8 for one in range(11, 20)},
     **{str(one): 10 for one in range(31, 37)},
 }
-"""Characters of an element, its identifier included, by the first two digits."""
+"""Length of an element with its identifier, in characters, by the first two digits."""
 
 _IDENTIFIER_DIGITS: Final = {
     **dict.fromkeys(["23", "24", "25", "40", "41", "42", "71"], 3),
     **dict.fromkeys(["31", "32", "33", "34", "35", "36", "39", "43", "70", "72"], 4),
     **dict.fromkeys(["80", "81", "82"], 4),
 }
-"""Digits of an application identifier by its first two; 2 for all others."""
+"""Number of digits of an application identifier by its first two; 2 for all others."""
 
 
 def elements(text: str) -> tuple[tuple[str, str], ...]:
     """Return application identifier and value of each element.
 
-    An element that is cut off, or whose identifier is no number, ends the list: it and what follows
-    are the last value, behind the identifier "".
+    At an element that is cut, or whose identifier is no number, the list ends: the rest of the text
+    is the last value, with the identifier "".
     """
     found: list[tuple[str, str]] = []
     at = 1 if text.startswith(GS) else 0

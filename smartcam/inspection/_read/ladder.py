@@ -1,8 +1,7 @@
-"""Try again after a miss: the same reader, on the picture prepared otherwise.
+"""Retry after a miss with the same reader on differently prepared pictures.
 
-Each rung stands here because it reads codes of the measured sets that those before it miss; they
-stand in the order of what they gain for their time. ``tests.inspection.proofs.codes`` measures
-them.
+Each rung reads codes of the measured sets that the rungs before it miss; the rungs are ordered by
+gain per time. ``tests.inspection.proofs.codes`` measures them.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ if TYPE_CHECKING:
     Prepared = tuple[NDArray[np.uint8], Affine]
 
 MAX_RUNG_PIXELS: Final = 16_000_000
-"""Pixels of a prepared picture; a rung that would make more is left out."""
+"""Largest number of pixels of a prepared picture; larger rungs are left out."""
 
-CONFIRMED: Final = frozenset(
+CONFIRMED_KINDS: Final = frozenset(
     {
         *("Codabar", "Code32", "Code39", "Code39Ext", "Code39Std", "Code93", "Code128"),
         *("DXFilmEdge", "EAN13", "EAN8", "EANUPC", "ISBN", "ITF", "ITF14", "PZN", "UPCA", "UPCE"),
@@ -37,25 +36,25 @@ CONFIRMED: Final = frozenset(
         *("PDF417", "CompactPDF417", "MicroPDF417"),
     }
 )
-"""Kinds whose checksum is weak or missing, and those with rows that may be misread one by one: in a
-prepared picture they count only if a second reading is the same: that of another rung, or of the
-same one on a smaller picture."""
+"""Kinds with a weak or missing checksum, and kinds of stacked rows, each of which may be misread.
+In prepared pictures they need a second, equal reading: of another rung, or of the same rung on a
+smaller picture."""
 
 CONFIRMING_SCALE: Final = 0.9
-"""Size of the picture of the second reading: its samples lie elsewhere."""
+"""Scale of the picture for the second reading, which moves its samples."""
 
 MAX_SAME_PLACE: Final = 0.5
-"""Distance of the centres of two readings of one code, as a share of its longest edge."""
+"""Largest distance between two readings of one code, as a share of its longest edge."""
 
 
 class Rung(NamedTuple):
-    """One preparation.
+    """One preparation of the picture.
 
     Attributes:
-        name: what it does.
-        prepare: picture to prepared picture, with where its pixels are in the picture.
-        scale: pixels of the prepared picture along a side for one of the picture.
-        binarizer: zxing-cpp's name for how it tells dark from light.
+        name: description of the preparation.
+        prepare: function that returns the prepared picture, and the affine map back to the picture.
+        scale: ratio of the prepared picture's width to the picture's.
+        binarizer: zxing-cpp's name of the binarizer.
     """
 
     name: str
@@ -65,13 +64,13 @@ class Rung(NamedTuple):
 
 
 class CodeSearch(NamedTuple):
-    """The picture that is read, and the codes that count.
+    """The picture to read, and the wanted codes.
 
     Attributes:
         grey: picture, (H, W).
-        formats: kinds that are looked for.
-        origin: place of the first pixel in the picture that corners are of.
-        counts: function that says whether a code lies where it counts.
+        formats: wanted kinds.
+        origin: place of the first pixel in the picture of the corners.
+        counts: function that returns whether a code lies in the region.
     """
 
     grey: NDArray[np.uint8]
@@ -83,15 +82,14 @@ class CodeSearch(NamedTuple):
 def read_again(
     search: CodeSearch, found: Sequence[ReadCode], least: int, deadline: float, expected: float
 ) -> list[ReadCode]:
-    """Return the codes found before, with those that the rungs find, until there are enough.
+    """Return the codes found before and by the rungs, until there are enough.
 
     Args:
-        search: the picture, and what is looked for.
+        search: the picture and the wanted codes.
         found: codes found before.
-        least: how many are enough.
-        deadline: seconds of ``time.monotonic()`` at which no further rung begins; one that would
-            take longer is left out.
-        expected: seconds that reading took without preparation.
+        least: number of codes that is enough.
+        deadline: ``time.monotonic()`` at which no further rung begins; slower rungs are left out.
+        expected: duration of reading without preparation, seconds.
     """
     grey, counts = search.grey, search.counts
     codes = list(found)
@@ -106,7 +104,7 @@ def read_again(
         for code in _by_rung(rung, search):
             if not counts(code) or any(_is_same(code, one) for one in codes):
                 continue
-            if code.kind in CONFIRMED and not any(_is_same(code, one) for one in waiting):
+            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, one) for one in waiting):
                 if smaller is None:
                     smaller = _by_rung(rung, search, CONFIRMING_SCALE)
                 if not any(_is_same(code, one) for one in smaller):
@@ -117,7 +115,7 @@ def read_again(
 
 
 def _by_rung(rung: Rung, search: CodeSearch, scale: float = 1.0) -> list[ReadCode]:
-    """Return the codes that one rung finds, in the picture or in a smaller one."""
+    """Return the codes that one rung finds, in the picture or in a scaled copy."""
     grey = search.grey if scale == 1.0 else _resize(search.grey, scale)
     prepared, back = rung.prepare(grey)
     places = _scaled_by(scale)
@@ -138,7 +136,7 @@ def _is_same(one: ReadCode, other: ReadCode) -> bool:
 
 
 def _scaled_by(scale: float) -> Affine:
-    """Return the map from a scaled picture's pixels to the picture's."""
+    """Return the affine map from a scaled picture's pixels to the picture's."""
     shift = 0.5 / scale - 0.5
     return np.array([[1 / scale, 0, shift], [0, 1 / scale, shift]])
 
@@ -174,14 +172,14 @@ def _median(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return black and white by Otsu's threshold."""
+    """Return a binary picture by Otsu's threshold."""
     cv2 = load("cv2", "inspection needs")
     black: NDArray[np.uint8] = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)[1]
     return black
 
 
 def _local_threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return black and white by the mean of the neighbourhood."""
+    """Return a binary picture with the neighbourhood's mean as the threshold."""
     cv2 = load("cv2", "inspection needs")
     how = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
     black: NDArray[np.uint8] = cv2.adaptiveThreshold(grey, 255, how, cv2.THRESH_BINARY, 51, 4)
@@ -189,7 +187,7 @@ def _local_threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _turned(grey: NDArray[np.uint8], degrees: float) -> Prepared:
-    """Return the picture turned clockwise, the rest white."""
+    """Return the picture turned clockwise, on white."""
     cv2 = load("cv2", "inspection needs")
     height, width = grey.shape
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -211,7 +209,7 @@ def _rung(
     scale: float = 1.0,
     binarizer: str = "LocalAverage",
 ) -> Rung:
-    """Return the rung that scales the picture and then does the steps."""
+    """Return the rung that scales the picture, then applies the steps."""
 
     def prepare(grey: NDArray[np.uint8]) -> Prepared:
         made = grey if scale == 1.0 else _resize(grey, scale)
@@ -255,4 +253,4 @@ RUNGS: Final[tuple[Rung, ...]] = (
         scale=2,
     ),
 )
-"""All of them, in the order in which they are tried."""
+"""All rungs in the order in which they are tried."""

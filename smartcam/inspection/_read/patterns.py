@@ -1,4 +1,4 @@
-"""Regular expressions that hold nobody up, whatever the pattern and the text."""
+"""Regular expressions with a time limit for every pattern and text."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from typing import Final
 from smartcam._extras import load
 
 MAX_MATCH_SECONDS: Final = 0.5
-"""Longest time in which a text is compared, in seconds. A pattern such as ``(a|a)+b`` has as many
-ways through a text as two to the power of its length."""
+"""Longest time to match a text, seconds. A pattern such as ``(a|a)+b`` may need a time that grows
+exponentially with the text's length."""
 
 MAX_PATTERN_CHARACTERS: Final = 4000
-"""Largest length of a pattern, in characters: compiling takes longer for a longer one."""
+"""Largest length of a pattern, in characters, which bounds the time of compiling."""
 
 
 class PatternError(ValueError):
-    """A pattern cannot be used."""
+    """Error in a pattern."""
 
 
 class TooLongError(Exception):
-    """Comparing a text with a pattern takes too long."""
+    """Error for a match that takes too long."""
 
 
 class TextPattern:
-    """A regular expression of the package ``regex``: those of :mod:`re`, and some more.
+    """A regular expression of the package ``regex``, which extends :mod:`re`.
 
-    Unlike ``re``, it lets other threads run while it compares, and gives up in time.
+    Unlike ``re``, matching lets other threads run, and has a time limit.
 
     Args:
         pattern: the expression.
@@ -51,7 +51,7 @@ class TextPattern:
         """Return True if the whole text matches the pattern.
 
         Raises:
-            TooLongError: comparing takes longer than :data:`MAX_MATCH_SECONDS`.
+            TooLongError: matching takes longer than :data:`MAX_MATCH_SECONDS`.
         """
         try:
             found = self._compiled.fullmatch(text, timeout=MAX_MATCH_SECONDS, concurrent=True)

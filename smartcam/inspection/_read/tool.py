@@ -1,4 +1,4 @@
-"""The tool `read`: its settings, and its finding."""
+"""The tool `read` and its settings."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
     from smartcam.inspection._tool import ToolSetup, View
 
 MAX_CODES: Final = 255
-"""Largest number of codes in one result; zxing-cpp finds no more."""
+"""Largest number of codes in one result, which is zxing-cpp's limit."""
 
 MAX_TEXT_BYTES: Final = 4000
-"""Largest number of bytes of a code's text; no code holds many more."""
+"""Largest number of bytes of a code's text; codes hardly hold more."""
 
-INPUT: Final = "input"
-"""Setting by which a code must hold the value of the input."""
+INPUT_SETTING: Final = "input"
+"""Value of the setting ``expect`` for codes that must equal the trigger's input."""
 
 
 def _pattern(given: str | None) -> str | None:
-    if given is not None and given != INPUT:
+    if given is not None and given != INPUT_SETTING:
         TextPattern(given)  # raises a ValueError
     return given
 
 
 class ReadSettings(ToolSettings):
-    """The codes to read, and the text that they must hold."""
+    """Kinds and number of codes, and their expected text."""
 
     codes: Annotated[
         tuple[str, ...],
@@ -50,21 +50,17 @@ class ReadSettings(ToolSettings):
     expect: Annotated[str | None, AfterValidator(_pattern)] = Field(
         None,
         max_length=1000,
-        description="what the whole text has to be: a regular expression, or input: the value of "
-        "the input",
+        description="expected text: a regular expression, or input: the value of the input",
     )
-    most: int = Field(1, ge=1, le=MAX_CODES, description="codes in the result at most")
-    least: int = Field(1, ge=0, le=MAX_CODES, description="codes that there have to be")
-    length: int = Field(
-        64, ge=1, le=MAX_TEXT_BYTES, description="bytes that the result has for a text"
-    )
-    corners: bool = Field(False, description="put the four corners into the result, too")
+    most: int = Field(1, ge=1, le=MAX_CODES, description="largest number of codes in the result")
+    least: int = Field(1, ge=0, le=MAX_CODES, description="least number of codes")
+    length: int = Field(64, ge=1, le=MAX_TEXT_BYTES, description="bytes of a text in the result")
+    corners: bool = Field(False, description="add the four corners to the result")
     seconds: float = Field(
         0.5,
         ge=0,
         le=60,
-        description="how long it goes on trying after a miss, with the picture prepared otherwise; "
-        "0: not at all",
+        description="time to retry after a miss with differently prepared pictures",
     )
 
 
@@ -72,10 +68,10 @@ _CORNERS: Final = ("x1", "y1", "x2", "y2", "x3", "y3", "x4", "y4")
 
 
 class ReadTool(Tool[ReadSettings]):
-    """Codes."""
+    """Read codes."""
 
     settings_model = ReadSettings
-    needs_whole_region = False  # a code that is read is whole
+    needs_whole_region = False  # a code that can be read is complete
 
     def __init__(self, settings: ReadSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
@@ -86,16 +82,16 @@ class ReadTool(Tool[ReadSettings]):
         except ValueError as exc:
             raise ConfigurationError(str(exc)) from exc
         expect = settings.expect
-        self._pattern = None if expect in (None, INPUT) else TextPattern(str(expect))
+        self._pattern = None if expect in (None, INPUT_SETTING) else TextPattern(str(expect))
 
     @property
     def fields(self) -> str:
-        """The fields: number of codes, and the first one."""
+        """Fields of the number of codes and of the first code."""
         return f"count: uint8, {self._of_code}" if self.settings.most == 1 else "count: uint8"
 
     @property
     def records(self) -> str:
-        """The fields of each code."""
+        """Fields of each code."""
         return "" if self.settings.most == 1 else self._of_code
 
     @property
@@ -142,12 +138,12 @@ class ReadTool(Tool[ReadSettings]):
         origin: tuple[int, int] = (0, 0),
         counts: Callable[[ReadCode], bool] = lambda _: True,
     ) -> list[ReadCode]:
-        """Return the codes, the upper ones first.
+        """Return the codes, from top to bottom.
 
         Args:
-            grey: the picture, (H, W), in one block.
-            origin: place of its first pixel in the coordinates of the corners.
-            counts: function that returns whether a code lies where codes count.
+            grey: the picture, (H, W), contiguous.
+            origin: place of the first pixel in the coordinates of the corners.
+            counts: function that returns whether a code lies in the region.
         """
         started = time.monotonic()
         back = np.array([[1.0, 0, origin[0]], [0, 1, origin[1]]])
@@ -165,12 +161,12 @@ class ReadTool(Tool[ReadSettings]):
         return sorted(codes, key=lambda code: (code.centre[1], code.centre[0]))
 
     def _reason(self, codes: list[ReadCode], given: bytes) -> str:
-        """Return why these codes are not the required ones; "" if they are."""
+        """Return the reason why the codes are not ok; "" if they are ok."""
         settings = self.settings
         if len(codes) < settings.least:
             return f"{len(codes)} codes, expected {settings.least}"
         for code in codes:
-            if settings.expect == INPUT and code.data != given:
+            if settings.expect == INPUT_SETTING and code.data != given:
                 return f"read {code.data[:40]!r}, expected the input {given[:40]!r}"
             if not self._fits_layout(code):
                 size = len(code.text.encode())

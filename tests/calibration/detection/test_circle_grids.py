@@ -1,4 +1,4 @@
-"""Grids of dots among letters, rulers and other dots: all of one, or none."""
+"""Grids of dots among letters, rulers and other dots are found whole or not at all."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ PLAIN = CircleGrid(columns=8, rows=6, spacing=0.02, diameter=0.01)
 SMALL = CircleGrid(columns=7, rows=6, spacing=0.02, diameter=0.01)
 
 SAMPLES = 3
-"""Of a pixel, along each side."""
+"""Samples along each side of a pixel."""
 
 
 def printed(target: CircleGrid, roll: float, tilt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a camera sees of a printed sheet, and where its points are (N, 2)."""
+    """Return a camera's image of a printed sheet, and the places (N, 2) of its points."""
     pdfium = pytest.importorskip("pypdfium2", reason="needs pypdfium2, of the extra dev")
     sheet = make_sheet(target)
     document = pdfium.PdfDocument(sheet.pdf())
@@ -112,7 +112,7 @@ def test_find_circles_in_uneven_light_have_their_origin() -> None:
     assert picture.off(view).max() < 0.1
 
 
-def test_find_circles_among_thousands_of_spots_says_so() -> None:
+def test_find_circles_among_thousands_of_spots_reports_them() -> None:
     noise = np.random.default_rng(2).normal(size=(480, 640)).astype(np.float32)
     clouds = 128 + 400 * np.asarray(cv2.GaussianBlur(noise, (0, 0), 3))
     with refused(Code.TARGET_NOT_FOUND, "dark spots and no such grid among them"):

@@ -1,4 +1,4 @@
-"""Targets in images: found, numbered, with their points and origin where they are."""
+"""Targets in images are found, with the right numbers, points and origin."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ TILTED = [one for one in TILTED if one not in OTHERS]
 @pytest.mark.parametrize(
     ("target", "roll"), [*TILTED, *(pytest.param(*one, marks=pytest.mark.long) for one in OTHERS)]
 )
-def test_find_target_of_tilted_sheet_has_each_point_where_it_is(target: Target, roll: int) -> None:
+def test_find_target_of_tilted_sheet_has_true_places(target: Target, roll: int) -> None:
     picture = drawn(target, tilt=35, roll=roll)
     view = find_target(picture.image, target, name="one")
     assert view.ids.tolist() == list(range(len(target.points)))
@@ -192,7 +192,7 @@ def test_find_target_whose_larger_dot_is_not_there_is_ambiguous() -> None:
         find_target(drawn(plain).image, DOTS)
 
 
-def test_find_target_of_other_board_says_what_is_seen_instead() -> None:
+def test_find_target_of_other_board_reports_the_board_in_the_image() -> None:
     wanted = Checkerboard(columns=10, rows=7, square=0.025)
     text = "expected a board of 10 x 7 inner corners that is seen as a whole, found one of about"
     with pytest.raises(CalibrationError, match=text) as caught:
@@ -201,7 +201,7 @@ def test_find_target_of_other_board_says_what_is_seen_instead() -> None:
     assert caught.value.got in ((9, 6), (6, 9))
 
 
-def test_find_target_of_nothing_says_that_none_is_found() -> None:
+def test_find_target_of_an_empty_image_reports_that() -> None:
     empty = np.full((480, 640), 128, dtype=np.uint8)
     with refused(Code.TARGET_NOT_FOUND, "9 x 6 inner corners", "found none"):
         find_target(empty, PLAIN)
@@ -211,7 +211,7 @@ def test_find_target_of_nothing_says_that_none_is_found() -> None:
         find_target(empty, DOTS)
 
 
-def test_find_target_of_covered_dots_says_how_many_are_seen() -> None:
+def test_find_target_of_covered_dots_reports_the_visible_number() -> None:
     picture = drawn(DOTS)
     u, v = np.rint(picture.pixels[35]).astype(int)
     cv2.circle(picture.image, (int(u), int(v)), 11, 210, -1)
@@ -264,12 +264,12 @@ def test_find_target_of_no_target_is_refused() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_find_target_of_two_alike_boards_says_so(count: int) -> None:
+def test_find_target_of_two_equal_boards_is_refused(count: int) -> None:
     view = find_target(np.hstack([drawn(DARK).image] * count), DARK)
     assert [one.code for one in view.warnings] == [Code.WRONG_TARGET] * (count - 1)
 
 
-def test_find_target_whose_origin_area_is_not_in_the_image_says_so() -> None:
+def test_find_target_without_its_origin_area_in_the_image_is_refused() -> None:
     picture = drawn(DARK)
     left = round(picture.pixels[0, 0] - 1.1 * np.ptp(picture.pixels[:2, 0]))
     text = "at the origin (2 of the 4 such areas outside of the image): expected the origin"
@@ -294,7 +294,7 @@ def test_find_target_in_uneven_light_has_its_origin(roll: int) -> None:
 
 
 # ----------------------------------------------------------------------
-# How the points of a grid are numbered.
+# Numbers of the points of a grid.
 
 
 GRIDS = [
@@ -379,7 +379,7 @@ def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int |
 
 
 # ----------------------------------------------------------------------
-# Images as detectors take them.
+# Images for detectors.
 
 
 def test_grey_image_of_bytes_keeps_them() -> None:
@@ -416,7 +416,7 @@ def test_grey_image_of_a_cut_of_an_image_is_contiguous() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_scaled_has_places_where_it_says(scale: float) -> None:
+def test_scaled_image_has_its_stated_places(scale: float) -> None:
     image = np.repeat(np.arange(0, 240, 4, dtype=np.uint8)[None], 40, axis=0)
     bytes_ = scaled(image, scale)
     assert bytes_.shape == (40 * scale, 60 * scale)

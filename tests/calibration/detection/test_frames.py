@@ -1,4 +1,4 @@
-"""Targets in frames of a camera: its brightness counts, as it sent it."""
+"""Targets in frames of a camera: the brightness that it sent counts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def shot(data: bytes, format: str, stride: int) -> Frame:
 
 
 @pytest.mark.parametrize("format", ["Mono8", "YUYV", "Mono12"])
-def test_target_in_a_frame_is_where_it_is_in_its_brightness(format: str) -> None:
+def test_target_in_a_frame_equals_that_in_its_brightness(format: str) -> None:
     levels: Any = IMAGE
     stride = 320
     if format == "YUYV":  # U and V of strong colours, which the brightness does not have

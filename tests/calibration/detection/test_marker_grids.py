@@ -21,8 +21,8 @@ LATER = MarkerGrid(
 )
 
 CODES = {0: 0xD5D628584, 1: 0xD97F18B49, 5: 0xF31DAB3AC, 23: 0x9F21CC2D7}
-"""Tags of AprilTag's family 36h11 as its tables have them: 36 bits from the upper left on, white
-where one is set."""
+"""Tags of AprilTag's family 36h11 from its tables: 36 bits from the upper left on, a set bit is
+white."""
 
 
 @pytest.mark.parametrize("identity", CODES)
@@ -59,7 +59,7 @@ def test_corners_of_a_grid_board_are_opencvs() -> None:
 @pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("grid", [APRIL, PLAIN, LATER], ids=lambda one: one.dictionary)
 @pytest.mark.parametrize(("tilt", "roll"), [(0, 0), (30, 70), (25, 200)])
-def test_grid_has_each_corner_where_it_is(grid: MarkerGrid, tilt: int, roll: int) -> None:
+def test_grid_has_each_corner_at_its_true_place(grid: MarkerGrid, tilt: int, roll: int) -> None:
     picture = drawn(grid, camera=STRAIGHT, tilt=tilt, roll=roll, away=0.4, noise=1)
     view = find_target(picture.image, grid, name="one")
     assert len(view.ids) >= 0.9 * len(grid.points)
@@ -131,7 +131,7 @@ def test_grid_that_is_another_one_is_refused(
         find_target(drawn(shown, camera=STRAIGHT, tilt=15, away=0.4).image, said)
 
 
-def test_grid_as_data_is_the_same_again() -> None:
+def test_grid_from_its_data_is_equal() -> None:
     for grid in (APRIL, PLAIN, LATER):
         assert target_from_data(target_to_data(grid)) == grid
     twice = resized(APRIL, 2.0)

@@ -1,4 +1,4 @@
-"""Markers on a board: each number is checked by its neighbours, and what contradicts it is told."""
+"""Markers on a board: each number is checked by its neighbours, and contradictions are reported."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOARD = np.array([[x, y] for y in range(4) for x in range(5)], dtype=np.float64)
 
 
 def seen(ids: list[int], *, turn: float = 0.3, scale: float = 40.0) -> Markers:
-    """Return the markers of BOARD that have these numbers, seen from the side."""
+    """Return the markers of BOARD with these numbers, seen from the side."""
     c, s = np.cos(turn), np.sin(turn)
     flat = BOARD[ids].reshape(-1, 2)
     depth = 1 + 0.05 * flat[:, :1] + 0.03 * flat[:, 1:]
@@ -30,7 +30,7 @@ def seen(ids: list[int], *, turn: float = 0.3, scale: float = 40.0) -> Markers:
     return Markers(pixels.reshape(-1, 4, 2), np.array(ids))
 
 
-def test_agreeing_of_a_board_that_is_right_is_all_of_it() -> None:
+def test_agreeing_of_a_right_board_has_all_markers() -> None:
     good, contrary = agreeing(seen(list(range(20))), BOARD)
     assert good.all()
     assert contrary == 0
@@ -61,7 +61,7 @@ def test_agreeing_of_fewer_than_two_of_the_board_is_none(ids: list[int]) -> None
     assert contrary == 0
 
 
-def test_agreeing_joins_what_a_hand_in_the_middle_parts() -> None:
+def test_agreeing_joins_the_parts_beside_a_hand() -> None:
     board = np.concatenate([BOARD, BOARD + np.array([9, 0])])
     good, contrary = agreeing(Markers(50 + 40 * board, np.arange(40)), board)
     assert good.all()
@@ -102,8 +102,8 @@ def test_find_charuco_of_the_other_pattern_names_both(
     there = dataclasses.replace(said, legacy_pattern=not said.legacy_pattern)
     picture = drawn(there, camera=STRAIGHT, tilt=20)
     if hidden:
-        # the markers at one side alone tell: those that begin a row of the new pattern at the
-        # left, and those that end one of the legacy pattern at the right
+        # only the markers at one side show it: those at the left of the new pattern's rows, and
+        # those at the right of the legacy pattern's
         side = range(columns - hidden, columns) if said.legacy_pattern else range(hidden)
         picture = covered(picture, side, there)
     text = f"legacy_pattern={said.legacy_pattern}", f"legacy_pattern={there.legacy_pattern}"
@@ -145,7 +145,7 @@ def wild(picture: Drawn, numbers: list[int], side: int = 24) -> Drawn:
     return picture
 
 
-def test_find_charuco_leaves_markers_out_that_stand_elsewhere_and_tells() -> None:
+def test_find_charuco_leaves_misplaced_markers_out_with_a_remark() -> None:
     picture = wild(drawn(NEW, tilt=20, away=0.6), [3, 11, 26])
     view = find_target(picture.image, NEW)
     assert len(view.ids) == len(NEW.points)

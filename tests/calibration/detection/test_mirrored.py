@@ -1,4 +1,4 @@
-"""Mirrored images: refused where the print tells it, and only there."""
+"""Mirrored images are refused if and only if the print shows it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ NOT_TOLD: list[Target] = [
 
 
 def short(targets: list[Target], *which: int) -> list[Any]:
-    """Return targets, all but some of them for the long run."""
+    """Return targets, most of them for the long run only."""
     return [
         target if number in which else pytest.param(target, marks=pytest.mark.long)
         for number, target in enumerate(targets)
@@ -66,7 +66,7 @@ def test_find_target_in_mirror_image_is_refused(target: Target, axis: int) -> No
 
 
 @pytest.mark.parametrize("target", short(TOLD, 0, 4, 6), ids=repr)
-def test_find_target_of_what_tells_its_mirror_image_is_found_as_it_is(target: Target) -> None:
+def test_find_target_of_an_asymmetric_target_keeps_its_orientation(target: Target) -> None:
     picture = drawn(target, tilt=25, roll=70)
     assert picture.off(find_target(picture.image, target)).max() < 0.02
 
@@ -82,7 +82,7 @@ def test_find_target_in_mirror_image_that_looks_like_a_turned_one_is_found(targe
     assert not (apart.argmin(axis=1) == np.arange(len(mirrored))).all()
 
 
-def test_find_target_of_exchanged_counts_says_so() -> None:
+def test_find_target_of_exchanged_counts_reports_them() -> None:
     text = "got a white one: an image that is mirrored, or a negative, or the board is one of 9 x 7"
     with refused(Code.MIRRORED, "checkerboard of 7 x 9 corners: expected a black square", text):
         find_target(drawn(board(9, 7)).image, board(7, 9))

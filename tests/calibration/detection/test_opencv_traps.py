@@ -20,7 +20,7 @@ METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis")
 
 @pytest.mark.long
 def test_trap_hand_eye_methods_are_not_all_tsais() -> None:
-    """``calibrateHandEye(a, b, c, d, METHOD)`` takes the method for an output, and runs Tsai's."""
+    """``calibrateHandEye(a, b, c, d, METHOD)`` takes the method as an output, and runs Tsai's."""
     poses, views = scene("eye-in-hand", poses=5).measured(
         pixel_sigma=0.3, robot_sigmas=SIGMAS, random=np.random.default_rng(2)
     )
@@ -52,7 +52,7 @@ def line(count: int) -> Array:
 
 
 def test_trap_homography_of_a_line_is_none() -> None:
-    """``findHomography`` returns None, or a matrix of whatever."""
+    """``findHomography`` returns None, or a random matrix."""
     found = fit_homography(line(6), line(6))
     assert found is None or not np.isfinite(np.linalg.cond(found)) or np.linalg.cond(found) > 1e6
 
@@ -65,8 +65,8 @@ def test_trap_rotation_of_a_line_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_trap_turns_about_one_axis_are_refused_whatever_the_method(name: str) -> None:
-    """Tsai's gives 89 mm of error without a word, Daniilidis' 3155 mm, Park's NaN."""
+def test_trap_turns_about_one_axis_are_refused_by_each_method(name: str) -> None:
+    """Tsai's gives 89 mm of error without a warning, Daniilidis' 3155 mm, Park's NaN."""
     poses, views = scene("eye-in-hand").measured(
         pixel_sigma=0.1, robot_sigmas=SIGMAS, random=np.random.default_rng(2)
     )

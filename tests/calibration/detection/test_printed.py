@@ -1,4 +1,4 @@
-"""Sheets as Chromium and PDFium draw them, measured with our own detection."""
+"""Sheets drawn by Chromium and PDFium, measured with smartcam's detection."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def seen_by_camera(picture: Picture) -> Picture:
 
 
 def off(picture: Picture, sheet: Sheet, scale: Any) -> float:
-    """Return how far a point is at most from where the sheet says that it is, mm."""
+    """Return the largest distance of a point from its nominal place on the sheet, mm."""
     assert not isinstance(sheet.target, Rays)
     view = find_target(seen_by_camera(picture), sheet.target)
     assert len(view.ids) == len(sheet.target.points)
@@ -102,8 +102,7 @@ def off(picture: Picture, sheet: Sheet, scale: Any) -> float:
 
 def black_length(picture: Picture, axis: int, longest: float) -> float:
     """Return the length of the longest line of black along an axis but below ``longest``, pixels.
-
-    Grey pixels at its ends count by how dark they are.
+    Grey pixels at its ends count by their darkness.
     """
     lines = picture if axis == 1 else picture.T
     best = 0.0
@@ -116,13 +115,13 @@ def black_length(picture: Picture, axis: int, longest: float) -> float:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: make_sheet(one).id)
-async def test_svg_has_each_point_where_it_says(browser: Browser, target: Target) -> None:
+async def test_svg_has_each_point_at_its_stated_place(browser: Browser, target: Target) -> None:
     sheet = make_sheet(target)
     assert off(await drawn_svg(browser, sheet), sheet, DPI / 25.4) < OFF_DRAWN
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: make_sheet(one).id)
-async def test_pdf_has_each_point_where_it_says(target: Target) -> None:
+async def test_pdf_has_each_point_at_its_stated_place(target: Target) -> None:
     sheet = make_sheet(target)
     picture = drawn_pdf(sheet)
     scale = np.array(picture.shape[::-1]) / (sheet.width, sheet.height)

@@ -1,4 +1,4 @@
-"""Corners of checkerboards and dots, refined."""
+"""Refine corners of checkerboards, and dots."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_refine_corners_gains_are_positive_between_the_two_ways() -> None:
     assert gains[1, 1] == pytest.approx(90, abs=1)
 
 
-def test_refine_corners_where_none_is_keeps_its_start_with_a_large_covariance() -> None:
+def test_refine_corners_without_a_corner_keeps_its_start_with_a_large_covariance() -> None:
     picture = drawn(BOARD, camera=STRAIGHT)
     u, v = np.rint(picture.pixels[4]).astype(int)
     cv2.rectangle(picture.image, (int(u) - 20, int(v) - 20), (int(u) + 20, int(v) + 20), 128, -1)
@@ -93,7 +93,7 @@ def test_refine_corners_at_the_rim_uses_the_pixels_that_are_there() -> None:
 
 
 # ----------------------------------------------------------------------
-# Dots, refined, and what perspective makes of their middles.
+# Refined dots, and the shift of their middles by perspective.
 
 
 GRID = CircleGrid(columns=8, rows=6, spacing=0.03, diameter=0.02)
@@ -101,7 +101,7 @@ FLAT = GRID.points[:, :2]
 
 
 def ellipse_shift(matrix: np.ndarray, x: float, y: float, radius: float) -> np.ndarray:
-    """Return how far a circle's image has its middle from its centre's, by its dual conic."""
+    """Return the shift of a circle's image against its centre's, by its dual conic."""
     centre = np.array([x, y, 1.0])
     dual = radius**2 * np.diag([1.0, 1.0, 0.0]) - np.outer(centre, centre)
     seen = matrix @ dual @ matrix.T
@@ -149,7 +149,7 @@ def test_refine_dots_has_middles_areas_and_covariance() -> None:
     np.testing.assert_allclose(dots.areas, np.pi * (0.01 / 0.45) ** 2 * 600 * 602, rtol=0.01)
 
 
-def test_refine_dots_where_none_is_keeps_its_start() -> None:
+def test_refine_dots_without_a_dot_keeps_its_start() -> None:
     empty = grey_image(np.full((480, 640), 200, dtype=np.uint8))
     ways = np.tile(10 * np.eye(2), (2, 1, 1))
     start = np.array([[100.25, 90.0], [300.0, 200.5]])

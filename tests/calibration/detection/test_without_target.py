@@ -1,4 +1,4 @@
-"""Images without a target: given up after work that is bounded, whatever they show."""
+"""The search in any image without a target ends after bounded work."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def texture(random: np.random.Generator) -> Picture:
 
 
 def desk(random: np.random.Generator) -> Picture:
-    """Draw things with corners on each other."""
+    """Draw objects with corners on each other."""
     image = np.full(SIZE, 200, dtype=np.uint8)
     for _ in range(250):
         middle = random.uniform((0, 0), SIZE[::-1])
@@ -90,7 +90,7 @@ scenes = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Count what takes time in a search."""
+    """Count the slow steps of a search."""
     counted: Counter[str] = Counter()
 
     def count(place: Any, name: str) -> None:
@@ -157,7 +157,7 @@ def test_search_for_dots_looks_for_dark_and_light_ones_twice(
     ],
     ids=lambda target: f"{target.kind} {target.columns} x {target.rows}",
 )
-def test_search_where_another_target_is_seen_looks_at_few_sizes(
+def test_search_in_an_image_of_another_target_tries_few_sizes(
     shown: Target, wanted: Target, calls: Counter[str]
 ) -> None:
     with refused(Code.TARGET_NOT_FOUND):
@@ -249,7 +249,7 @@ def test_find_checkerboard_of_a_part_with_the_mark_has_its_numbers(
 ) -> None:
     board = Checkerboard(columns=shape[0], rows=shape[1], square=0.025, origin_mark=True)
     picture = drawn(board, camera=STRAIGHT, tilt=15, roll=roll, away=0.4)
-    # what lies beyond the third part of the board that is farthest from the mark is covered
+    # the third of the board that is farthest from the mark is covered
     place = board.points[:, :2] @ [1.0, 0.4]
     far = np.flatnonzero(place > np.quantile(place, 0.62))
     for u, v in np.rint(picture.pixels[far]).astype(int):
@@ -288,7 +288,7 @@ def squares(size: tuple[int, int], step: int, side: int) -> Picture:
 
 @pytest.mark.parametrize(("step", "side"), [(28, 20), (14, 10), (20, 12)])
 def test_many_squares_are_few_outlines_to_opencv(step: int, side: int) -> None:
-    """It compares each outline with each other one."""
+    """This search compares each outline with each other one."""
     image = squares((1024, 1224), step, side)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     without = cv2.aruco.DetectorParameters()

@@ -1,4 +1,4 @@
-"""Whatever a file with a right hash says, no calibration gives a pose of what is no number."""
+"""No file with a right hash gives a calibration whose poses contain NaN."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ WRONG = (1e308, -1e308, 1e99, -1e99, 1e-308, 0.0)
 
 
 def numbers(data: Any, *, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Yield where numbers stand; of long lists and of lists of mappings the first one's."""
+    """Yield the places of numbers; of long lists and lists of mappings the first one's."""
     if isinstance(data, float):
         yield path
     elif isinstance(data, dict):
@@ -125,7 +125,7 @@ def stereo() -> StereoCalibration:
 
 def stereo_gives(found: StereoCalibration) -> list[np.ndarray]:
     points = found.triangulate([[300.0, 240.0], [320.0, 200.0]], [[280.0, 240.0], [290.0, 200.0]])
-    return [points[~np.isnan(points)]]  # NaN is what the rays do not meet in
+    return [points[~np.isnan(points)]]  # the intersection of the rays is NaN
 
 
 CASES: list[tuple[Any, Callable[[Any], list[np.ndarray]]]] = [
@@ -167,7 +167,7 @@ def test_file_with_a_right_hash_and_any_number_gives_numbers_or_is_refused(
         inner[path[-1]] = right
 
 
-def test_file_with_a_number_that_cannot_be_is_refused_when_it_is_loaded(tmp_path: Path) -> None:
+def test_file_with_an_invalid_number_is_refused_at_the_load(tmp_path: Path) -> None:
     data = plane("similarity").to_data()
     data["matrix"][0][0] = 1e308
     write(tmp_path / "a.json", "plane", data)

@@ -1,4 +1,4 @@
-"""The store: exact, whole or not at all, and nothing that it does not know is read."""
+"""The store writes exactly, whole or not at all, and reads known versions only."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rewritten(path: Path, **changes: Any) -> None:
 
 
 def refusal(path: Path, kind: str = "plane") -> tuple[str, str]:
-    """Return code and text that reading a file is refused with."""
+    """Return code and text of the error of a file."""
     with pytest.raises(CalibrationError) as caught:
         read(path, kind)
     return caught.value.code, str(caught.value)
@@ -47,7 +47,7 @@ def test_floats_come_back_bit_by_bit(tmp_path_factory: Any, values: list[float])
     assert [struct.pack("<d", one) for one in back] == [struct.pack("<d", one) for one in values]
 
 
-def test_document_tells_all_that_was_written(tmp_path: Path) -> None:
+def test_document_has_all_written_fields(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write(path, "plane", {"x": [1, 2.5, None, "ü\ud800"]}, context={"tool": "pin"})
     document = read_document(path)
@@ -61,7 +61,7 @@ def test_document_tells_all_that_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), object(), {1, 2}])
-def test_write_of_what_json_lacks_is_refused_and_leaves_the_file(
+def test_write_of_values_that_json_lacks_is_refused_and_leaves_the_file(
     tmp_path: Path, value: object
 ) -> None:
     path = tmp_path / "a.json"
@@ -93,7 +93,7 @@ def test_read_of_another_kind_is_refused(tmp_path: Path) -> None:
         (b"[]", "no JSON object"),
         (b'{"a": 1}', "schema None, expected 'smartcam.calibration'"),
         (b'{"schema": "smartcam.calibration"}', "schema_version None"),
-        (b'{"schema": "smartcam.calibration", "schema_version": "1.0"}', "its hash is another"),
+        (b'{"schema": "smartcam.calibration", "schema_version": "1.0"}', "its hash does not match"),
         (b" " * (store.MAX_FILE_BYTES + 1), "more than 16777216 bytes"),
     ],
 )
@@ -114,7 +114,7 @@ def test_read_after_any_byte_was_changed_is_refused_or_the_same(tmp_path: Path) 
         changed[index] ^= 1
         path.write_bytes(changed)
         try:
-            assert read(path, "plane") == {"x": [0.1, 2]}  # between two values: no meaning
+            assert read(path, "plane") == {"x": [0.1, 2]}  # without a meaning between two values
         except CalibrationError as exc:
             assert exc.code in {"BROKEN_FILE", "NEWER_VERSION"}  # noqa: PT017  either is good
 
@@ -157,7 +157,7 @@ def test_backups_are_kept_newest_first(tmp_path: Path) -> None:
     assert files(tmp_path) == ["a.json", "a.json.1", "a.json.2", "a.json.3"]
 
 
-def test_keep_backup_where_no_link_can_be_made_copies(
+def test_keep_backup_copies_if_links_are_impossible(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -179,14 +179,14 @@ def test_replace_file_takes_the_place_of_a_link_and_leaves_its_target(tmp_path: 
 
 
 class PowerCutError(Exception):
-    """The power is gone."""
+    """The error of a power failure."""
 
 
 CALLS = {"open", "os.rename", "os.remove", "os.link", "os.truncate", "shutil.copyfile"}
-"""Audit events of what touches a file."""
+"""Audit events of calls that change files."""
 
 _calls_left: list[int] = []
-"""Number of calls that there is power for; empty: for all."""
+"""Number of calls before the power failure; empty: no failure."""
 
 
 def _cut(event: str, _arguments: object) -> None:

@@ -1,4 +1,4 @@
-"""Many writers of one file, and writers that are killed: whole or not at all, and nothing stays."""
+"""Many writers of one file, and killed ones, write whole or not at all, and leave nothing."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_many_writers_at_once_leave_whole_files_and_the_last_ones(tmp_path: Path
 def test_many_threads_replace_without_locks_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_whole_files, "try_lock", lambda _: None)  # a file system that knows none
+    monkeypatch.setattr(_whole_files, "try_lock", lambda _: None)  # a file system without links
     path = tmp_path / "a"
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda n: replace_file(path, b"%d" % n, backups=2), range(20)))
@@ -150,7 +150,7 @@ def test_process_killed_at_each_step_leaves_a_file_and_the_next_save_clears_up(
 
 
 def test_write_after_crashes_of_an_earlier_version(tmp_path: Path) -> None:
-    # a file and all its backups are names of one file: three crashes behind the backup
+    # a file and all its backups are names of one file: three crashes after the backup
     path = tmp_path / "a.json"
     write(path, "plane", {"n": 0})
     for number in (1, 2, 3):
@@ -175,7 +175,7 @@ def refused(path: Path) -> tuple[str, str]:
     return caught.value.code, str(caught.value)
 
 
-def test_write_that_the_disk_refuses_is_told_as_ours(tmp_path: Path) -> None:
+def test_write_that_the_disk_refuses_is_a_calibration_error(tmp_path: Path) -> None:
     path = tmp_path / "none" / "a.json"
     text = f"{path}: cannot be written: No such file or directory"
     assert refused(path) == ("NOT_WRITTEN", text)

@@ -65,7 +65,7 @@ def test_chain_of_a_calibration_has_its_camera() -> None:
     _same(chain.cameras[0], found.camera)
 
 
-def test_camera_info_is_what_ros_reads() -> None:
+def test_camera_info_is_read_by_ros() -> None:
     data = yaml.safe_load(compose_camera_info(WIDE, "wide: 1"))
     assert (data["image_width"], data["image_height"]) == (640, 480)
     assert data["camera_name"] == "wide: 1"
@@ -95,7 +95,7 @@ def test_camera_info_of_a_rectified_pair_has_its_projection(tmp_path: Path) -> N
     assert baseline == pytest.approx(np.linalg.norm(RIG.translation))
 
 
-def test_camchain_is_what_kalibr_reads() -> None:
+def test_camchain_is_read_by_kalibr() -> None:
     data = yaml.safe_load(compose_camchain(TWO))
     assert list(data) == ["cam0", "cam1"]
     assert data["cam0"]["intrinsics"] == [530.0, 531.0, 325.0, 236.0]
@@ -168,7 +168,7 @@ def test_camera_info_with_more_coefficients_than_its_model_has_must_have_zeros()
         ),
     ],
 )
-def test_write_cameras_of_what_a_format_cannot_hold_raises(
+def test_write_cameras_of_values_that_a_format_cannot_store_raises(
     tmp_path: Path, form: CameraForm, chain: CameraChain, text: str
 ) -> None:
     with pytest.raises(CalibrationError, match=text) as caught:
@@ -228,7 +228,7 @@ def test_read_cameras_of_a_spoiled_file_raises(
 @pytest.mark.parametrize(
     ("content", "text"), [(b"\xff\xfe\xff", "UTF-8"), (b"a" * (1 << 20) + b"b", "1048576 bytes")]
 )
-def test_read_cameras_of_what_is_no_text_raises(tmp_path: Path, content: bytes, text: str) -> None:
+def test_read_cameras_of_binary_files_raises(tmp_path: Path, content: bytes, text: str) -> None:
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(CalibrationError, match=text):
         read_cameras(tmp_path / "file", "opencv")

@@ -1,4 +1,4 @@
-"""Files of other programs that are only read: their structure, and what they leave open."""
+"""Files of other programs that are only read: their structure, and missing facts."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def test_multical_pair_wants_the_unit_of_its_board(tmp_path: Path) -> None:
         ("basalt", '{"value0": {"intrinsics": []}}', Code.MALFORMED, "1 to 64 cameras"),
     ],
 )
-def test_camera_of_another_program_that_is_spoiled_says_how(
+def test_damaged_camera_of_another_program_is_refused_with_the_fault(
     tmp_path: Path, form: CameraForm, text: str, code: Code, said: str
 ) -> None:
     (tmp_path / "file").write_text(text)
@@ -411,11 +411,11 @@ def test_sensor_of_euroc_sits_on_its_body(tmp_path: Path) -> None:
         ("ros2", LAUNCH + "(", Code.MALFORMED, "launch file: expected Python"),
     ],
 )
-def test_pose_of_another_program_that_is_spoiled_says_how(
+def test_damaged_pose_of_another_program_is_refused_with_the_fault(
     tmp_path: Path, form: str, text: str, code: Code | None, said: str
 ) -> None:
     (tmp_path / "file").write_text(text)
-    if code is None:  # another joint's origin is not looked at
+    if code is None:  # another joint's origin does not count
         assert read_transform(tmp_path / "file", form, target="flange").source == "camera"
         return
     with refused(code, said):
@@ -442,7 +442,7 @@ def test_angles_of_more_than_a_turn_are_no_radians(tmp_path: Path) -> None:
         read_transform(tmp_path / "tf.txt", "tf2")
 
 
-def test_unit_that_a_file_says_is_taken_and_another_one_goes_before_it(tmp_path: Path) -> None:
+def test_unit_of_a_file_is_used_unless_the_user_gives_another(tmp_path: Path) -> None:
     text = '%YAML:1.0\n---\nunit: "mm"\nPose: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n'
     flat = ", ".join(str(value) for row in ROWS for value in row)
     (tmp_path / "a.yaml").write_text(f"{text}   data: [ {flat} ]\n")

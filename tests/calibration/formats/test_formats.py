@@ -1,4 +1,4 @@
-"""Formats of other programs: what is written, who else reads it, what comes back."""
+"""Formats of other programs are written, read by other programs, and read back."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from tests.geometry.rigid import (
 MOVEIT = ROOT / "tests/data/moveit_calibration/pose_samples.json"
 
 WRITTEN = [name for name, form in TRANSFORMS.items() if form.compose is not None]
-"""Formats of transforms that are not only read."""
+"""Formats of transforms that can be written."""
 
 TURNED = Transform(
     "base",
@@ -64,7 +64,7 @@ TURNED = Transform(
 
 
 def written(tmp_path: Path, form: str, transform: Transform = TURNED) -> str:
-    """Return what is in a file of a transform."""
+    """Return the transform in a file."""
     write_transform(tmp_path / "file", form, transform)
     return (tmp_path / "file").read_text()
 
@@ -102,7 +102,7 @@ def test_transform_written_and_read_is_the_same(
     assert close(back, transform, 4e-15)
 
 
-def test_easy_handeye_file_has_what_its_program_reads(tmp_path: Path) -> None:
+def test_easy_handeye_file_has_the_fields_that_its_program_reads(tmp_path: Path) -> None:
     data = yaml.safe_load(written(tmp_path, "easy_handeye"))
     assert data["parameters"] == {
         "eye_on_hand": False, "move_group": "manipulator", "move_group_namespace": "/",
@@ -114,7 +114,7 @@ def test_easy_handeye_file_has_what_its_program_reads(tmp_path: Path) -> None:
     assert [pose[key] for key in ("qx", "qy", "qz", "qw")] == TURNED.quaternion.tolist()
 
 
-def test_easy_handeye2_file_has_what_its_program_reads(tmp_path: Path) -> None:
+def test_easy_handeye2_file_has_the_fields_that_its_program_reads(tmp_path: Path) -> None:
     data = yaml.safe_load(written(tmp_path, "easy_handeye2_in_hand"))
     assert data["parameters"] == {
         "name": "smartcam", "calibration_type": "eye_in_hand", "robot_base_frame": "",
@@ -320,7 +320,7 @@ def test_samples_of_moveit_are_read_and_written(tmp_path: Path) -> None:
     assert np.array_equal(again, json.loads(MOVEIT.read_text()))
 
 
-def test_samples_of_moveit_say_where_the_camera_is_as_its_own_test_does() -> None:
+def test_samples_of_moveit_give_the_camera_pose_of_its_own_test() -> None:
     cv2 = pytest.importorskip("cv2", reason="needs the extra calibration")
     found = read_samples(MOVEIT, "moveit")
     rotation, shift = cv2.calibrateHandEye(
@@ -331,7 +331,7 @@ def test_samples_of_moveit_say_where_the_camera_is_as_its_own_test_does() -> Non
         method=cv2.CALIB_HAND_EYE_DANIILIDIS,
     )
     camera = Transform("base", "camera", rotation, shift.ravel())
-    # the target is fixed to the hand: seen from there it is always at the same place
+    # the target is fixed to the hand: in the hand's frame its place is constant
     places = [(one.hand.inverse() @ camera @ one.seen).translation for one in found]
     assert np.std(places, axis=0).max() < 0.02
 
@@ -440,7 +440,7 @@ def test_trajectory_goes_by_its_header(tmp_path: Path, head: str, time: str) -> 
         "t,x,y,z,x,qx,qy,qz,qw",
     ],
 )
-def test_trajectory_without_a_header_that_says_all_is_refused(tmp_path: Path, head: str) -> None:
+def test_trajectory_with_an_incomplete_header_is_refused(tmp_path: Path, head: str) -> None:
     (tmp_path / "t.csv").write_text(f"{head}\n10.25,1,2,3,0,0,0.6,0.8\n")
     with refused("MALFORMED", "header: expected #t [s],x [m]", "the unit of time among them"):
         read_trajectory(tmp_path / "t.csv", "asl")
@@ -458,7 +458,7 @@ def test_trajectory_without_a_header_that_says_all_is_refused(tmp_path: Path, he
         ("253402300800,2,3,4,0,0,0,1", "BAD_TIME", "before the year 10000"),
     ],
 )
-def test_trajectory_with_a_row_that_is_none_is_refused(
+def test_trajectory_with_an_invalid_row_is_refused(
     tmp_path: Path, row: str, code: str, text: str
 ) -> None:
     (tmp_path / "t.csv").write_text(f"t,x,y,z,qx,qy,qz,qw\n{row}\n")

@@ -1,4 +1,4 @@
-"""Files of other programs are bad input: whatever stands in them, the error has a code."""
+"""For any contents of other programs' files, the error has a code."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from tests.geometry.rigid import FEW, refused
 from tests.layout.bombs import laughs, merges
 
 PARSED = ["ros2", "ros_industrial", "easy_handeye", "easy_handeye2", "opencv"]
-"""One format of a transform for each reader; the others share theirs."""
+"""A format of a transform for each reader."""
 
 LOADERS = ["ros2", "ros_industrial", "moveit", "asl"]
-"""One format of each way in which text is read."""
+"""A format for each parser of text."""
 
 READERS: dict[str, tuple[Callable[..., object], str | None]] = {
     **{form: (read_transform, form) for form in PARSED},
@@ -44,7 +44,7 @@ READERS: dict[str, tuple[Callable[..., object], str | None]] = {
 
 
 def refusal(path: Path, form: str) -> CalibrationError | None:
-    """Return the error of a file, None where it is read."""
+    """Return the error of a file; None: the file is read."""
     try:
         read(path, form)
     except CalibrationError as error:
@@ -297,7 +297,7 @@ def test_matrix_that_is_no_rigid_motion_is_refused(
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999", "true", "null", "[]", "1" * 5000])
-def test_json_with_what_is_no_number_is_refused(tmp_path: Path, number: str) -> None:
+def test_json_with_values_that_are_no_numbers_is_refused(tmp_path: Path, number: str) -> None:
     row = f"[{number}, 0, 0, 0]"
     (tmp_path / "file").write_text(
         f"[[[{row}, {row}, {row}, {row}], [{row}, {row}, {row}, {row}]]]"
@@ -320,7 +320,7 @@ def test_json_that_is_too_deep_is_refused() -> None:
         load_json("[" * 100_000)
 
 
-def test_yaml_without_pyyaml_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yaml_without_pyyaml_names_the_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[yaml\]"'):
         load_yaml("a: 1")

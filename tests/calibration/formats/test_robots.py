@@ -1,4 +1,4 @@
-"""Poses as robots write them, against SciPy's rotations and the makers' own formulas."""
+"""Compare poses in robots' conventions with SciPy's rotations and the makers' formulas."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_pose_from_angles_is_the_rotation_of_scipy(
 @pytest.mark.parametrize("robot", EULER)
 @FEW
 @given(pose=transforms("base", "tool"))
-def test_pose_to_angles_is_what_scipy_makes_the_same_rotation_of(
+def test_pose_to_angles_gives_angles_of_the_same_rotation_in_scipy(
     robot: str, pose: Transform
 ) -> None:
     values = pose_to(robot, pose)
@@ -81,15 +81,15 @@ def test_pose_written_and_read_is_the_same(robot: str, pose: Transform) -> None:
         ("kuka", [0, 0, 90], X, Z),  # c is about x
         ("fanuc", [90, 0, 0], X, Z),  # w is about x
         ("fanuc", [0, 0, 90], Y, -X),  # r is about z
-        ("meca500", [90, 90, 0], Y, Z),  # x first, then the y that was turned with it
-        ("fanuc", [90, 90, 0], -Z, X),  # x first, then the y that stands
+        ("meca500", [90, 90, 0], Y, Z),  # x first, then the turned y
+        ("fanuc", [90, 90, 0], -Z, X),  # x first, then the fixed y
         ("ur", [0, 0, math.pi / 2], Y, -X),
         ("abb", [math.sqrt(0.5), 0, 0, math.sqrt(0.5)], Y, -X),
         ("wxyz", [math.sqrt(0.5), math.sqrt(0.5), 0, 0], X, Z),
         ("xyzw", [math.sqrt(0.5), 0, 0, math.sqrt(0.5)], X, Z),
     ],
 )
-def test_pose_from_turns_the_axes_as_the_maker_says(
+def test_pose_from_angles_turns_the_axes_by_the_maker_s_convention(
     robot: str, turn: list[float], x_goes_to: Any, y_goes_to: Any
 ) -> None:
     rotation = pose_from(robot, [0, 0, 0, *turn]).rotation
@@ -129,7 +129,7 @@ def test_vector_longer_than_half_a_turn_comes_back_as_the_shorter_way() -> None:
         ("xyzw", [0] * 7, "NOT_RIGID", "of length 0"),
     ],
 )
-def test_pose_from_what_is_none_is_refused(robot: str, values: Any, code: str, text: str) -> None:
+def test_pose_from_invalid_values_is_refused(robot: str, values: Any, code: str, text: str) -> None:
     with refused(code, text):
         pose_from(robot, values)
 

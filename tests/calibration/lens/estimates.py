@@ -38,7 +38,7 @@ def spread_poses(camera: CameraModel, count: int, *, seed: int = 5) -> list[Tran
 
 
 class Bench:
-    """One set of poses before a camera; calibrations differ by their noise."""
+    """A set of poses in front of a camera; calibrations differ by their noise."""
 
     def __init__(self, camera: CameraModel, poses: list[Transform], sigma: float = SIGMA) -> None:
         self.camera, self.poses, self.sigma = camera, poses, sigma
@@ -51,7 +51,7 @@ class Bench:
 
     @functools.cached_property
     def back(self) -> Array:
-        """The change of all that is sought by a change of each coordinate of a pixel."""
+        """The derivatives of all unknowns by each coordinate of a pixel."""
         rows = []
         for number, (pose, view) in enumerate(zip(self.poses, self.views, strict=True)):
             at = linearize(pose.apply(view.object_points), self.camera)
@@ -74,7 +74,7 @@ class Bench:
 
     @functools.cached_property
     def gauge(self) -> Array:
-        """The points that are seen, before the camera."""
+        """The visible points, in the camera's frame."""
         return np.concatenate(
             [
                 pose.apply(one.object_points)
@@ -84,7 +84,7 @@ class Bench:
 
     @functools.cache  # noqa: B019 - benches are few, and live as long as the tests
     def lens(self, seed: int) -> CameraModel:
-        """Return what is found of the lens under some noise."""
+        """Return the estimated lens under some noise."""
         (fx, _, cx), (_, fy, cy), _ = self.camera.matrix
         lens = np.concatenate([[fx, fy, cx, cy], self.camera.distortion])
         poses = Rigid.stacked(one.rigid for one in self.poses)
@@ -111,7 +111,7 @@ class Bench:
         return camera
 
     def calibration(self, seed: int | None = None) -> IntrinsicCalibration:
-        """Return a calibration, without noise where there is no seed."""
+        """Return a calibration; without a seed there is no noise."""
         fits = [
             ViewFit(
                 view=view,

@@ -36,7 +36,7 @@ def test_calibrations_of_one_lens_are_the_same_within_their_noise(distance: floa
     assert found.verdict.startswith("the same within their noise: ")
 
 
-def test_lens_that_is_another_is_told_from_noise() -> None:
+def test_another_lens_differs_by_more_than_noise() -> None:
     moved = Bench(longer(LENS, 3.0), SECOND.poses).calibration(2)
     found = compare(FIRST.calibration(1), moved)
     assert found.same is False
@@ -45,7 +45,7 @@ def test_lens_that_is_another_is_told_from_noise() -> None:
     assert found.verdict.startswith("they differ by more than their noise explains: ")
 
 
-def test_lens_of_another_model_is_told_by_what_no_values_explain() -> None:
+def test_lens_of_another_model_differs_by_a_part_that_no_values_explain() -> None:
     bent = dataclasses.replace(LENS, distortion=LENS.distortion + np.array([0, 0, 0.002, 0, 0]))
     exact = dataclasses.replace(FIRST.calibration(1), covariance=1e-8 * FIRST.covariance)
     other = dataclasses.replace(exact, camera=bent)
@@ -104,13 +104,13 @@ def test_images_of_two_sizes_are_refused() -> None:
     assert caught.value.code == Code.WRONG_SIZE
 
 
-def test_what_has_no_lens_is_refused() -> None:
+def test_calibration_without_a_lens_is_refused() -> None:
     with pytest.raises(CalibrationError, match="expected calibrations of lenses") as caught:
         compare(LENS, LENS.matrix)  # type: ignore[arg-type]
     assert caught.value.code == Code.SHAPE
 
 
-def test_pair_is_compared_by_where_its_cameras_stand() -> None:
+def test_pair_is_compared_by_the_places_of_its_cameras() -> None:
     same = compare(LENS, LENS)
     turned = Transform(
         "right",
@@ -133,7 +133,7 @@ def test_chance_is_one() -> None:
         for seed in range(150)
     ]
     chances = np.array([one.chance for one in found])
-    # as few views tell how large the noise is, it errs to the safe side
+    # few views estimate the noise badly, so the comparison errs to the safe side
     assert (chances < 0.05).mean() <= 0.05
     assert 0.2 < (chances < 0.5).mean() < 0.6
     assert (chances < 0.01).mean() <= 0.03

@@ -1,4 +1,4 @@
-"""Pictures of calibrations from images: what they show, and that nothing lies on anything."""
+"""Pictures of calibrations from images have the right contents without overlaps."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class Written(NamedTuple):
 
 
 def written(svg: str) -> list[Written]:
-    """Return the texts of a picture and the room that each takes, about."""
+    """Return the texts of a picture and their approximate boxes."""
     found = []
     for one in parsed(svg).iter(f"{SVG}text"):
         kind = one.get("class", "")
@@ -208,7 +208,7 @@ def test_bars_are_as_high_as_the_errors() -> None:
     assert np.array(second) / first == pytest.approx(np.full(12, 2.0), rel=1e-2)
 
 
-def test_bar_of_a_bad_view_is_cut_and_says_its_number() -> None:
+def test_bar_of_a_bad_view_is_cut_and_has_its_value() -> None:
     svg = draw_views(with_bad_view())
     assert len(rectangles(svg, "off")) == 2
     assert max(rectangles(svg, "first")) > 0.25 * max(rectangles(svg, "off"))
@@ -233,7 +233,7 @@ def test_scene_of_a_robot_has_its_poses(setup: Setup, boards: int, cameras: int)
     assert {"base", "x", "y", "z"} <= {one.said for one in written(svg)}
 
 
-def test_map_says_its_figures_and_where_it_has_none() -> None:
+def test_map_has_its_figures_and_marks_places_without_a_value() -> None:
     found = LENS.uncertainty(distance=0.5)
     svg = draw_uncertainty(found)
     assert f"centre {found.figures.centre:.2g}, corners {found.figures.corners:.2g}" in svg
@@ -255,7 +255,7 @@ def test_map_of_a_lens_that_is_exact_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("draw", [draw_views, draw_scene, draw_uncertainty])
-def test_what_cannot_be_drawn_is_refused(draw: object) -> None:
+def test_objects_that_cannot_be_drawn_are_refused(draw: object) -> None:
     with pytest.raises(
         CalibrationError, match=r"expected a calibration .*, got CameraModel"
     ) as one:
@@ -275,5 +275,5 @@ def test_what_cannot_be_drawn_is_refused(draw: object) -> None:
         (["x", "x1"], ["x", "1"]),
     ],
 )
-def test_names_are_told_apart_by_what_differs(names: list[str], short: list[str]) -> None:
+def test_names_are_shortened_to_their_different_parts(names: list[str], short: list[str]) -> None:
     assert short_names(names) == short

@@ -1,4 +1,4 @@
-"""The choice of the next view by what it tells, and its text."""
+"""The choice of the next view by its gain, and its text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CENTRE = Bench(LENS, lenskit.poses(4, seed=3))
 CHARUCO = Charuco(columns=7, rows=5, square=0.03, marker=0.0225)
 
 
-def test_best_view_comes_first_and_each_says_what_it_is_worth() -> None:
+def test_best_view_comes_first_and_each_view_has_its_gain() -> None:
     found = suggest_views(CENTRE.calibration())
     means = [one.mean for one in found]
     assert len(found) > 60
@@ -29,17 +29,17 @@ def test_best_view_comes_first_and_each_says_what_it_is_worth() -> None:
     assert found[0].mean < 0.1 * found[0].present
 
 
-def test_worth_of_a_view_is_the_uncertainty_once_it_is_taken() -> None:
+def test_mean_of_a_view_is_the_uncertainty_after_it() -> None:
     best = suggest_views(CENTRE.calibration(), distance=0.4)[0]
     taken = Bench(LENS, [*CENTRE.poses, best.transform])
     before = CENTRE.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.present == pytest.approx(before.figures.mean, rel=1e-6)
-    # the gauge takes the new view in, too, so they are not quite the same
+    # the gauge includes the new view, too, so both differ a little
     after = taken.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.mean == pytest.approx(after.figures.mean, rel=0.3)
 
 
-def test_view_where_the_target_never_was_helps_more() -> None:
+def test_view_at_a_new_place_of_the_target_helps_more() -> None:
     best = suggest_views(CENTRE.calibration())[0]
     corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479]])
     near = np.linalg.norm(best.outline[:, None] - corners, axis=2).min()
@@ -57,7 +57,7 @@ def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target:
         assert ((seen >= 0) & (seen <= np.array(camera.size) - 1)).all()
 
 
-def test_words_say_where_the_target_is_and_which_side_is_away() -> None:
+def test_text_names_the_target_s_place_and_its_far_side() -> None:
     straight = CameraModel(size=(640, 480), matrix=LENS.matrix)
     found = candidates(straight, lenskit.BOARD)
     poses = dict(zip(found.texts, map(found.poses.taken, range(found.poses.size)), strict=True))
@@ -84,21 +84,21 @@ def test_words_say_where_the_target_is_and_which_side_is_away() -> None:
         assert sign * farthest[axis] > 0.04
 
 
-def test_values_that_were_held_stay_so() -> None:
+def test_fixed_values_stay_fixed() -> None:
     held = CENTRE.calibration()
     held.covariance[8] = held.covariance[:, 8] = 0.0  # k3
     found = suggest_views(held)
     assert all(math.isfinite(one.mean) and one.mean < one.present for one in found)
 
 
-def test_distance_that_is_none_is_refused() -> None:
+def test_invalid_distance_is_refused() -> None:
     with pytest.raises(CalibrationError) as caught:
         suggest_views(CENTRE.calibration(), distance=-1.0)
     assert caught.value.code == Code.NOT_FINITE
 
 
 def held(best: NextView, random: np.random.Generator) -> Transform:
-    """Return a pose as people hold what they were told: by 3 degrees and 10 mm off."""
+    """Return a pose that a person would hold: 3 degrees and 10 mm off the suggested one."""
     turn = exp_rotation(random.normal(0, math.radians(3), 3)) @ best.transform.rotation
     shift = best.transform.translation + random.normal(0, 0.01, 3)
     return Transform("camera", "target", turn, shift)
@@ -106,7 +106,7 @@ def held(best: NextView, random: np.random.Generator) -> Transform:
 
 @pytest.mark.long
 @pytest.mark.parametrize("camera", [lenskit.LEFT, lenskit.FISHEYE])
-def test_ten_views_as_suggested_tell_a_lens_better_than_ten_at_random(camera: CameraModel) -> None:
+def test_ten_suggested_views_beat_ten_random_ones(camera: CameraModel) -> None:
     ratios = []
     for seed in range(3):
         random = np.random.default_rng(seed)

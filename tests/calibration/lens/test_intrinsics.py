@@ -27,11 +27,11 @@ from tests.calibration.inside import (
     Sight,
     adjust_shape,
     adjust_weighted,
-    as_meant,
     choose_shape,
     coverage,
     leave_out,
     lens_values,
+    moved_to_nominal,
     residuals,
     with_lens,
 )
@@ -46,11 +46,11 @@ if TYPE_CHECKING:
 
 @functools.cache
 def _calibrated(first: int = 0) -> IntrinsicCalibration:
-    """Return what eight views from ``first`` on give."""
+    """Return the calibration from eight views, from ``first`` on."""
     return calibrate_intrinsics(seen(LEFT, poses(8))[first:])
 
 
-def test_calibrate_intrinsics_finds_the_lens_as_well_as_it_says() -> None:
+def test_calibrate_intrinsics_finds_the_lens_within_its_covariance() -> None:
     found = calibrate_intrinsics(seen(LEFT, poses(9)), sheet="auto")
     off = lens_values(found.camera) - lens_values(LEFT)
     deviations = np.array(list(found.deviations.values()))
@@ -111,7 +111,7 @@ def test_calibrate_intrinsics_leaves_out_a_third_of_the_views_at_most() -> None:
     assert [one.code for one in found.warnings].count(Code.BAD_VIEW) == 4
 
 
-def test_calibrate_intrinsics_told_to_keep_a_bad_view_names_it_only() -> None:
+def test_calibrate_intrinsics_keeps_a_bad_view_on_request_and_names_it() -> None:
     views = seen(LEFT, poses(10))
     shaken = views[4].points + 0.5 * np.random.default_rng(2).normal(size=views[4].points.shape)
     views[4] = dataclasses.replace(views[4], points=shaken)
@@ -133,7 +133,7 @@ def test_calibrate_intrinsics_of_a_bent_sheet_finds_its_shape() -> None:
     assert found.held_out < 0.08 < 0.2 < exact.held_out
     assert abs(found.camera.matrix[0, 0] - 530.0) < 1.5
     (remark,) = [one for one in found.warnings if one.code == Code.SHEET_NOT_EXACT]
-    assert "mm rms from where they were meant to be" in remark.text
+    assert "mm rms from their nominal places" in remark.text
 
 
 def test_point_errors_of_a_view_left_out_are_its_held_out_error() -> None:
@@ -145,7 +145,7 @@ def test_point_errors_of_a_view_left_out_are_its_held_out_error() -> None:
     assert rms == pytest.approx(found.views[0].held_out, rel=1e-3)
 
 
-def test_point_errors_of_another_target_are_taken_as_well() -> None:
+def test_point_errors_of_another_target_are_computed_too() -> None:
     found = _calibrated()
     finer = Checkerboard(columns=11, rows=8, square=0.02)
     errors = np.concatenate(found.point_errors(seen(LEFT, poses(3, seed=9), target=finer)))
@@ -190,7 +190,7 @@ def test_calibrate_intrinsics_of_hidden_corners_uses_those_that_are_seen() -> No
     assert len(found.views[0].residuals) == int(some[0].sum())
 
 
-def test_calibrate_intrinsics_of_three_views_says_that_none_was_held_out() -> None:
+def test_calibrate_intrinsics_of_three_views_reports_that_none_was_held_out() -> None:
     found = calibrate_intrinsics(seen(LEFT, poses(3, seed=3)))
     assert math.isnan(found.held_out)
     codes = [one.code for one in found.warnings]
@@ -198,7 +198,7 @@ def test_calibrate_intrinsics_of_three_views_says_that_none_was_held_out() -> No
     assert Code.POOR_COVERAGE in codes
 
 
-def test_calibrate_intrinsics_of_the_wrong_model_says_so() -> None:
+def test_calibrate_intrinsics_of_the_wrong_model_has_a_remark() -> None:
     views = seen(FISHEYE, poses(6, tilt=0.9, distance=0.12))
     found = calibrate_intrinsics(views, drop_bad=False, fixed=["k1", "k2", "k3"])
     assert any(one.code == Code.POOR_FIT for one in found.warnings)
@@ -280,7 +280,7 @@ def test_fit_lens_of_views_without_noise_finds_the_lens(
 
 
 @pytest.mark.parametrize("fails", [1, 2])
-def test_fit_lens_begins_elsewhere_where_opencv_gives_up(
+def test_fit_lens_has_another_start_if_opencv_gives_up(
     fails: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calibrate, calls = cv2.calibrateCamera, []
@@ -353,19 +353,19 @@ RANDOM = np.random.default_rng(11)
 OFF = BOARD.points + 2e-4 * RANDOM.normal(size=(54, 3))
 
 
-def test_as_meant_takes_place_direction_and_size_away() -> None:
+def test_moved_to_nominal_removes_place_direction_and_size() -> None:
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = 1.7 * BOARD.points @ turn.T + [0.3, -0.2, 0.5]
-    np.testing.assert_allclose(as_meant(moved, BOARD.points), BOARD.points, atol=1e-12)
+    np.testing.assert_allclose(moved_to_nominal(moved, BOARD.points), BOARD.points, atol=1e-12)
 
 
-def test_adjust_shape_finds_where_the_points_are() -> None:
+def test_adjust_shape_finds_the_places_of_the_points() -> None:
     views = seen(LEFT, poses(15), sigma=0.02, points=OFF)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     before = fit_lens(views, "plumb_bob")
     found = adjust_shape(before.bundle, sights, before.more)
     assert found.bundle.points is not None
-    off = found.bundle.points - as_meant(OFF, BOARD.points)
+    off = found.bundle.points - moved_to_nominal(OFF, BOARD.points)
     assert np.sqrt((off**2).mean()) < 4e-5
     assert found.more < 0.1 * before.more
     assert found.freedom == before.freedom - 3 * 54 + 7
@@ -389,7 +389,7 @@ def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) 
         assert off == pytest.approx(rms, rel=0.01)
 
 
-def test_held_out_of_a_view_does_not_know_it() -> None:
+def test_held_out_error_of_a_view_does_not_use_it() -> None:
     views = seen(LEFT, poses(8))
     shaken = views[3].points + 2.0 * np.random.default_rng(4).normal(size=views[3].points.shape)
     spoiled = [*views[:3], dataclasses.replace(views[3], points=shaken), *views[4:]]
@@ -404,7 +404,7 @@ def test_held_out_of_a_view_does_not_know_it() -> None:
     assert np.abs((lens_values(moved.bundle.cameras[0]) - lenses[0]) / deviations).max() > 5.0
 
 
-STRETCHED = as_meant(BOARD.points * [1.008, 0.995, 1.0], BOARD.points)
+STRETCHED = moved_to_nominal(BOARD.points * [1.008, 0.995, 1.0], BOARD.points)
 
 
 def test_calibrate_intrinsics_of_a_stretched_sheet_finds_by_how_much_both_ways() -> None:
@@ -416,7 +416,7 @@ def test_calibrate_intrinsics_of_a_stretched_sheet_finds_by_how_much_both_ways()
     assert np.abs(error / np.array(list(found.deviations.values()))).max() < 4.0
 
 
-def test_calibrate_intrinsics_of_a_stretched_sheet_taken_as_exact_says_so() -> None:
+def test_calibrate_intrinsics_of_a_stretched_sheet_has_a_remark() -> None:
     found = calibrate_intrinsics(seen(LEFT, poses(8), points=STRETCHED), sheet="exact")
     assert found.sheet is None
     (remark,) = [one for one in found.warnings if one.code == Code.SHEET_NOT_EXACT]
@@ -460,13 +460,15 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
     assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
 
 
-def test_adjust_shape_shows_the_same_with_place_direction_and_size_as_meant() -> None:
+def test_adjust_shape_keeps_the_nominal_place_direction_and_size() -> None:
     views = seen(LEFT, poses(8), points=OFF)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     fitted = fit_lens(views, "plumb_bob")
     found = adjust_shape(fitted.bundle, sights, fitted.more).bundle
     assert found.points is not None
-    np.testing.assert_allclose(as_meant(found.points, BOARD.points), found.points, atol=1e-9)
+    np.testing.assert_allclose(
+        moved_to_nominal(found.points, BOARD.points), found.points, atol=1e-9
+    )
     together = np.concatenate(residuals(found, sights))
     assert together.std() == pytest.approx(0.045, rel=0.1)
 
@@ -489,7 +491,7 @@ def test_coverage_from_corner_to_corner_fills_the_bars_of_place() -> None:
     assert bars.lacking == ("size", "skew")
 
 
-def test_coverage_of_a_part_of_the_way_is_that_part_of_what_is_enough() -> None:
+def test_coverage_is_a_part_of_the_enough_range() -> None:
     middle = 100 * SQUARE + [0.35 * 540, 0]
     assert coverage([100 * SQUARE, middle], (640, 480)).x == pytest.approx(0.5)
 
@@ -595,7 +597,7 @@ def test_adjust_of_points_behind_the_camera_gives_up() -> None:
     assert np.isnan(found.by_noise).all()
 
 
-def test_adjust_weighted_finds_what_the_covariance_does_not_say() -> None:
+def test_adjust_weighted_finds_the_variance_beyond_the_covariance() -> None:
     sights = [
         one._replace(view=dataclasses.replace(one.view, covariance=0.01 * one.view.covariance))
         for one in _sights(8, 0.2)

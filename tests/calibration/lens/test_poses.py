@@ -54,14 +54,14 @@ def test_locate_weights_points_by_their_covariance() -> None:
     assert np.linalg.norm(_off(locate(alike, LEFT).transform, NEAR)[3:]) > 5e-4
 
 
-def test_locate_covariance_grows_where_residuals_are_larger_than_the_points_say() -> None:
+def test_locate_covariance_grows_with_residuals_beyond_the_points_covariance() -> None:
     view = seen(LEFT, [NEAR], sigma=0.2)[0]
     bold = dataclasses.replace(view, covariance=view.covariance * 1e-4)
     ratio = np.diag(locate(bold, LEFT).covariance) / np.diag(locate(view, LEFT).covariance)
     np.testing.assert_allclose(ratio, 1.0, atol=0.5)
 
 
-def test_locate_of_a_far_plane_tells_of_the_other_pose() -> None:
+def test_locate_of_a_far_plane_reports_the_ambiguity() -> None:
     turn = Rotation.from_euler("xyz", [np.pi - 0.15, 0.1, 0.1]).as_matrix()
     far = Transform("camera", "target", turn, np.array([-0.1, 0.06, 3.0]))
     found = locate(seen(LEFT, [far], sigma=0.2)[0], LEFT)
@@ -94,7 +94,7 @@ def test_locate_of_a_part_of_the_points_uses_their_ids() -> None:
         ({"points": np.full((54, 2), np.nan)}, Code.NOT_FINITE, "expected finite numbers"),
     ],
 )
-def test_locate_of_what_leaves_the_pose_open_raises(
+def test_locate_of_points_that_leave_the_pose_open_raises(
     changes: dict[str, Any], code: Code, text: str
 ) -> None:
     view = seen(LEFT, [NEAR], sigma=0.0)[0]
@@ -110,14 +110,14 @@ def test_locate_of_what_leaves_the_pose_open_raises(
 def test_locate_of_points_that_no_pose_explains_raises() -> None:
     view = seen(LEFT, [NEAR], sigma=0.0)[0]
     points = np.tile([320.0, 240.0], (54, 1))
-    with pytest.raises(CalibrationError, match="expected one before the camera") as caught:
+    with pytest.raises(CalibrationError, match="expected one in front of the camera") as caught:
         locate(dataclasses.replace(view, points=points), LEFT)
     assert caught.value.code == Code.POOR_FIT
     assert len(BOARD.points) == 54
 
 
 def test_locate_of_exact_rays_survives_the_solver() -> None:
-    pose = poses(10, tilt=0.9, distance=0.12)[0]  # of which OpenCV's solver makes NaN
+    pose = poses(10, tilt=0.9, distance=0.12)[0]  # for which OpenCV's solver gives NaN
     found = locate(seen(FISHEYE, [pose], sigma=0.0)[0], FISHEYE)
     np.testing.assert_allclose(_off(found.transform, pose), 0.0, atol=1e-7)
 
@@ -189,6 +189,6 @@ def test_excess_is_the_variance_that_the_covariance_does_not_explain() -> None:
 
 
 @pytest.mark.parametrize("freedom", [0, 100])
-def test_excess_is_zero_where_nothing_is_left_to_explain(freedom: int) -> None:
+def test_excess_is_zero_if_noise_explains_all(freedom: int) -> None:
     residuals = 0.1 * np.random.default_rng(4).normal(size=(50, 2))
     assert excess(residuals, np.tile(0.01 * np.eye(2), (50, 1, 1)), freedom) == 0.0

@@ -1,4 +1,4 @@
-"""A lens' own error where views err as a whole: simulation with known truth."""
+"""The error of a lens from views with common errors: simulation with known truth."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def rolled(around: list[Transform], seed: int) -> list[TargetView]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("views_of", [bent_anew, rolled], ids=["bent anew", "rolling shutter"])
-def test_predicted_uncertainty_is_found_where_views_err_as_a_whole(
+def test_predicted_uncertainty_is_right_for_views_with_common_errors(
     views_of: Callable[[list[Transform], int], list[TargetView]],
 ) -> None:
     around = spread_poses(LEFT, 16)
@@ -71,7 +71,7 @@ def test_misfit_of_other_causes_is_not_taken_for_flips_or_a_zoom(
         assert {Code.MIRRORED, Code.WRONG_LENS}.isdisjoint(one.code for one in found.warnings)
 
 
-def test_zoom_between_views_is_told_with_what_else_was_tried() -> None:
+def test_zoom_between_views_is_reported_with_the_rejected_causes() -> None:
     matrix = LEFT.matrix.copy()
     matrix[[0, 1], [0, 1]] *= 1.05
     around = spread_poses(LEFT, 12)
@@ -94,7 +94,7 @@ def test_held_out_error_near_a_singular_lens_is_that_of_refits() -> None:
         assert found.views[number].held_out == pytest.approx(rms, rel=0.1)
 
 
-def test_halves_of_views_that_err_as_a_whole_are_the_same_lens() -> None:
+def test_halves_of_views_with_common_errors_give_the_same_lens() -> None:
     found = [calibrate_intrinsics(rolled(spread_poses(LEFT, 10), seed)) for seed in (1, 2)]
     compared = compare(*found)
     assert compared.same

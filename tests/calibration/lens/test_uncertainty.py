@@ -31,13 +31,13 @@ def test_map_reaches_from_corner_to_corner_and_has_its_figures() -> None:
     assert 3 * found.figures.centre < found.figures.corners < found.figures.worst * 1.0001
 
 
-def test_uncertainty_is_least_where_the_target_was_and_ends_at_infinity() -> None:
+def test_uncertainty_is_least_at_the_target_and_ends_at_infinity() -> None:
     means = [CALIBRATION.uncertainty(distance=one).figures.mean for one in (0.4, 1.0, 3.0, 1e6)]
     assert means == sorted(means)
     assert CALIBRATION.uncertainty().figures.mean == pytest.approx(means[-1], rel=1e-4)
 
 
-def test_across_is_what_pixels_are_at_the_distance() -> None:
+def test_across_converts_pixels_to_metres_at_the_distance() -> None:
     found = CALIBRATION.uncertainty(distance=2.0)
     focal = lenskit.LEFT.matrix[0, 0]
     assert found.across[12, 16] == pytest.approx(found.sigma[12, 16] * 2.0 / focal, rel=0.02)
@@ -45,16 +45,16 @@ def test_across_is_what_pixels_are_at_the_distance() -> None:
     assert angle.across[12, 16] == pytest.approx(angle.sigma[12, 16] / focal, rel=0.02)
 
 
-def test_principal_point_that_turns_the_camera_is_taken_off() -> None:
+def test_error_of_the_principal_point_is_compensated_by_a_turn() -> None:
     straight = CameraModel(size=(640, 480), matrix=lenskit.LEFT.matrix)
     only_cx = np.zeros((9, 9))
     only_cx[2, 2] = 1.0  # pixel^2
     found = uncertainty(straight, only_cx, BENCH.gauge).figures
-    # a coordinate's share of 1 pixel is 0.71; a turn makes up for all but the perspective's part
+    # a coordinate's share of 1 pixel is 0.71; a turn compensates all but the perspective's part
     assert found.worst < 0.25
 
 
-def test_values_that_are_known_leave_nothing_open() -> None:
+def test_known_values_have_no_uncertainty() -> None:
     known = dataclasses.replace(CALIBRATION, covariance=np.zeros((9, 9)))
     assert known.uncertainty().figures.worst == 0.0
 
@@ -65,7 +65,7 @@ def test_corner_that_the_model_does_not_reach_has_no_number() -> None:
     )
     found = uncertainty(folding, BENCH.covariance, BENCH.gauge)
     assert np.isnan(found.sigma[0, 0])
-    assert np.isnan(found.figures.corners)  # none of them is reached
+    assert np.isnan(found.figures.corners)  # the view reaches none of them
     assert np.isfinite(found.sigma[12, 16])
     assert np.isfinite(found.figures.mean)
 
@@ -77,14 +77,14 @@ def test_corners_that_are_reached_have_a_mean() -> None:
 
 
 @pytest.mark.parametrize("distance", [0.0, -1.0, math.nan, math.inf])
-def test_distance_that_is_none_is_refused(distance: float) -> None:
+def test_invalid_distance_is_refused(distance: float) -> None:
     with pytest.raises(CalibrationError, match="distance: expected a positive number") as caught:
         CALIBRATION.uncertainty(distance=distance)
     assert caught.value.code == Code.NOT_FINITE
 
 
 @pytest.mark.parametrize("shape", [(1, 9), (9, 501), (9,), (0, 0)])
-def test_shape_that_is_none_is_refused(shape: tuple[int, int]) -> None:
+def test_invalid_shape_is_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(CalibrationError, match="shape of a map: expected rows") as caught:
         CALIBRATION.uncertainty(shape=shape)
     assert caught.value.code == Code.SHAPE
@@ -112,7 +112,7 @@ def test_predicted_uncertainty_is_observed(distance: float | None) -> None:
     assert ratio.max() < 1.15
 
 
-def test_lens_whose_model_ends_before_the_image_says_so_and_has_its_figures() -> None:
+def test_lens_model_that_ends_before_the_image_has_a_remark_and_figures() -> None:
     views = lenskit.seen(lenskit.FISHEYE, lenskit.poses(10, distance=0.2), seed=1)
     found = calibrate_intrinsics(views, sheet="exact")
     (remark,) = [one for one in found.warnings if one.code == Code.OUT_OF_FIELD]

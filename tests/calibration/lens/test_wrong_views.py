@@ -1,4 +1,4 @@
-"""Views that are none, or that are not what they seem: each a typed error or a remark by name."""
+"""Invalid and misleading views give a typed error, or a remark with their name."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def changed(view: TargetView, points: Array) -> TargetView:
 
 
 def flipped(view: TargetView, axis: int) -> TargetView:
-    """Return what is found in the flipped picture: corners are numbered as one reads them there."""
+    """Return the view in the flipped picture, with corners numbered as they are read there."""
     board = view.target
     assert isinstance(board, Checkerboard)
     numbers = np.arange(len(board.points)).reshape(board.rows, board.columns)[:, ::-1].ravel()
@@ -93,13 +93,13 @@ def doubled(values: Any) -> Any:
         ({"covariance": np.nan * VIEW.covariance}, Code.NOT_FINITE, "finite numbers"),
     ],
 )
-def test_view_that_is_none_is_refused(changes: dict[str, Any], code: Code, text: str) -> None:
+def test_invalid_view_is_refused(changes: dict[str, Any], code: Code, text: str) -> None:
     with pytest.raises(Exception, match=text) as caught:
         dataclasses.replace(VIEW, **changes)
     assert getattr(caught.value, "code", None) == code
 
 
-def test_view_keeps_copies_that_nobody_changes() -> None:
+def test_view_keeps_read_only_copies() -> None:
     points = VIEW.points.copy()
     view = changed(VIEW, points)
     points[0] = np.nan
@@ -123,7 +123,7 @@ def test_view_keeps_copies_that_nobody_changes() -> None:
         (lambda _: IMAGE, Code.SHAPE, r"got ndarray of shape \(480, 640\)"),
     ],
 )
-def test_locate_of_what_is_no_view_of_the_target_is_refused(
+def test_locate_of_a_view_of_another_target_is_refused(
     make: Callable[[TargetView], Any], code: Code, text: str
 ) -> None:
     with pytest.raises(Exception, match=text) as caught:
@@ -181,7 +181,7 @@ def test_calibrate_intrinsics_of_some_flipped_pictures_names_them(ways: tuple[in
 def test_calibrate_intrinsics_of_a_stretched_sheet_sees_no_flips() -> None:
     views = seen(LEFT, poses(15), points=BOARD.points * [1.01, 1.0, 1.0])
     found = calibrate_intrinsics(views, sheet="exact")
-    assert found.rms > 0.2  # half of the squares are gone where pictures are flipped instead
+    assert found.rms > 0.2  # flipped pictures would remove half of the squares
     assert {Code.OUTLIER, Code.MIRRORED}.isdisjoint(one.code for one in found.warnings)
 
 
@@ -212,7 +212,7 @@ def test_calibrate_intrinsics_names_points_that_are_off_and_leaves_them_out(same
     assert abs(found.camera.matrix[0, 0] - 530) < 4 * found.deviations["fx"]
 
 
-def test_calibrate_intrinsics_told_to_keep_everything_names_points_that_are_off() -> None:
+def test_calibrate_intrinsics_names_stray_points_that_it_keeps_on_request() -> None:
     views = seen(LEFT, poses(5))
     points = views[2].points.copy()
     points[7] += 3.0
@@ -231,7 +231,7 @@ def test_calibrate_intrinsics_uses_a_view_without_the_point_that_is_off() -> Non
     assert len(found.views[2].view.ids) == len(views[2].ids) - 1
 
 
-def test_calibrate_intrinsics_of_points_of_a_smaller_image_says_so() -> None:
+def test_calibrate_intrinsics_of_points_of_a_smaller_image_has_a_remark() -> None:
     views = [changed(one, one.points / 2) for one in seen(LEFT, poses(5))]
     found = calibrate_intrinsics([*views, dataclasses.replace(views[0], name="copy")])
     texts = {one.code: one.text for one in found.warnings}
@@ -239,7 +239,7 @@ def test_calibrate_intrinsics_of_points_of_a_smaller_image_says_so() -> None:
     assert "the same to the last digit: 00, copy" in texts[Code.COINCIDENT]
 
 
-def test_strays_are_told_from_their_neighbours() -> None:
+def test_strays_differ_from_their_neighbours() -> None:
     random = np.random.default_rng(1)
     residuals, by_pose = random.normal(size=(40, 2)), random.normal(size=(40, 2, 6))
     residuals[[3, 30]] += [[15, 0], [0, -20]]

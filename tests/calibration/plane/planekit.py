@@ -1,4 +1,4 @@
-"""Planes in space, cameras over them, and robots that touch; what the tests know to be true."""
+"""Planes in space with cameras over them and robots that touch, as the truth of tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from smartcam.models import Header, Localization, Pose, Position, Quaternion
 __all__ = ["GRID", "SIGMA", "Scene", "grid", "part", "scenes", "spread"]
 
 SIGMA = 0.0002
-"""Of a touch, metres."""
+"""Standard deviation of a touch, metres."""
 
 
 def grid(columns: int, rows: int, width: float = 0.3, height: float = 0.24) -> Array:
@@ -34,7 +34,7 @@ class Scene:
 
     Attributes:
         turn: R_robot_camera (3, 3).
-        origin: where the camera's (0, 0) lies (3,), metres.
+        origin: place of the camera's (0, 0) (3,), metres.
         scale: metres for each unit of the camera.
     """
 
@@ -43,17 +43,17 @@ class Scene:
     scale: float = 1.0
 
     def camera(self, marks: Array) -> Array:
-        """Return where the camera sees marks (N, 2) in metres, in its own unit."""
+        """Return the camera's coordinates of marks (N, 2), which are in metres, in its own unit."""
         seen: Array = marks / self.scale
         return seen
 
     def robot(self, marks: Array) -> Array:
-        """Return where marks (N, 2) lie (N, 3)."""
+        """Return the places (N, 3) of marks (N, 2)."""
         lying: Array = marks @ self.turn[:, :2].T + self.origin
         return lying
 
     def touched(self, marks: Array, seed: int, sigma: float = SIGMA) -> Array:
-        """Return where a robot thinks that they lie (N, 3)."""
+        """Return a robot's touches (N, 3) of marks, with noise."""
         noise = np.random.default_rng(seed).normal(size=(len(marks), 3))
         touches: Array = self.robot(marks) + sigma * noise
         return touches
@@ -82,7 +82,7 @@ SPECIAL = [
     np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 ]
-"""Normals along z, against it both ways, along x and against it."""
+"""Normals along and against z, the latter in two attitudes, and along and against x."""
 
 _unit = st.floats(-1, 1)
 _turns = st.one_of(

@@ -53,8 +53,8 @@ def numbers(picture: str) -> list[float]:
     return [float(text) for text in re.findall(r"-?\d+\.\d+", picture)]
 
 
-def test_picture_is_the_one_that_was_looked_at() -> None:
-    """To look at a new one: run this test with SMARTCAM_REWRITE=1 and open the file."""
+def test_picture_equals_the_approved_one() -> None:
+    """To approve a new picture, run this test with SMARTCAM_REWRITE=1 and view the file."""
     parts = [localization(0.08, 0.05, 0.5, "screw <1>"), localization(0.2, 0.12, -2.0, "nut")]
     picture = draw(calibration(), parts, title="Table & camera")
     if os.environ.get("SMARTCAM_REWRITE"):
@@ -72,7 +72,7 @@ def test_picture_shows_each_touch_with_residual_and_ellipse() -> None:
     assert f"similarity, 9 touches; held-out error {1e3 * error:.3f} mm rms" in texts(picture)
 
 
-def test_picture_residuals_are_as_much_larger_as_it_says() -> None:
+def test_picture_residuals_are_enlarged_by_the_stated_factor() -> None:
     one = calibration()
     picture = draw(one)
     larger = enlargement(picture)

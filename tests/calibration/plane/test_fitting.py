@@ -73,7 +73,7 @@ def test_fit_homography_equals_scipy_least_squares() -> None:
     fitted = fit("homography", pairs)
     start = fitted.matrix.ravel()[:11] + 0.01
     theirs = least_squares(residuals, start, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    # theirs has numerical derivatives, and stops where the oldest SciPy does
+    # SciPy's has numerical derivatives, and the limits of the oldest SciPy
     assert fitted.matrix.ravel()[:11] == pytest.approx(theirs.x, abs=1e-6)
     assert (residuals(fitted.matrix.ravel()[:11]) ** 2).sum() == pytest.approx(2 * theirs.cost)
 
@@ -112,16 +112,16 @@ def test_fit_covariance_equals_numerical_derivatives(name: ModelName) -> None:
 
 @pytest.mark.parametrize("weights", [None, WEIGHTS])
 @pytest.mark.parametrize("name", NAMES)
-def test_held_out_equals_fitting_anew(name: ModelName, weights: Array | None) -> None:
+def test_held_out_equals_a_new_fit(name: ModelName, weights: Array | None) -> None:
     pairs = noisy(weights)
     found = held_out(fit(name, pairs), pairs)
     for index in range(9):
         others = fit(name, pairs.without(index)).matrix
         expected = pairs.robot[index] - apply_homography(others, pairs.camera[index : index + 1])[0]
-        assert found[index] == pytest.approx(expected, abs=1e-8)  # where rounding ends it
+        assert found[index] == pytest.approx(expected, abs=1e-8)  # the limit of rounding
 
 
-def test_held_out_of_many_points_equals_fitting_anew_nearly() -> None:
+def test_held_out_of_many_points_nearly_equals_a_new_fit() -> None:
     pairs = noisy(marks=grid(15, 15))
     found = held_out(fit("homography", pairs), pairs)
     others = fit("homography", pairs.without(0)).matrix

@@ -1,4 +1,4 @@
-"""Touches that are mistakes are never called good with an error beyond what is allowed."""
+"""Mistaken touches never give the verdict good with an error beyond the allowed one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIELD = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 6)), axis=-
 
 
 def layout(count: int, random: np.random.Generator) -> Array:
-    """Return marks as a hand lays them: apart, and in no line."""
+    """Return marks in a natural layout: apart, and not in a line."""
     while True:
         marks = random.uniform((0.0, 0.0), (0.3, 0.24), (count, 2))
         apart = np.linalg.norm(marks[:, None] - marks, axis=2) + np.eye(count)
@@ -77,7 +77,7 @@ def outcome(marks: Array, touches: Array, sigma: float | None) -> str:
         pytest.param(range(4, 13), 12, marks=pytest.mark.long),
     ],
 )
-def test_no_mistake_is_called_good_beyond_what_is_allowed(counts: list[int], offs: int) -> None:
+def test_no_mistake_beyond_the_allowed_error_is_called_good(counts: list[int], offs: int) -> None:
     random, found = np.random.default_rng(41), Counter[str]()
     for count in counts:
         marks = layout(count, random)
@@ -132,7 +132,7 @@ def test_option_that_is_no_positive_number_is_refused(name: str, value: Any) -> 
 
 
 @pytest.mark.parametrize("sigma", [None, SIGMA])
-def test_rows_of_a_grid_touched_one_further_are_told_though_most_points_agree(
+def test_shifted_rows_of_a_grid_are_reported_though_most_points_agree(
     sigma: float | None,
 ) -> None:
     marks = np.array([(0.15 * i, 0.12 * j) for j in range(3) for i in range(3)])
@@ -142,7 +142,7 @@ def test_rows_of_a_grid_touched_one_further_are_told_though_most_points_agree(
     assert found.verdict.level == "poor"
 
 
-def test_exchanged_touches_that_are_left_out_are_not_told_twice() -> None:
+def test_exchanged_touches_that_are_left_out_are_reported_once() -> None:
     marks = layout(12, np.random.default_rng(2))
     touches = SCENE.touched(marks, 1)[[1, 0, *range(2, 12)]]
     found = fit_plane(marks, touches, touch_sigma=SIGMA, tool_z=DOWN, robust=True)

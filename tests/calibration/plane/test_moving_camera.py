@@ -1,4 +1,4 @@
-"""A camera on the robot: right where the plane stays, refused where it does not."""
+"""A camera on the robot is right for an unmoved plane, and refused for a moved one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TABLE = np.column_stack([SEEN, np.zeros(4)])
 
 
 def camera(table: Transform, flange: Transform, tolerance: float = 2e-4) -> MovingCamera:
-    """Return one that was calibrated with its own frame on the table's."""
+    """Return a moving camera whose frame was the table's at the calibration."""
     static = RealWorldPosition(table.translation, table.rotation)
     return MovingCamera(static, flange, field=table.apply(TABLE), tolerance=tolerance)
 
@@ -108,7 +108,7 @@ def test_moving_camera_whose_plane_moves_is_refused(
         camera(TABLE_POSE, FLANGE).now(pose)
 
 
-def test_moving_camera_tolerance_is_looked_at_where_the_field_is() -> None:
+def test_moving_camera_tolerance_is_checked_in_the_field() -> None:
     tilt = Transform("table", "table", rotation_about(np.array([0, 1e-3, 1.0]), 0), np.zeros(3))
     pose = carried(TABLE_POSE, tilt, FLANGE)
     camera(TABLE_POSE, FLANGE, tolerance=2e-4).now(pose)
@@ -174,7 +174,7 @@ def test_moving_camera_field_that_is_no_plane_is_refused() -> None:
 
 
 def test_moved_before_the_chain_is_wrong() -> None:
-    """As the thesis describes it: the same motion applied before all other solvers."""
+    """The thesis' form: the same motion applied before all other solvers."""
     motion = in_plane(0.5, 0.1, 0.0)
     pose = carried(TABLE_POSE, motion, FLANGE)
     moved = Moved(pose.undated() @ FLANGE.undated().inverse())
@@ -189,13 +189,13 @@ def test_moved_before_the_chain_is_wrong() -> None:
 HAND_EYE = Transform(
     "flange", "camera", rotation_about(np.array([0.3, -0.2, 1]), 0.8), np.array([0.05, 0.02, 0.08])
 )
-"""Place of the camera on the flange; nothing but the simulation knows it."""
+"""Place of the camera on the flange, which only the simulation uses."""
 
 GRID = np.array([(x, y, 0.0) for x in (-0.12, 0.0, 0.12) for y in (-0.1, 0.0, 0.1)])
 
 
 def pixels(camera_in_base: Transform, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where a pinhole sees points of the base, (N, 2), y up; 1200 pixels in a radian."""
+    """Return a pinhole's pixels (N, 2), y up, of points of the base; 1200 pixels in a radian."""
     x, y, z = camera_in_base.inverse().apply(points).T
     return 1200 * np.column_stack([x / z, -y / z])
 
@@ -223,7 +223,7 @@ def calibrated() -> MovingCamera:
 
 
 @given(angles, st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_moving_pinhole_sees_parts_where_they_are(turn: float, x: float, y: float) -> None:
+def test_moving_pinhole_maps_parts_to_their_true_places(turn: float, x: float, y: float) -> None:
     motion = in_plane(turn, x, y)
     flange = flange_at(motion @ VIEW)
     parts = TABLE_POSE.apply(motion.apply(GRID * 0.8))
@@ -231,7 +231,7 @@ def test_moving_pinhole_sees_parts_where_they_are(turn: float, x: float, y: floa
     np.testing.assert_allclose(found, parts, rtol=0, atol=1e-9)
 
 
-def test_moving_pinhole_that_is_raised_would_be_wrong_by_as_much() -> None:
+def test_raised_moving_pinhole_is_refused_with_its_error() -> None:
     lift = Transform("table", "table", np.eye(3), np.array([0, 0, 0.01]))
     flange = flange_at(lift @ VIEW)
     with refused("PLANE_MOVED", "10.00 mm"):
@@ -255,7 +255,7 @@ def test_image_time_without_a_time_zone_is_refused() -> None:
 @pytest.mark.parametrize(
     ("field", "code"), [(SEEN, "SHAPE"), (np.full((4, 3), np.nan), "NOT_FINITE")]
 )
-def test_field_that_is_no_field_is_refused(field: NDArray[np.float64], code: str) -> None:
+def test_invalid_field_is_refused(field: NDArray[np.float64], code: str) -> None:
     flange = Transform("robot", "flange", np.eye(3), np.zeros(3))
     with refused(code, "moving camera: points of the field"):
         MovingCamera(chain_of(fit_plane(SEEN, TABLE)), flange, field=field)

@@ -1,8 +1,8 @@
-"""The thesis' 4.4, as far as it can be taken: planes in each of the eight octants.
+"""The thesis' 4.4 in general: planes in each of the eight octants.
 
 The thesis had two set-ups in each octant, and compared by eye. Here the plane's origin lies in the
-octant, its normal and its turn about it are any, so are the camera's mark and the camera's scale,
-and what the chain says is compared with the truth at random points and headings.
+octant, its normal and its turn about it are any, so are the camera's mark and the camera's scale.
+The chain's results are compared with the truth at random points and headings.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ octants = pytest.mark.parametrize("octant", OCTANTS, ids=lambda o: "".join("-+"[
 
 
 class Setup(NamedTuple):
-    """One cell: where the sheet lies, and how the camera sees it."""
+    """A cell with the pose of the sheet and the camera's coordinates."""
 
     origin: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -38,14 +38,14 @@ class Setup(NamedTuple):
     """Metres in one of the camera's units."""
 
     def seen(self, sheet: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the camera says of points of the sheet, (N, 2) in metres."""
+        """Return the camera's coordinates of points (N, 2) of the sheet, metres."""
         return sheet @ yaw(self.mark_theta)[:2, :2].T / self.unit + self.mark
 
     def real(self, sheet: NDArray[np.float64]) -> NDArray[np.float64]:
         return sheet @ self.rotation[:, :2].T + self.origin
 
     def heading(self, theta: float) -> NDArray[np.float64]:
-        """Return where a part points that is turned by ``theta`` in the camera's eyes."""
+        """Return the direction of a part with the angle ``theta`` in the camera's frame."""
         on_sheet = theta - self.mark_theta
         return self.rotation[:, :2] @ [np.cos(on_sheet), np.sin(on_sheet)]
 

@@ -20,7 +20,7 @@ CORNERS = grid(2, 2)
 
 
 def tilted(degrees: float) -> Array:
-    """Return where a camera that is tilted sees the grid, pixels of 0.42 mm or so."""
+    """Return a tilted camera's coordinates of the grid, pixels of about 0.42 mm."""
     sin, cos = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     marks = GRID - (0.15, 0.12)
     pixels: Array = 1200.0 * np.column_stack([marks[:, 0] * cos, marks[:, 1]])
@@ -100,7 +100,7 @@ def test_fit_plane_weights_move_the_map_to_the_point() -> None:
 
 
 @pytest.mark.parametrize("seen_again", [0.0, 1e-4])
-def test_fit_plane_counts_what_is_touched_again_once(seen_again: float) -> None:
+def test_fit_plane_counts_repeated_touches_once(seen_again: float) -> None:
     """The camera's part of a point's error is in all of its touches, as the robot's in pictures."""
     touches, again = SCENE.touched(GRID, 1), np.repeat(np.arange(9), 3)
     seen = GRID[again] + seen_again * np.tile([-1.0, 0.0, 1.0], 9)[:, None]
@@ -113,7 +113,7 @@ def test_fit_plane_counts_what_is_touched_again_once(seen_again: float) -> None:
     assert np.allclose(thrice.leave_one_out, once.leave_one_out[again])
 
 
-def test_fit_plane_of_touches_of_one_point_that_disagree_says_so() -> None:
+def test_fit_plane_of_contradictory_touches_of_one_point_has_a_remark() -> None:
     again = [*range(9), 4]
     touches = SCENE.touched(GRID, 1)[again]
     touches[9] += 0.02 * SCENE.turn[:, 0]
@@ -209,7 +209,7 @@ def test_fit_plane_with_worse_touches_than_given_warns() -> None:
     assert said(found, "POOR_FIT").endswith("where 0.1 mm was given")
 
 
-def test_fit_plane_of_three_points_says_that_nothing_checks_it() -> None:
+def test_fit_plane_of_three_points_reports_that_it_is_unverified() -> None:
     found = fit_plane(CORNERS[:3], SCENE.touched(CORNERS[:3], 1))
     assert [one.code for one in found.warnings] == ["NOT_HELD_OUT", "UNVERIFIED", "SIDE_UNKNOWN"]
     assert found.held_out_error is None
@@ -281,7 +281,7 @@ def test_check_of_a_knock_finds_it_stale() -> None:
 
 
 @pytest.mark.long
-def test_check_of_an_untouched_cell_is_stale_as_seldom_as_said() -> None:
+def test_check_of_an_unchanged_cell_is_stale_at_the_stated_rate() -> None:
     stale, knocked = 0, 0
     marks = GRID[[0, 4, 8]]
     for seed in range(300):
@@ -311,7 +311,7 @@ def test_check_of_one_touch_far_off_among_many_finds_it_stale() -> None:
     assert healthy().check(GRID, again).stale
 
 
-def test_check_with_an_estimated_sigma_knows_how_well_it_is_known() -> None:
+def test_check_with_an_estimated_sigma_allows_for_its_uncertainty() -> None:
     found = fit_plane(CORNERS, SCENE.touched(CORNERS, 3), model="similarity")
     given = fit_plane(
         CORNERS, SCENE.touched(CORNERS, 3), model="similarity", touch_sigma=found.touch_sigma
@@ -326,7 +326,7 @@ def test_check_of_points_that_do_not_pair_raises() -> None:
 
 
 @pytest.mark.parametrize("y_down", [True, False, None])
-def test_fit_plane_y_down_is_kept_with_all_that_is_made_of_it(y_down: bool | None) -> None:
+def test_fit_plane_y_down_is_kept_in_all_derived_calibrations(y_down: bool | None) -> None:
     found = fit_plane(GRID, SCENE.robot(GRID), y_down=y_down)
     raised = found.at_height(0.02, SCENE.origin + SCENE.turn[:, 2])
     again = PlaneCalibration.from_data(json.loads(json.dumps(raised.to_data())))
@@ -334,7 +334,7 @@ def test_fit_plane_y_down_is_kept_with_all_that_is_made_of_it(y_down: bool | Non
     assert found.matrix.tobytes() == fit_plane(GRID, SCENE.robot(GRID)).matrix.tobytes()
 
 
-def test_from_data_of_a_file_without_y_down_does_not_know_it() -> None:
+def test_from_data_of_a_file_without_y_down_leaves_it_unknown() -> None:
     data = fit_plane(GRID, SCENE.robot(GRID), y_down=True).to_data()
     del data["y_down"]
     assert PlaneCalibration.from_data(data).y_down is None
@@ -364,7 +364,7 @@ def test_at_height_above_the_camera_raises() -> None:
     assert caught.value.code == "OUT_OF_FIELD"
 
 
-def test_to_robot_keeps_what_is_not_the_pose() -> None:
+def test_to_robot_keeps_all_fields_but_the_pose() -> None:
     found = healthy(robot_frame="base").to_robot(part(0.1, 0.1, 0.5))
     assert (found.feature_id, found.quality, found.photo_index) == ("cube", 0.9, 1)
     assert (found.pose.header.seq, found.pose.header.frame_id) == (7, "base")
@@ -480,7 +480,7 @@ def test_from_data_of_something_else_raises(change: dict[str, Any], text: str) -
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 2.0, math.nan])
-def test_check_with_a_level_that_is_none_raises(level: float) -> None:
+def test_check_with_an_invalid_level_raises(level: float) -> None:
     found = fit_plane(GRID, np.column_stack([GRID, np.zeros(len(GRID))]), touch_sigma=SIGMA)
     with pytest.raises(
         CalibrationError, match="level: expected a number between 0 and 1"

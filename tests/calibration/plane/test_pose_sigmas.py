@@ -1,4 +1,4 @@
-"""The errors of poses in the robot's space: true by many calibrations, and by how poses lie."""
+"""Compare predicted errors of poses in the robot's space with many calibrations."""
 
 from __future__ import annotations
 

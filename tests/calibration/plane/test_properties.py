@@ -1,4 +1,4 @@
-"""Properties of every plane, in all eight octants, whatever the camera's unit.
+"""Properties of every plane, in all eight octants and any unit of the camera.
 
 Planes are drawn with their origin up to 10 m off in each direction, any turn, normals along and
 against z and x among them, and 10^-6 to 10^3 metres for each unit of the camera. Every property has
@@ -18,7 +18,7 @@ p10   the order of the points is irrelevant
 p11   the zero vector is finite
 p12   mirrored input is reported
 p13   points in a line and points that are the same are refused
-p14   many are as one
+p14 many points map like single ones
 p15   a moving camera is the static one calibrated anew at the new pose
 p16   stored and loaded, it is the same bit by bit
 ====  ===============================================================================
@@ -72,7 +72,7 @@ def calibrated(scene: Scene, seed: int | None = None) -> PlaneCalibration:
 
 
 def sheet(scene: Scene, place: tuple[float, float], theta: float) -> PlaneCalibration:
-    """Return what the origin mark at a place and three touches of the sheet's rays give."""
+    """Return the calibration from the origin mark and three touches of the sheet's rays."""
     marks = np.array(place) + rotate_ccw([[0.0, 0.0], [0.2, 0.0], [0.0, 0.15]], theta)
     seen = scene.camera(marks[:1])[0]
     touches = scene.robot(marks)
@@ -220,7 +220,7 @@ def test_plane_p13_points_in_a_line_are_refused(scene: Scene, yaw: float) -> Non
 
 
 @given(scenes(), st.lists(st.tuples(places, angles), min_size=1, max_size=5), seeds)
-def test_plane_p14_many_are_as_one(
+def test_plane_p14_many_points_map_like_single_ones(
     scene: Scene, lying: list[tuple[tuple[float, float], float]], seed: int
 ) -> None:
     found = calibrated(scene, seed)

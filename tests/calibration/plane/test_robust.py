@@ -31,7 +31,7 @@ SIX, FIVE_BY_FIVE = grid(3, 2), grid(5, 5)
 
 
 def with_wrong(marks: Array, wrong: list[int], seed: int = 1, scene: Scene = SCENE) -> Array:
-    """Return touches of which some are 5 to 15 mm off, in any direction."""
+    """Return touches, some of them 5 to 15 mm off in any direction."""
     random = np.random.default_rng([seed, len(marks)])
     touches = scene.touched(marks, seed)
     directions = random.normal(size=(len(wrong), 3))
@@ -62,7 +62,7 @@ def test_fit_plane_robust_equals_the_fit_without_the_wrong_points(
     assert (found.freedom, found.touch_sigma) == (expected.freedom, expected.touch_sigma)
 
 
-def test_fit_plane_robust_names_what_it_leaves_out_first() -> None:
+def test_fit_plane_robust_names_left_out_points_first() -> None:
     touches = with_wrong(GRID, [3, 7])
     found = robust(GRID, touches, touch_sigma=SIGMA)
     assert [one.code for one in found.warnings] == ["OUTLIER", "OUTLIER"]
@@ -138,7 +138,7 @@ def test_agreeing_with_two_wrong_of_six_never_takes_one_for_right(count: int) ->
     found = []
     for seed in range(count):
         touches = with_wrong(SIX, [seed % 6, (seed + 1 + seed % 5) % 6], seed)
-        with suppress(CalibrationError):  # a good point looks wrong as well
+        with suppress(CalibrationError):  # a good point is an outlier, too
             found.append((seed, np.flatnonzero(~agreeing(SIX, touches, np.ones(6), SIGMA))))
     assert len(found) >= 0.95 * count
     for seed, left_out in found:
@@ -173,7 +173,7 @@ def test_fit_plane_robust_of_a_touch_a_kilometre_off_finds_it() -> None:
     assert spread(found.transform(GRID), SCENE.robot(GRID)) < 5 * SIGMA
 
 
-def test_fit_plane_robust_without_noise_finds_what_is_a_micrometre_off() -> None:
+def test_fit_plane_robust_without_noise_finds_an_outlier_of_a_micrometre() -> None:
     touches = SCENE.robot(GRID)
     touches[5] += 1e-6
     assert robust(GRID, touches).outliers == (5,)
@@ -196,7 +196,7 @@ def test_fit_plane_robust_p10_order_of_points_is_irrelevant(
 ) -> None:
     marks = grid(4, 4)
     seen, touches = scene.camera(marks), with_wrong(marks, [0, 5, 6, 11], seed, scene)
-    assert math.comb(16, 4) > MAX_SUBSETS_TRIED  # they are drawn
+    assert math.comb(16, 4) > MAX_SUBSETS_TRIED  # the picture shows them
     options: dict[str, Any] = {"robust": True, "touch_sigma": SIGMA if given_sigma else None}
     first = fit_plane(seen, touches, **options)
     second = fit_plane(seen[order], touches[order], **options)
@@ -224,8 +224,8 @@ def test_fit_plane_robust_saved_is_loaded_with_its_outliers(tmp_path: Path) -> N
     assert (again.outliers, again.warnings) == ((3,), found.warnings)
 
 
-def test_plane_data_holds_what_version_1_0_does() -> None:
-    """A file without what came later is read: a robust fit adds but a weight of 0."""
+def test_plane_data_has_the_fields_of_version_1_0() -> None:
+    """A file without later fields is read: a robust fit adds only a weight of 0."""
     data = fit_plane(GRID, with_wrong(GRID, [3]), robust=True, touch_sigma=SIGMA).to_data()
     required = {
         *("model", "camera_points", "robot_points", "weights", "matrix", "place", "residuals"),
@@ -313,4 +313,4 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
     assert max(proposed) <= MAX_SUBSETS_TRIED
     assert (
         len(fitted) <= 2 * MAX_FITTED_PROPOSALS * 3
-    )  # a round of each, one that judges anew, and one that confirms
+    )  # a round for each point, one that judges again, and one that confirms

@@ -1,4 +1,4 @@
-"""The tip of a tool, from touches of one point; its axis, from turns before the camera."""
+"""The tip of a tool from touches of one point; its axis from turns in front of the camera."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_tool_tip_does_not_depend_on_base_and_order(base: Transform, order: list
 def test_tool_tip_error_that_was_found_is_gone_at_every_yaw(angle: int, error: float) -> None:
     """1 mm of error at the tip: 0, 1.41 and 2 mm off at a yaw of 0, 90 and 180 degrees."""
     off = np.array([1e-3, 0, 0])
-    touched = touching(DOWN).apply(TIP + off)  # where the controller says the tip is
+    touched = touching(DOWN).apply(TIP + off)  # the tip by the controller
     target = Transform("base", "part", DOWN @ yaw(np.radians(angle)), touched)
     poses = Poses(target.translation[None], target.quaternion[None])
 

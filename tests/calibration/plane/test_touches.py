@@ -40,7 +40,7 @@ def test_fit_touches_without_noise_maps_the_whole_field() -> None:
     assert found.rotation[:, 2] == pytest.approx(SCENE.turn[:, 2])
 
 
-def test_fit_touches_says_what_nothing_checks() -> None:
+def test_fit_touches_reports_the_unchecked_values() -> None:
     found = fitted(1)
     assert [one.code for one in found.warnings] == ["SCALE_ASSUMED", "NOT_HELD_OUT", "SIDE_UNKNOWN"]
     assert found.held_out_error is None
@@ -55,7 +55,7 @@ def test_fit_touches_y_down_is_kept(y_down: bool | None) -> None:
     assert PlaneCalibration.from_data(found.to_data()).y_down is y_down
 
 
-def test_fit_touches_without_sigma_estimates_it_badly_and_says_so() -> None:
+def test_fit_touches_without_sigma_estimates_it_badly_with_a_remark() -> None:
     found = fitted(1, touch_sigma=None, tool_z=-SCENE.turn[:, 2])
     assert found.warnings[0].code == "UNVERIFIED"
     assert "estimated from 1 degrees of freedom" in found.warnings[0].text
@@ -158,7 +158,7 @@ def test_fit_touches_with_an_impossible_theta_sigma_raises(sigma: float) -> None
     assert caught.value.code == "NOT_FINITE"
 
 
-def test_fit_touches_without_a_touch_of_a_ray_says_which() -> None:
+def test_fit_touches_without_a_touch_of_a_ray_names_the_ray() -> None:
     o, _, b = touched(1)
     with pytest.raises(CalibrationError, match="touches of ray A: expected one or more") as caught:
         fit_touches(ORIGIN, o, np.empty((0, 3)), b)

@@ -1,7 +1,7 @@
-"""The traps of the thesis' mathematics, T1 to T23, and the tests that keep each one shut.
+"""The traps of the thesis' mathematics, T1 to T23, and a test for each.
 
-What is short and about planes is tested here; for the rest the table names the tests. T7, names
-that are mixed up in a listing, cannot come back. T18 is about images of marks.
+Short tests about planes are in this file; for other traps the table names the tests. T7, exchanged
+names in a listing, cannot occur here. T18 is about images of marks.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ ELSEWHERE = {
     "t21": ("test_to_robot_from_another_frame_raises", "test_transform_wrong_way_round_is_refused"),
     "t22": ("test_fit_touches_of_swapped_rays_is_mirrored", "test_to_robot_with_tool_flip_*"),
 }
-"""Places of the traps' tests that are not in this file; ``*`` is any ending."""
+"""Places of the traps' tests in other files; ``*`` is any ending."""
 
 TRAPS = [*(f"t{number}" for number in range(1, 24)), "t3b", "t5b", "t6b", "t6c", "t11b", "t15b"]
 SEEN = part(0.0, 0.0)
 
 
 def touched(turn: Array, a: float = 0.2, b: float = 0.15) -> PlaneCalibration:
-    """Return what exact touches give of a sheet that is turned so."""
+    """Return the calibration from exact touches of a turned sheet."""
     o = np.array([0.4, 0.1, 0.02])
     return fit_touches(SEEN, o, o + a * turn[:, 0], o + b * turn[:, 1], touch_sigma=0.0005)
 
 
 def tilted(degrees: float) -> Array:
-    """Return where a camera 0.5 m away, of 1200 pixels in a radian, sees the grid."""
+    """Return the grid's pixels in a camera 0.5 m away, with 1200 pixels in a radian."""
     sin, cos = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     marks = GRID - GRID.mean(axis=0)
     seen: Array = 1200.0 * marks * (cos, 1.0) / (0.5 + marks[:, :1] * sin)

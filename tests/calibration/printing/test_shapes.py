@@ -25,7 +25,7 @@ OTHERS = [(3, False), (3, True), (4, False)]
 
 
 def winding(polygons: list[Polygon], x: float, y: float) -> int:
-    """Return how often polygons run around a point counter-clockwise."""
+    """Return the number of counter-clockwise turns of polygons around a point."""
     total = 0.0
     for polygon in polygons:
         turns = np.array([math.atan2(b - y, a - x) for a, b in polygon.points])
@@ -132,7 +132,7 @@ def test_outlines_of_a_ring_have_a_hole_that_runs_clockwise() -> None:
     assert sorted(area(loop) for loop in outlines(ring)) == [-1, 9]
 
 
-def test_outlines_have_points_where_they_turn_only() -> None:
+def test_outlines_have_points_only_at_their_turns() -> None:
     assert sorted(outlines(np.ones((2, 5), dtype=bool))[0]) == [(0, 0), (0, 2), (5, 0), (5, 2)]
 
 
@@ -158,7 +158,7 @@ PAGE = PrintedPage(100, 120.5, "A & B", json.dumps({"kind": "<none>"}), SHAPES)
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def test_svg_is_as_large_as_the_page_in_millimetres() -> None:
+def test_svg_has_the_page_s_size_in_millimetres() -> None:
     root = ET.fromstring(svg(PAGE).encode())  # noqa: S314
     assert (root.get("width"), root.get("height")) == ("100mm", "120.5mm")
     assert root.get("viewBox") == "0 0 100 120.5"
@@ -179,7 +179,7 @@ def test_svg_has_no_stroke_and_carries_title_and_description() -> None:
     assert [one.text for one in root.iter(f"{SVG}text")] == ["a <b> (c) \\", "up"]
 
 
-def test_pdf_is_as_large_as_the_page_in_points() -> None:
+def test_pdf_has_the_page_s_size_in_points() -> None:
     assert b"/MediaBox [0 0 283.4646 341.5748]" in pdf(PAGE)
     assert b"2.834645669 0 0 2.834645669 0 0 cm\n10 20 m 40 20 l 40 25 l 10 25 l h" in pdf(PAGE)
 
@@ -192,14 +192,14 @@ def test_pdf_finds_its_objects_by_their_offsets() -> None:
     assert [data[at:].split(b" obj")[0] for at in offsets] == [b"%d 0" % n for n in range(1, 7)]
 
 
-def test_pdf_content_is_as_long_as_it_says() -> None:
+def test_pdf_content_has_its_stated_length() -> None:
     data = pdf(PAGE)
     (length,) = re.findall(rb"/Length (\d+)", data)
     content = data.split(b"stream\n", 1)[1]
     assert content[int(length) :].startswith(b"\nendstream")
 
 
-def test_pdf_asks_for_its_own_size_and_strokes_nothing() -> None:
+def test_pdf_requests_its_true_size_and_strokes_nothing() -> None:
     data = pdf(PAGE)
     assert b"/ViewerPreferences << /PrintScaling /None >>" in data
     content = data.split(b"stream\n", 1)[1].split(b"\nendstream")[0].decode()

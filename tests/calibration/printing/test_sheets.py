@@ -1,4 +1,4 @@
-"""Sheets: what stands where, what is said on them, what does not fit, what a printer changes."""
+"""Sheets: places of their parts, texts, limits of the page, scale of the printer."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Bounds = tuple[float, float, float, float]
 
 
 def bounds(shape: Polygon | Disc | Label) -> Bounds:
-    """Return what a shape takes, generously for texts: left, low, right, high."""
+    """Return the box of a shape, generous for texts: left, low, right, high."""
     match shape:
         case Polygon(points):
             x, y = zip(*points, strict=True)
@@ -66,7 +66,7 @@ def texts(sheet: Sheet) -> list[str]:
 
 
 def pattern_length(sheet: Sheet) -> int:
-    """Return how many of a sheet's shapes are the target's."""
+    """Return the number of a sheet's shapes that belong to the target."""
     return next(
         number
         for number, one in enumerate(sheet.shapes)
@@ -74,8 +74,8 @@ def pattern_length(sheet: Sheet) -> int:
     )
 
 
-def test_sheet_is_the_one_that_was_looked_at() -> None:
-    """To look at a new one: run this test with SMARTCAM_REWRITE=1 and open the file."""
+def test_sheet_equals_the_approved_one() -> None:
+    """To approve a new sheet, run this test with SMARTCAM_REWRITE=1 and view the file."""
     document = make_sheet(BOARD).svg()
     if os.environ.get("SMARTCAM_REWRITE"):
         GOLDEN.write_text(document, encoding="utf-8", newline="\n")
@@ -98,7 +98,7 @@ def test_sheet_is_inside_the_border_and_nothing_overlaps_the_pattern(target: Tar
 
 
 def see_white_areas(sheet: Sheet, target: Checkerboard) -> None:
-    """See that nothing stands in the areas of the three corners without the mark."""
+    """Check that the areas of the three corners without the mark are empty."""
     radius = 1e3 * target.corner_area_diameter / 2
     x, y = sheet.origin
     for a, b in 1e3 * target.corner_areas[1:]:
@@ -148,7 +148,7 @@ def test_sheet_rulers_are_100_mm_along_x_and_y() -> None:
     assert sum(size == pytest.approx((0.3, 2.7)) for size in sizes) == 11
 
 
-def test_sheet_says_what_it_is() -> None:
+def test_sheet_has_a_line_with_its_parameters() -> None:
     sheet = make_sheet(BOARD)
     assert sheet.id == "7af2c1ac"
     said = texts(sheet)
@@ -188,7 +188,7 @@ def test_sheet_files_carry_the_description() -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: make_sheet(one).id)
-def test_sheet_data_gives_back_what_is_on_it(target: Target | Rays) -> None:
+def test_sheet_data_gives_back_the_target(target: Target | Rays) -> None:
     assert on_paper(json.loads(json.dumps(make_sheet(target).data))) == target
 
 
@@ -206,7 +206,7 @@ def test_sheet_takes_the_page_upright_or_lying() -> None:
         make_sheet(BOARD, page="210x297")
 
 
-def test_sheet_that_does_not_fit_says_by_how_much() -> None:
+def test_error_of_a_too_large_sheet_names_the_excess() -> None:
     with pytest.raises(
         CalibrationError,
         match=r"^checkerboard, 9 x 6 corners, squares of 30 mm, marked origin: does not fit on A4 "
@@ -218,7 +218,7 @@ def test_sheet_that_does_not_fit_says_by_how_much() -> None:
 
 
 @pytest.mark.parametrize("page", ["a4", "300", "0x100", "100x3001", "300 x 200", "x" * 200])
-def test_page_that_is_none_is_refused(page: str) -> None:
+def test_invalid_page_is_refused(page: str) -> None:
     with pytest.raises(CalibrationError, match="page: expected one of A5, A4, ") as caught:
         page_size(page)
     assert caught.value.code == Code.SHAPE
@@ -257,7 +257,7 @@ def test_scaled_changes_every_length_and_no_count() -> None:
     ("rulers", "axis"),
     [((94.9, 100), "x"), ((100, 105.1), "y"), ((float("nan"), 100), "x"), ((3.9, 3.9), "x")],
 )
-def test_scaled_refuses_what_is_more_than_a_twentieth_off(
+def test_scaled_refuses_lengths_more_than_a_twentieth_off(
     rulers: tuple[float, float], axis: str
 ) -> None:
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""OpenCV's 13 pairs of images, where SMARTCAM_PAIRS or Debian's package opencv-doc has them."""
+"""OpenCV's 13 pairs of images, from SMARTCAM_PAIRS or Debian's package opencv-doc."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _views(side: str) -> list[TargetView]:
 
 
 def _tutorial(side: str) -> list[TargetView]:
-    """Return corners as OpenCV's tutorial refines them, in a window of 23 x 23 pixels."""
+    """Return corners refined as in OpenCV's tutorial, in a window of 23 x 23 pixels."""
     views = []
     for number in NUMBERS:
         image = cv2.imread(str(FOLDER / f"{side}{number:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
@@ -88,5 +88,5 @@ def test_lens_of_the_left_camera_is_that_of_opencv() -> None:
 
 def test_corners_of_the_tutorial_have_bad_points_in_left02() -> None:
     found = calibrate_intrinsics(_tutorial("left"), sheet="exact")
-    assert found.bad_views == ()  # what is left of it is as good as the others
+    assert found.bad_views == ()  # its other points are as good as those of the other pairs
     assert "0 in left02 (6.3" in found.warnings[0].text

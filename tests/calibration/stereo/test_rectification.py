@@ -90,7 +90,7 @@ def test_rectification_apply_brings_a_grey_ramp_along_its_map() -> None:
         ),
     ],
 )
-def test_rectify_of_what_cannot_be_raises(changes: dict[str, Any], code: Code, text: str) -> None:
+def test_rectify_of_a_wrong_pair_raises(changes: dict[str, Any], code: Code, text: str) -> None:
     right = changes.pop("right", RIGHT)
     with pytest.raises(CalibrationError, match=text) as caught:
         rectify(LEFT, right, RIG, **changes)
@@ -100,8 +100,8 @@ def test_rectify_of_what_cannot_be_raises(changes: dict[str, Any], code: Code, t
 @pytest.mark.parametrize(
     ("turn", "shift", "alpha"),
     [
-        (np.diag([-1.0, -1.0, 1.0]), [0.02, 0.05, 0.0], 0.5),  # one camera on its head
-        (np.eye(3), [0.01, 0.0, -0.1], 1.0),  # one behind the other
+        (np.diag([-1.0, -1.0, 1.0]), [0.02, 0.05, 0.0], 0.5),  # one camera upside down
+        (np.eye(3), [0.01, 0.0, -0.1], 1.0),  # one camera behind the other
     ],
 )
 def test_rectify_of_cameras_that_no_rows_join_raises(
@@ -190,7 +190,7 @@ def test_epipolar_distances_of_partners_are_zero() -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 
 
-def test_epipolar_distances_are_what_a_pixel_is_off_across_the_line() -> None:
+def test_epipolar_distances_are_the_offsets_across_the_line() -> None:
     left, right = _seen(SEEN_POINTS[2:3])
     found = epipolar_distances(PAIR, (left, right + np.array([0.0, 1.0])))
     assert found[0] == pytest.approx([1.0, 1.0], abs=0.1)

@@ -20,7 +20,7 @@ from smartcam.calibration import (
 )
 from smartcam.calibration._stereo.errors import spacing_errors
 from smartcam.calibration._stereo.start import Lenses, as_moments, start
-from tests.calibration.inside import Sight, as_meant, check_fit, half_turned, remark_sides
+from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, remark_sides
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
 
@@ -40,7 +40,7 @@ def _calibrated() -> StereoCalibration:
 
 @functools.cache
 def _exactly(first: int = 0) -> StereoCalibration:
-    """Return what pairs from ``first`` on give, of a sheet taken for exact."""
+    """Return the calibration from pairs from ``first`` on, of a sheet taken as exact."""
     left, right = pairs(6)
     return calibrate_stereo(left[first:], right[first:], sheet="exact")
 
@@ -50,7 +50,7 @@ def _off(found: Transform) -> Array:
     return np.concatenate([turn, found.translation - RIG.translation])
 
 
-def test_calibrate_stereo_finds_the_transform_as_well_as_it_says() -> None:
+def test_calibrate_stereo_finds_the_transform_within_its_covariance() -> None:
     found = _calibrated()
     off = _off(found.transform)
     assert np.abs(off / np.sqrt(np.diag(found.covariance))).max() < 4.0
@@ -104,7 +104,7 @@ def test_calibrate_stereo_uses_views_of_one_camera_alone() -> None:
     assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
 
 
-def test_calibrate_stereo_of_a_moment_that_nobody_saw_leaves_it_open() -> None:
+def test_calibrate_stereo_of_a_moment_without_views_leaves_it_open() -> None:
     left, right = pairs(6)
     found = calibrate_stereo([*left, None], [*right, None], left=LEFT, right=RIGHT)
     assert found.pairs[6].used == (False, False)
@@ -141,7 +141,7 @@ def test_calibrate_stereo_of_shifted_pairs_is_refused() -> None:
     assert caught.value.code == Code.POOR_FIT
 
 
-def test_calibrate_stereo_told_to_keep_a_wrong_pair_is_refused_and_names_it() -> None:
+def test_calibrate_stereo_with_a_kept_wrong_pair_is_refused_and_names_it() -> None:
     left, right = pairs(6)
     right[2] = dataclasses.replace(right[5], name="other")
     with pytest.raises(CalibrationError, match=r"worst: other \(right\)") as caught:
@@ -149,7 +149,7 @@ def test_calibrate_stereo_told_to_keep_a_wrong_pair_is_refused_and_names_it() ->
     assert caught.value.code == Code.POOR_FIT
 
 
-def test_calibrate_stereo_of_swapped_sides_says_so() -> None:
+def test_calibrate_stereo_of_swapped_sides_has_a_remark() -> None:
     left, right = pairs(5)
     found = calibrate_stereo(right, left, left=RIGHT, right=LEFT, sheet="exact")
     assert [one.code for one in found.warnings] == [Code.SWAPPED_SIDES]
@@ -184,7 +184,7 @@ def test_calibrate_stereo_of_a_camera_on_its_head_numbers_alike() -> None:
     lefts = poses(6, name="left")
     rights = [over @ RIG @ one for one in lefts]
     left, right = seen(LEFT, lefts, target=target), seen(RIGHT, rights, target=target, seed=2)
-    # as each picture is read: the right one from the other end, but for two that say it right
+    # numbered by each picture: the right one from the other end, except for two pairs
     right = [half_turned(one) if number > 1 else one for number, one in enumerate(right)]
     found = calibrate_stereo(left, right, left=LEFT, right=RIGHT)
     assert 1e3 * np.linalg.norm(found.transform.translation) == pytest.approx(80.0, abs=0.5)
@@ -207,8 +207,8 @@ def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
 
 @pytest.mark.long
 @pytest.mark.judged
-def test_calibrate_stereo_of_a_stretched_sheet_adjusts_it_or_says_so() -> None:
-    stretched = as_meant(BOARD.points * [1.01, 1.0, 1.0], BOARD.points)
+def test_calibrate_stereo_of_a_stretched_sheet_adjusts_it_or_has_a_remark() -> None:
+    stretched = moved_to_nominal(BOARD.points * [1.01, 1.0, 1.0], BOARD.points)
     left, right = pairs(8, points=stretched)
     found, exact = (calibrate_stereo(left, right, sheet=one) for one in ("auto", "exact"))
     assert found.sheet is not None
@@ -422,7 +422,7 @@ def test_start_is_near_the_truth() -> None:
     assert apart == {}
 
 
-def test_start_tells_the_pair_that_does_not_belong_together() -> None:
+def test_start_names_the_pair_that_does_not_belong_together() -> None:
     left, right = pairs(6)
     views = [*right[:4], right[0], right[5]]
     _, bundle, apart = start(as_moments(left, views), Lenses((LEFT, RIGHT), "plumb_bob", ()))
@@ -442,7 +442,7 @@ def test_check_fit_of_more_pixels_than_can_be_names_the_worst_views() -> None:
         check_fit(5.1, sights, [Sight(1, 1, right[1])])
 
 
-def test_check_fit_allows_more_where_points_are_not_known_better() -> None:
+def test_check_fit_allows_more_for_less_certain_points() -> None:
     left, _ = pairs(2, sigma=0.5)
     sights = [Sight(0, 0, left[0])]
     check_fit(9.9, sights, [])
@@ -459,7 +459,7 @@ def test_check_fit_allows_more_where_points_are_not_known_better() -> None:
         (np.pi, [0.1, 0.01, 0.0], []),
     ],
 )
-def test_remark_sides_is_made_where_the_right_one_is_left(
+def test_remark_sides_is_made_for_a_right_camera_on_the_left(
     turn: float, shift: list[float], codes: list[Code]
 ) -> None:
     rotation = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()

@@ -1,4 +1,4 @@
-"""Pairs that are none, or that are not what they seem: each a typed error or a remark by name."""
+"""Invalid and misleading pairs give a typed error, or a remark with their name."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_calibrate_stereo_of_wrong_options_is_refused(options: dict[str, Any], t
         known(*pairs(3), **options)
 
 
-def test_calibrate_stereo_of_what_may_be_gone_through_once_is_taken() -> None:
+def test_calibrate_stereo_accepts_an_iterator() -> None:
     left, right = pairs(2)
     once: Any = iter(left)
     found = known(once, right)
@@ -56,7 +56,7 @@ def test_calibrate_stereo_with_exchanged_lenses_is_refused() -> None:
         calibrate_stereo(left, right, left=RIGHT, right=LEFT)
 
 
-def test_calibrate_stereo_with_lenses_that_are_alike_tells_nothing_of_them() -> None:
+def test_calibrate_stereo_with_equal_lenses_has_no_remark_on_them() -> None:
     left = poses(4, name="left")
     views = seen(LEFT, left, seed=1), seen(LEFT, [RIG @ one for one in left], seed=2)
     found = known(*views, right=LEFT)
@@ -114,14 +114,14 @@ def _points(found: StereoCalibration, side: int) -> list[int]:
     return [len(one.ids) for one in views if one is not None]
 
 
-def test_calibrate_stereo_with_a_lens_of_another_camera_says_so() -> None:
+def test_calibrate_stereo_with_a_lens_of_another_camera_has_a_remark() -> None:
     left, right = pairs(4)
     found = known(left, right, left=LEFT, right=LEFT)
     (remark,) = [one for one in found.warnings if one.code == Code.WRONG_LENS]
     assert remark.text.startswith("the right lens that was given leaves 4.")
 
 
-def test_calibrate_stereo_of_what_cannot_be_says_so() -> None:
+def test_calibrate_stereo_of_invalid_arguments_is_refused() -> None:
     left, right = pairs(3)
     twice = [*left, left[0]], [*right, right[0]]
     found = known(*twice)

@@ -31,17 +31,17 @@ HELD = Quaternion(1.0, 0.0, 0.0, 0.0)
 
 
 def where(x: float, y: float) -> list[float]:
-    """Return where the robot touches a point of the camera, metres."""
+    """Return the robot's touch of a point of the camera, metres."""
     place: list[float] = (ROTATION @ [x, y, 0.0] + OFFSET).tolist()
     return place
 
 
 class Bench:
-    """A camera that sees marks, and a robot whose tip somebody moves.
+    """A camera that sees marks, and a robot whose tip the test moves.
 
     Args:
-        marks: where they lie, in the camera's frame.
-        sigma: of a touch, metres.
+        marks: places of the marks, in the camera's frame.
+        sigma: standard deviation of a touch, metres.
     """
 
     def __init__(self, marks: Sequence[tuple[float, float]] = GRID, sigma: float = 0.0) -> None:
@@ -63,18 +63,18 @@ class Bench:
         return Pose(Header(0, datetime.now(UTC), "robot"), Position(*self.tip), HELD)
 
     def touch(self, x: float, y: float) -> tuple[float, float, float]:
-        """Move the tip onto a point of the camera, and return where it is."""
+        """Move the tip onto a point of the camera, and return the tip's place."""
         place = np.array(where(x, y)) + self._random.normal(0.0, self.sigma, 3)
         self.tip = (float(place[0]), float(place[1]), float(place[2]))
         return self.tip
 
     def touch_mm(self, x: float, y: float) -> dict[str, float]:
-        """Return an answer with where the tip touches a point, in mm."""
+        """Return an answer with the tip's place at a point, in mm."""
         return {axis: 1e3 * value for axis, value in zip("xyz", self.touch(x, y), strict=True)}
 
 
 async def say(session: WizardSession, answers: object = None) -> dict[str, Any]:
-    """Answer the current step, which must take it."""
+    """Answer the current step, which must accept the answer."""
     view = await session.submit(session.token, answers)
     assert view["errors"] == {}, view
     return view

@@ -71,7 +71,7 @@ def test_listing_of_three_touches_knows_no_error(tmp_path: Path) -> None:
     assert listing(Folder(tmp_path))[0]["held_out_mm"] is None
 
 
-def test_listing_names_what_cannot_be_read_and_goes_on(tmp_path: Path) -> None:
+def test_listing_names_unreadable_files_and_goes_on(tmp_path: Path) -> None:
     saved(tmp_path, "b")
     (tmp_path / "a.json").write_text("{")
     write(tmp_path / "c.json", "other", {})

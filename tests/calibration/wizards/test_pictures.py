@@ -1,4 +1,4 @@
-"""Pictures out of files and folders."""
+"""Pictures from files and folders."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def encoded(image: Any = GREY, suffix: str = ".png") -> bytes:
 
 
 async def taken(folder: PictureFolder, *writes: tuple[Path, bytes]) -> Any:
-    """Take a picture; the files are written when it has looked at what was there before."""
+    """Take a picture; the files are written after the first look at the folder."""
     task = asyncio.create_task(folder.take())
     await asyncio.sleep(0)  # up to its first wait
     for path, data in writes:
@@ -49,7 +49,7 @@ def test_picture_of_sixteen_bits_keeps_them() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a, and no more", encoded()[:40]])
-def test_picture_that_is_none_is_refused(data: bytes) -> None:
+def test_invalid_picture_is_refused(data: bytes) -> None:
     with refused("BAD_PICTURE", "shot.png: expected a bitmap, JPEG, PNG or TIFF, got"):
         decode_picture(data, "shot.png")
 
@@ -104,14 +104,14 @@ async def test_folder_waits_for_a_file_that_grows(
     assert folder.parts == []
 
 
-async def test_folder_where_none_comes_says_so_in_time(tmp_path: Path) -> None:
+async def test_folder_without_a_new_picture_is_an_error_in_time(tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(encoded())
     wanted = "expected a file that ends in one of .bmp, .jpeg"
     with refused("NO_PICTURE", f"within 0.3 s (there before: 1); {wanted}"):
         await PictureFolder(tmp_path, deadline=0.3).take()
 
 
-async def test_folder_where_other_files_come_names_them(tmp_path: Path) -> None:
+async def test_folder_with_other_new_files_names_them(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_bytes(b"here before")
     folder = PictureFolder(tmp_path, deadline=0.5)
     waiting = asyncio.create_task(folder.take())
@@ -122,18 +122,18 @@ async def test_folder_where_other_files_come_names_them(tmp_path: Path) -> None:
         await waiting
 
 
-def test_folder_says_which_file_it_waits_for(tmp_path: Path) -> None:
+def test_folder_describes_the_awaited_file(tmp_path: Path) -> None:
     told = PictureFolder(tmp_path, deadline=5.0).awaited
     assert f"the next file that comes into {tmp_path} counts, one that ends in .bmp" in told
     assert told.endswith("It is waited for 5 s")
 
 
-async def test_folder_with_a_picture_that_is_none_names_the_file(tmp_path: Path) -> None:
+async def test_folder_with_an_invalid_picture_names_the_file(tmp_path: Path) -> None:
     with refused("BAD_PICTURE", "shot.jpg: expected a bitmap"):
         await taken(PictureFolder(tmp_path), (tmp_path / "shot.jpg", b"no picture"))
 
 
-async def test_folder_that_is_none_is_refused(tmp_path: Path) -> None:
+async def test_invalid_folder_is_refused(tmp_path: Path) -> None:
     with refused("NO_PICTURE", "missing: expected a folder that pictures come into"):
         PictureFolder(tmp_path / "missing")
     folder = PictureFolder(tmp_path)
@@ -152,7 +152,7 @@ def test_folder_with_too_many_files_is_refused(
         PictureFolder(tmp_path)
 
 
-async def test_folder_take_cancelled_leaves_nothing_behind(tmp_path: Path) -> None:
+async def test_folder_take_cancelled_leaves_nothing_open(tmp_path: Path) -> None:
     task = asyncio.create_task(PictureFolder(tmp_path).take())
     await asyncio.sleep(0)
     task.cancel()
@@ -163,7 +163,7 @@ async def test_folder_take_cancelled_leaves_nothing_behind(tmp_path: Path) -> No
 # ---------------------------------------------------------------------- sources of frames
 
 
-async def test_picture_of_a_source_is_the_first_exposed_after_it_was_wanted() -> None:
+async def test_picture_of_a_source_is_the_first_exposed_after_the_request() -> None:
     driver, source = scripted(stall=None, linger=60.0)
     take = taker(source)
     async with source, source.reader() as reader:
@@ -172,7 +172,7 @@ async def test_picture_of_a_source_is_the_first_exposed_after_it_was_wanted() ->
         assert (await anext(reader)).sequence == 1  # here before the button
         taking = asyncio.ensure_future(take())
         await until(lambda: source.statistics().readers == 2)
-        driver.give(frame(2, captured=time.monotonic() - 1.0))  # exposed before, here after it
+        driver.give(frame(2, captured=time.monotonic() - 1.0))  # exposed before
         await asyncio.sleep(1.0)
         assert not taking.done()
         driver.give(frame(3))
@@ -198,7 +198,7 @@ async def test_picture_of_a_source_that_dies_or_is_silent_is_its_error() -> None
         await take()
 
 
-async def test_what_takes_pictures_stays_what_it_is() -> None:
+async def test_function_that_takes_pictures_is_used_unchanged() -> None:
     async def take() -> Any:
         return GREY
 

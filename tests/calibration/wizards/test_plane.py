@@ -1,4 +1,4 @@
-"""The wizard of the plane: both ways, what is refused, what is saved."""
+"""The wizard of the plane: both ways, refusals, and saved files."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ async def test_touches_in_an_order_that_a_grid_does_not_tell_are_touched_again(
     assert (view["verdict"]["level"], view["defaults"]["next"]) == ("poor", "redo")
 
 
-async def test_error_beyond_what_the_user_allows_is_not_good(tmp_path: Path) -> None:
+async def test_error_beyond_the_allowed_one_is_not_good(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
     await say(session, {"touch_sigma": 0.2, "allowed": 0.5})
@@ -174,7 +174,7 @@ async def test_error_beyond_what_the_user_allows_is_not_good(tmp_path: Path) -> 
 async def touch_some_wrong(
     session: WizardSession, bench: Bench, wrong: Mapping[int, float]
 ) -> dict[str, Any]:
-    """Touch all nine marks, some by number off by so many millimetres; return the review."""
+    """Touch all nine marks, some of them off by a number of millimetres; return the review."""
     await say(session, {"touch_sigma": 0.2})
     await say(session)
     view = await say(session)
@@ -305,7 +305,7 @@ async def test_wizard_resumed_with_another_y_down_takes_no_picture(tmp_path: Pat
     session.close()
 
 
-async def test_marks_in_a_line_are_told_and_more_can_be_added(tmp_path: Path) -> None:
+async def test_marks_in_a_line_are_reported_and_more_can_be_added(tmp_path: Path) -> None:
     bench = Bench(marks=GRID[:3])
     session = begin(tmp_path, bench)
     await say(session)
@@ -475,7 +475,7 @@ async def test_wrong_touch_that_looks_like_another_scale_is_blamed(tmp_path: Pat
     session.close()
 
 
-async def test_marks_can_be_chosen_where_the_picture_shows_them(tmp_path: Path) -> None:
+async def test_marks_can_be_chosen_in_the_picture(tmp_path: Path) -> None:
     session = begin(tmp_path, Bench(marks=GRID[:3]))
     await say(session)
     view = await say(session)
@@ -520,7 +520,7 @@ async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
     assert told == pytest.approx(where(*GRID[0]), abs=0.001)
 
 
-async def test_side_that_was_not_said_is_asked_for_before_it_is_called_good(
+async def test_wizard_asks_for_a_missing_side_before_a_good_verdict(
     tmp_path: Path,
 ) -> None:
     bench = Bench(sigma=0.0002)
@@ -539,7 +539,7 @@ async def test_side_that_was_not_said_is_asked_for_before_it_is_called_good(
     assert found.tool_z.tolist() == [0.0, 0.0, -1.0]
 
 
-async def test_side_that_contradicts_the_touches_is_told_as_mirrored(tmp_path: Path) -> None:
+async def test_side_that_contradicts_the_touches_is_reported_as_mirrored(tmp_path: Path) -> None:
     bench = Bench()
     session = begin(tmp_path, bench)
     await say(session, {"touch_sigma": 0.2, "side": "unknown"})

@@ -45,7 +45,7 @@ async def test_session_answered_gives_the_result() -> None:
     ]  # fmt: skip
 
 
-def test_current_tells_all_that_a_front_end_shows() -> None:
+def test_current_has_all_fields_of_a_front_end() -> None:
     session, _ = started()
     view = session.current
     assert json.loads(json.dumps(view)) == view
@@ -58,7 +58,7 @@ def test_current_tells_all_that_a_front_end_shows() -> None:
     session.close()
 
 
-async def test_submit_of_wrong_answers_keeps_the_step_and_tells_each() -> None:
+async def test_submit_of_wrong_answers_keeps_the_step_and_names_each() -> None:
     session, _ = started()
     token = session.token
     view = await session.submit(token, {"name": "A B", "unit": "inch", "z": 1})
@@ -253,7 +253,7 @@ async def test_repeat_of_a_step_without_an_action_is_refused() -> None:
     session.close()
 
 
-async def test_abort_ends_it() -> None:
+async def test_abort_ends_the_sequence() -> None:
     session, _ = started()
     view = await answer_all(session, until=2)
     view = await session.abort(view["token"])
@@ -393,7 +393,7 @@ async def test_submit_onto_a_full_disk_keeps_the_step(tmp_path: Path) -> None:
 
 
 def drive(path: Path, answers: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Run the survey in a process, which is killed when it has told of each answer."""
+    """Run the survey in a process, which is killed after its report of each answer."""
     with start(path) as process:
         told = [json.loads(readline(process))]
         for one in answers:
@@ -439,7 +439,7 @@ def test_process_killed_at_every_step_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_process_killed_before_it_answers_takes_the_step_or_leaves_it(tmp_path: Path) -> None:
+def test_process_killed_before_its_answer_does_the_step_or_leaves_it(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     number = 1
     for answer in ANSWERS:
@@ -473,7 +473,7 @@ async def test_journal_cut_at_every_byte_loses_the_last_line_only(tmp_path: Path
             again.close()
 
 
-def test_journal_whose_answers_lead_nowhere_is_refused(tmp_path: Path) -> None:
+def test_journal_with_answers_of_another_sequence_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     WizardSession(survey(Trigger()), Journal(path)).close()
     names = {"event": "answer", "token": "", "outcome": None, "acted": False, "at": ""}
@@ -488,7 +488,7 @@ def test_journal_whose_answers_lead_nowhere_is_refused(tmp_path: Path) -> None:
 
 
 # ----------------------------------------------------------------------
-# The journal: what is written is there, what is broken or in use is refused.
+# The journal keeps written entries; broken files and files in use are refused.
 
 
 def test_entries_are_read_again_as_they_were_written(tmp_path: Path) -> None:

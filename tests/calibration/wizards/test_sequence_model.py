@@ -1,4 +1,4 @@
-"""A session against a plain model: whatever is done in whatever order, and broken off anywhere."""
+"""Compare a session with a plain model: any actions in any order, interrupted anywhere."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def tree(path: Path) -> list[str]:
 
 
 async def run_through(service: CalibrationService, bench: Bench) -> dict[str, Any]:
-    """Answer all that is asked from the picture on."""
+    """Answer all steps from the picture on."""
     await say(service.session)
     await say(service.session)
     await say(service.session)
@@ -59,7 +59,7 @@ async def run_through(service: CalibrationService, bench: Bench) -> dict[str, An
 
 
 @pytest.mark.parametrize("name", BAD_NAMES)
-def test_name_that_is_no_name_is_refused_everywhere(tmp_path: Path, name: str) -> None:
+def test_invalid_name_is_refused_everywhere(tmp_path: Path, name: str) -> None:
     service = served(tmp_path)
     saved(service, "good")
     before = tree(tmp_path)
@@ -217,7 +217,7 @@ async def test_start_while_an_action_is_under_way_is_refused(tmp_path: Path) -> 
     service.close()
 
 
-def test_service_without_a_sequence_or_a_calibration_says_so(tmp_path: Path) -> None:
+def test_service_without_a_sequence_or_a_calibration_reports_it(tmp_path: Path) -> None:
     service = served(tmp_path)
     with pytest.raises(CalibrationError, match="no calibration is under way"):
         _ = service.session

@@ -1,4 +1,4 @@
-"""The wizard that looks at a sheet: both ways, what is refused, what is saved, going on."""
+"""The wizard of the sheet: both ways, refusals, saved files, and resumed sessions."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ async def test_picture_is_shown_with_the_point_to_touch(tmp_path: Path) -> None:
     assert ">A</text>" in svg
     assert ">B</text>" in svg
     assert view["notes"][0] == "54 of 54 points of the target seen"
-    assert "told from the others by" in view["notes"][1]
+    assert "differs from the others by" in view["notes"][1]
     assert "point 9 of row 6, which has a ring" in view["description"]
     choices = view["preview"]["choices"]
     assert [one["answers"] for one in choices[8:10]] == [
@@ -102,7 +102,7 @@ async def test_rays_touched_give_a_calibration(tmp_path: Path) -> None:
     assert np.linalg.norm(found.transform(field()) - truth(field()), axis=1).max() < 2e-4
 
 
-async def test_corner_of_ones_own_choice_counts_as_what_it_is(tmp_path: Path) -> None:
+async def test_corner_of_the_user_s_choice_counts_at_its_place(tmp_path: Path) -> None:
     cell = Cell(sigma=0.0)
     session = begin(tmp_path, cell)
     await go_to(session, cell, "touch-1")
@@ -136,7 +136,7 @@ async def test_wrong_touch_is_touched_again_or_removed(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.judged
-async def test_print_that_is_smaller_is_told_unless_the_rulers_say_so(tmp_path: Path) -> None:
+async def test_smaller_print_is_reported_unless_the_rulers_are_smaller_too(tmp_path: Path) -> None:
     cell = Cell(scale=0.97, sigma=0.0)
     session = begin(tmp_path, cell)
     view = await go_to(session, cell, "review")
@@ -151,7 +151,7 @@ async def test_print_that_is_smaller_is_told_unless_the_rulers_say_so(tmp_path: 
     session.close()
 
 
-async def test_target_typed_is_the_one_that_is_found(tmp_path: Path) -> None:
+async def test_target_typed_is_the_one_in_the_picture(tmp_path: Path) -> None:
     cell = Cell()
     session = begin(tmp_path, cell, target=None)
     view = await say(session, sheetkit.ABOUT)
@@ -189,7 +189,7 @@ async def test_target_of_dots_typed_in_mm_is_kept_in_metres(tmp_path: Path) -> N
         ('{"kind": "checkerboard", "columns": 9}', {"base": "missing 2 required"}),
     ],
 )
-async def test_description_that_is_none_keeps_the_step(
+async def test_invalid_description_keeps_the_step(
     tmp_path: Path, text: str, wrong: dict[str, str]
 ) -> None:
     session = begin(tmp_path, Cell())
@@ -236,7 +236,7 @@ async def test_picture_without_the_sheet_keeps_the_step(
 
 @pytest.mark.long
 @pytest.mark.judged
-async def test_origin_that_is_not_marked_is_told(tmp_path: Path) -> None:
+async def test_unmarked_origin_is_reported(tmp_path: Path) -> None:
     cell = Cell()
     plain = Checkerboard(columns=9, rows=6, square=0.025)
     cell.pictures = [render(plain, CAMERA, sheetkit.SEEN)]
@@ -258,7 +258,7 @@ async def test_picture_of_another_size_than_the_lens_keeps_the_step(tmp_path: Pa
     session.close()
 
 
-async def test_tool_on_the_wrong_side_is_told(tmp_path: Path) -> None:
+async def test_tool_on_the_wrong_side_is_reported(tmp_path: Path) -> None:
     cell = Cell()
     side = "-z" if LIES.rotation[2, 2] < 0 else "+z"
     session = begin(tmp_path, cell, side=side)
@@ -317,7 +317,7 @@ def go_on(process: subprocess.Popen[str]) -> None:
 
 
 @pytest.mark.long
-def test_process_killed_behind_picture_and_touches_loses_nothing(tmp_path: Path) -> None:
+def test_process_killed_after_picture_and_touches_loses_nothing(tmp_path: Path) -> None:
     reached, taken = 1, 0
     for steps in (4, 2, 3):
         with start(tmp_path) as process:
@@ -339,7 +339,7 @@ def test_process_killed_behind_picture_and_touches_loses_nothing(tmp_path: Path)
 
 
 @pytest.mark.long
-def test_process_killed_with_a_picture_under_way_takes_the_step_or_leaves_it(
+def test_process_killed_during_a_picture_does_the_step_or_leaves_it(
     tmp_path: Path,
 ) -> None:
     with start(tmp_path) as process:
@@ -368,11 +368,11 @@ async def test_one_of_five_touches_that_is_off_is_named_and_not_the_print(tmp_pa
     assert (view["defaults"]["next"], view["defaults"]["point"]) == ("redo", 2)
 
 
-async def test_direction_of_the_pictures_right_side_is_told(tmp_path: Path) -> None:
+async def test_direction_of_the_pictures_right_side_is_shown(tmp_path: Path) -> None:
     cell = Cell(sigma=0.0)
     session = begin(tmp_path, cell, side="-z")
     view = await go_to(session, cell, "review")
     right = (LIES.rotation @ SEEN.rotation.T)[:, 0]
     (note,) = [one for one in view["notes"] if "to the right in the picture" in one]
     told = [float(one) for one in re.findall(r"-?\d\.\d\d", note)]
-    assert np.allclose(told, right, atol=0.18)  # the sheet is tilted before the camera
+    assert np.allclose(told, right, atol=0.18)  # the sheet is tilted in front of the camera

@@ -1,4 +1,4 @@
-"""Steps: their schema and their checks are one rule; the thesis' lists."""
+"""A step's schema and its checks agree; lists in the thesis' form."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VALUES = st.one_of(
 @example({"x": 1.5, "n": None, "t": "abc"})
 @example({"x": 1, "n": 3.0, "t": "a\n"})
 @example({"x": True})
-def test_checked_takes_exactly_what_the_schema_takes(answers: dict[str, Any]) -> None:
+def test_checked_accepts_the_same_answers_as_the_schema(answers: dict[str, Any]) -> None:
     valid = jsonschema.Draft202012Validator(STEP.schema()).is_valid(answers)
     try:
         STEP.checked(answers)
@@ -56,7 +56,7 @@ def test_schema_is_one_of_2020_12() -> None:
     jsonschema.validate({**STEP.defaults(), "x": 0}, STEP.schema())
 
 
-def test_checked_fills_in_defaults_and_makes_numbers_what_they_are() -> None:
+def test_checked_fills_in_defaults_and_converts_numbers() -> None:
     assert STEP.checked({"x": 1, "n": 3.0}) == {"x": 1.0, "n": 3, "t": "", "o": "b", "f": False}
     assert [type(STEP.checked({"x": 1, "n": 3.0})[one]) for one in "xn"] == [float, int]
 
@@ -74,7 +74,7 @@ def test_checked_fills_in_defaults_and_makes_numbers_what_they_are() -> None:
         ([1], {"base": "[1]: expected answers by the names of inputs"}),
     ],
 )
-def test_checked_tells_what_was_expected(answers: Any, errors: dict[str, str]) -> None:
+def test_checked_error_names_the_expected_answer(answers: Any, errors: dict[str, str]) -> None:
     with pytest.raises(CalibrationError) as caught:
         STEP.checked(answers)
     assert caught.value.got == errors

@@ -1,4 +1,4 @@
-"""The pictures of steps that look at targets or touch points, and the next view they ask for."""
+"""Pictures of steps with targets or touches, and of the suggested next view."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ DATA = re.compile(r"(?<=base64,)[\w+/=]+")
 def view(
     left: float = 100, low: float = 400, step: float = 60, size: tuple[int, int] = (640, 480)
 ) -> TargetView:
-    """Return a view of the target upright before the camera."""
+    """Return a view of the target, upright in front of the camera."""
     points = [(left + step * x, low - step * y) for y in range(3) for x in range(4)]
     return TargetView(
         target=TARGET,
@@ -67,8 +67,8 @@ def picture_in(picture: str) -> NDArray[Any]:
     return np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED))
 
 
-def test_preview_is_the_one_that_was_looked_at() -> None:
-    """To look at a new one: run this test with SMARTCAM_REWRITE=1 and open the file."""
+def test_preview_equals_the_approved_one() -> None:
+    """To approve a new picture, run this test with SMARTCAM_REWRITE=1 and view the file."""
     one = view()
     drawn = draw(
         GREY,
@@ -99,7 +99,7 @@ def test_preview_of_a_large_image_is_bounded(size: tuple[int, int]) -> None:
     assert len(drawn) < 1.5 * MAX_SIDE_PX**2 + 5000
 
 
-def test_preview_draws_points_where_the_picture_has_them() -> None:
+def test_preview_draws_points_at_their_places_in_the_picture() -> None:
     points = elements(draw(GREY, view=view()), "point")
     zoom = 900 / 640
     assert len(points) == 12
@@ -123,7 +123,7 @@ def test_preview_without_the_origin_fills_no_point() -> None:
     assert legend(drawn).startswith("11 of 12 points; ")
 
 
-def test_preview_residuals_are_as_much_larger_as_it_says() -> None:
+def test_preview_residuals_are_enlarged_by_the_stated_factor() -> None:
     one = view()
     drawn = draw(GREY, view=one, predicted=one.points + np.array([0.3, 0.4]))
     (line, *rest) = elements(drawn, "residual")
@@ -146,7 +146,7 @@ def test_preview_counts_the_cells_of_all_views() -> None:
     assert legend(drawn) == "12 of 12 points; 2 of 48 cells seen by 3 views"
 
 
-def test_preview_without_a_view_says_that_nothing_was_found() -> None:
+def test_preview_without_a_view_reports_that_no_target_was_found() -> None:
     drawn = draw(GREY, earlier=[view()])
     assert elements(drawn, "point") == []
     assert legend(drawn).startswith("no target found; ")
@@ -167,7 +167,7 @@ def test_cell_counts_counts_points_in_cells_of_the_image() -> None:
     assert counts.sum() == 12
 
 
-def test_cell_counts_leaves_out_what_is_outside_of_the_image() -> None:
+def test_cell_counts_leaves_out_points_outside_of_the_image() -> None:
     assert cell_counts([view(-5000)]).sum() == 0
     assert cell_counts([]).sum() == 0
 
@@ -181,9 +181,7 @@ def test_cell_counts_leaves_out_what_is_outside_of_the_image() -> None:
         ({"suggested": [1, 2, 3]}, "suggested outline"),
     ],
 )
-def test_preview_of_what_does_not_belong_together_is_refused(
-    options: dict[str, Any], text: str
-) -> None:
+def test_preview_of_contradictory_arguments_is_refused(options: dict[str, Any], text: str) -> None:
     with pytest.raises(CalibrationError, match=text) as caught:
         draw(GREY, **options)
     assert caught.value.code == Code.SHAPE
@@ -195,7 +193,7 @@ def test_preview_of_no_image_is_refused() -> None:
 
 
 # ----------------------------------------------------------------------
-# What pictures of touches are drawn from: places, the view, the map of predicted errors.
+# The data of pictures of touches: places, the view, the map of predicted errors.
 
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
@@ -218,7 +216,7 @@ def preview_of(found: PlaneCalibration) -> dict[str, Any]:
 
 
 def middles(preview: dict[str, Any]) -> Array:
-    """Return where the middles of the heat map's cells lie (rows, columns, 2), in the plane."""
+    """Return the middles (rows, columns, 2) of the heat map's cells, in the plane."""
     low, high = np.array(preview["view"])
     rows, columns = len(preview["heat"]), len(preview["heat"][0])
     x = low[0] + (np.arange(columns) + 0.5) * (high - low)[0] / columns
@@ -263,7 +261,7 @@ def test_compared_without_a_sigma_has_no_heat_and_no_covariance() -> None:
 
 
 @pytest.mark.parametrize(("off", "shown"), [(0.02, True), (1000.0, False)])
-def test_compared_marks_what_is_left_out_and_counts_it_nowhere(off: float, shown: bool) -> None:
+def test_compared_marks_left_out_points_and_does_not_count_them(off: float, shown: bool) -> None:
     touched = SCENE.touched(GRID, 1)
     touched[2] += off * SCENE.turn[:, 0]
     found = fit_plane(GRID, touched, touch_sigma=SIGMA, model="similarity", robust=True)
@@ -299,7 +297,7 @@ def test_before_shows_marks_and_the_next_one() -> None:
 
 
 # ----------------------------------------------------------------------
-# Where the next view is to be: outlines that fit into the image, and differ.
+# Outlines of the next view: they fit into the image, and differ.
 
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)
@@ -307,7 +305,7 @@ SIZE = (640, 480)
 
 
 @pytest.mark.parametrize("look", LOOKS, ids=lambda look: look.text[:20])
-def test_outline_takes_its_part_of_the_image_and_lies_in_it(look: Look) -> None:
+def test_outline_fills_its_part_of_the_image(look: Look) -> None:
     found = outline(look, BOARD, SIZE)
     assert (np.ptp(found, axis=0) / SIZE).max() == pytest.approx(look.fill, abs=0.01)
     assert ((found >= 0) & (found <= SIZE)).all()
@@ -315,7 +313,7 @@ def test_outline_takes_its_part_of_the_image_and_lies_in_it(look: Look) -> None:
     assert ax * by - ay * bx < 0  # seen from the front: y up on the sheet, v down
 
 
-def test_outline_from_the_front_is_upright_and_turned_by_a_quarter_it_lies() -> None:
+def test_outline_from_the_front_is_upright_or_turned_by_a_quarter() -> None:
     straight, turned = (outline(LOOKS[one], BOARD, SIZE) for one in (0, 5))
     assert straight[0] == pytest.approx([128, 360])
     assert straight[2] == pytest.approx([512, 120])

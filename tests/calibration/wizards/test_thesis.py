@@ -1,4 +1,4 @@
-"""The thesis' sequence without tokens: who may call when, what is left, and how it goes on."""
+"""The thesis' sequence without tokens: allowed calls, interruptions and resumption."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIXED = CalibrationStart(topic_image2=SMARTCAMERA, fixed_camera="True")
 
 
 class Camera:
-    """A camera of the bench, whose next picture may take its time, or fail."""
+    """A camera of the bench, whose next picture may be late or fail."""
 
     name, y_down, unit = "line1/cam3", False, "m"
 
@@ -49,7 +49,7 @@ class Camera:
 
 
 class Graph:
-    """ROS beside the camera, on paper: a tree of one frame, and no pictures."""
+    """A stand-in for ROS: a tree of one frame, and no pictures."""
 
     def check_topic(self, topic: str) -> None:
         pass
@@ -83,7 +83,7 @@ class Client:
         return await self.desk.perform(asked, self.camera)
 
     async def accept(self, answer: dict[str, Any], *texts: str) -> dict[str, Any]:
-        """Answer a step by what is shown."""
+        """Answer a step by its fields."""
         inputs = {
             "text_inputs": texts or answer["default_needed_strings"],
             "option_inputs": [one.split()[0] for one in answer["default_needed_options"]],
@@ -93,7 +93,7 @@ class Client:
         return answer
 
     async def to_picture(self, start: CalibrationStart = FIXED) -> dict[str, Any]:
-        """Start, and go on to where a picture is taken."""
+        """Start, and go on to the step that takes a picture."""
         await self.desk.start(start)
         answer = await self.accept(await self.step(), "table")
         answer = await self.accept(answer)
@@ -122,7 +122,7 @@ async def test_a_call_beside_another_one_is_refused_and_changes_nothing(tmp_path
     client.desk.close()
 
 
-async def test_abort_cuts_off_a_picture_and_its_caller_hears_of_it(tmp_path: Path) -> None:
+async def test_abort_cancels_a_picture_and_its_caller_gets_an_error(tmp_path: Path) -> None:
     client = Client(tmp_path)
     await client.to_picture()
     client.camera.hold = asyncio.Event()
@@ -136,7 +136,7 @@ async def test_abort_cuts_off_a_picture_and_its_caller_hears_of_it(tmp_path: Pat
         await client.step()
     assert caught.value.code == "NO_SEQUENCE"
     client.camera.hold = None
-    await client.to_picture()  # can begin anew at once
+    await client.to_picture()  # can restart at once
     client.desk.close()
 
 
@@ -175,7 +175,7 @@ async def test_a_caller_that_goes_away_leaves_the_step(tmp_path: Path) -> None:
     client.desk.close()
 
 
-async def test_what_a_camera_fails_with_is_shown_and_keeps_the_step(tmp_path: Path) -> None:
+async def test_error_of_a_camera_is_shown_and_keeps_the_step(tmp_path: Path) -> None:
     client = Client(tmp_path)
     await client.to_picture()
     client.camera.error = TriggerError("it is not running")
@@ -197,7 +197,7 @@ async def test_a_calibration_that_is_left_alone_is_given_up_and_goes_on_later(
     answer = await client.step(1.0, 2.0, 3.0)
     assert answer["header_text"] == "Touch mark 2 of 9"
     await asyncio.sleep(0.1)
-    assert (await client.step(1.0, 2.0))["error"]  # a call, of whatever kind, gives it time
+    assert (await client.step(1.0, 2.0))["error"]  # any call restarts the time limit
     await asyncio.sleep(0.15)
     assert (await client.step(1.0, 2.0))["error"]
     await asyncio.sleep(0.3)
@@ -223,7 +223,7 @@ async def test_a_run_that_was_started_in_another_way_begins_anew(tmp_path: Path)
     client.desk.close()
 
 
-async def test_an_end_leaves_no_timer_behind(tmp_path: Path) -> None:
+async def test_end_of_a_calibration_stops_its_timer(tmp_path: Path) -> None:
     client = Client(tmp_path, abandoned=0.1)
     await client.to_picture()
     await client.step(abort=True)
@@ -288,7 +288,7 @@ async def test_a_request_chooses_the_wizard(
     client.desk.close()
 
 
-async def test_zero_is_none_where_there_can_be_no_zero(tmp_path: Path) -> None:
+async def test_zero_is_no_answer_if_it_is_out_of_range(tmp_path: Path) -> None:
     client = Client(tmp_path)
     await client.desk.start(FIXED)
     answer = await client.accept(await client.step(), "table")
@@ -355,7 +355,7 @@ async def test_a_pose_comes_in_the_frame_that_is_wanted(tmp_path: Path) -> None:
     assert pose.header.frame_id == "hall"
 
 
-async def test_the_whole_of_it_maps_pixels_at_once(tmp_path: Path) -> None:
+async def test_finished_calibration_maps_pixels_at_once(tmp_path: Path) -> None:
     client = Client(tmp_path)
     answer = await client.accept(await client.accept(await client.to_picture()))
     for mark in GRID:

@@ -1,4 +1,4 @@
-"""The verdict on a calibration, and the choice that it makes advisable."""
+"""The verdict on a calibration, and the advised choice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FIELD = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
 SHIFT = np.array([0.4, -0.1])
-ALLOWED = Allowed(30.0, said=True)
+ALLOWED = Allowed(30.0, given=True)
 
 
 @pytest.mark.parametrize(
@@ -44,10 +44,10 @@ def test_verdict_promises_no_less_than_the_noise_leads_to() -> None:
     assert judged.verdict.text.startswith("Good for 0.4 mm without point 3: 95 of 100")
 
 
-def test_verdict_is_not_good_beyond_what_is_allowed() -> None:
+def test_verdict_is_not_good_beyond_the_allowed_error() -> None:
     for allowed, why in (
         (Allowed.of(0.003, 0.4), "but 3 mm are allowed: "),
-        (Allowed.of(None, 0.25), "but 2.5 mm are allowed, 1 % of the field, as nobody said: "),
+        (Allowed.of(None, 0.25), "but 2.5 mm are allowed, 1 % of the field, the default: "),
     ):
         judged = judge(1.6, [], worst=1, allowed=allowed)
         assert (judged.verdict.level, judged.good_for, judged.option) == ("poor", None, "more")
@@ -55,7 +55,7 @@ def test_verdict_is_not_good_beyond_what_is_allowed() -> None:
         assert judge(1.2, [], worst=1, allowed=allowed).verdict.level == "good"
 
 
-def test_verdict_is_not_known_where_all_may_be_mirrored() -> None:
+def test_verdict_is_unknown_if_all_may_be_mirrored() -> None:
     judged = judge(0.1, [(Code.SIDE_UNKNOWN, "not checked")], worst=1, allowed=ALLOWED)
     assert (judged.verdict.level, judged.good_for) == ("unknown", None)
     assert judged.chosen(["accept", "more", "redo", "side"]) == "side"
@@ -79,7 +79,7 @@ def test_verdict_names_the_point_of_the_warning_that_is_to_be_mended_first() -> 
 
 
 @pytest.mark.parametrize("cures", [CURES, VIEW_CURES])
-def test_verdict_of_each_thing_that_is_wrong_says_what_to_do(
+def test_verdict_of_each_fault_names_the_cure(
     cures: Mapping[Code, tuple[str, str]],
 ) -> None:
     for code, (_, option) in cures.items():
@@ -93,7 +93,7 @@ def test_verdict_of_each_thing_that_is_wrong_says_what_to_do(
 
 @pytest.mark.long
 def test_verdict_holds_for_new_points() -> None:
-    """Of calibrations that are called good, 95 of 100 new touches lie within what was promised."""
+    """With the verdict good, 95 of 100 new touches lie within the promised error."""
     random = np.random.default_rng(11)
     inside: list[float] = []
     new = random.uniform((0.0, 0.0), (0.3, 0.24), (200, 2))

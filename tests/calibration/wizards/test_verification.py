@@ -1,4 +1,4 @@
-"""The check of a calibration: what it says, what it keeps, what it refuses."""
+"""The check of a calibration: its result, its files and its refusals."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def saved(tmp_path: Path, calibration: PlaneCalibration, tool: str = "pin") -> N
 
 
 async def touch(session: WizardSession, bench: Bench, by: Any = (0.0, 0.0, 0.0)) -> dict[str, Any]:
-    """Take a picture and touch all marks of it, as far off as said."""
+    """Take a picture and touch all its marks with a given offset."""
     view = await say(session)
     if view["step"] == "which":
         view = await say(session)
@@ -67,7 +67,7 @@ async def touch(session: WizardSession, bench: Bench, by: Any = (0.0, 0.0, 0.0))
     return view
 
 
-async def test_check_of_what_was_not_moved_holds_and_is_noted(tmp_path: Path) -> None:
+async def test_check_of_an_unmoved_camera_holds_and_is_noted(tmp_path: Path) -> None:
     saved(tmp_path, calibrated())
     bench = Bench([GRID[4], GRID[0]], SIGMA)
     session = begin(tmp_path, bench)
@@ -263,21 +263,21 @@ async def test_check_of_a_calibration_without_sigma_asks_for_it(tmp_path: Path) 
     session.close()
 
 
-async def test_check_of_a_calibration_that_is_not_there_keeps_the_step(tmp_path: Path) -> None:
+async def test_check_of_a_missing_calibration_keeps_the_step(tmp_path: Path) -> None:
     session = begin(tmp_path, Bench())
     view = await session.submit(session.token)
     assert view["errors"] == {"base": "no calibration 'table'; there are none: the folder is empty"}
     session.close()
 
 
-async def test_check_of_a_mark_that_is_known_badly_says_so(tmp_path: Path) -> None:
+async def test_check_of_an_uncertain_mark_reports_it(tmp_path: Path) -> None:
     saved(tmp_path, replace(calibrated(), touch_sigma=0.001))
     bench = Bench(GRID[:1])
     session = begin(tmp_path, bench)
     await say(session)
     view = await touch(session, bench)
     assert view["notes"][2].endswith(
-        "with no number of touches of these marks: the calibration is known too badly there"
+        "with no number of touches of these marks: the calibration is too uncertain there"
     )
     assert (await say(session))["result"]["needed"] is None
 
@@ -332,7 +332,7 @@ def sample(sigma: float | None) -> list[PlaneCalibration]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("sigma", "mark"), [(SIGMA, GRID[0]), (SIGMA, GRID[4]), (None, GRID[4])])
-def test_touches_needed_notice_a_knock_as_often_as_said(
+def test_touches_needed_notice_a_knock_at_the_stated_rate(
     sigma: float | None, mark: tuple[float, float]
 ) -> None:
     known = replace(calibrated(), sigma_given=sigma is not None)

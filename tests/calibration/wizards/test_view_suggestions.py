@@ -1,4 +1,4 @@
-"""The next view: always the same at first, then by what the views leave open."""
+"""The next view: fixed at first, then by the uncertainty of the earlier views."""
 
 from __future__ import annotations
 

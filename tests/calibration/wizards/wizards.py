@@ -1,4 +1,4 @@
-"""A small wizard for tests of sequences; as a program it is driven through its standard input."""
+"""A small wizard for tests of sequences, which as a program reads its standard input."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def survey(trigger: Callable[[Any], Awaitable[Any]]) -> Wizard:
 
 
 class Trigger:
-    """An action that counts; it raises what ``errors`` holds first."""
+    """An action that counts its calls, and raises the first of ``errors``."""
 
     def __init__(self, *errors: BaseException) -> None:
         self.count = 0
@@ -86,7 +86,7 @@ ANSWERS: list[dict[str, Any]] = [
     {"value": 1.5},
     {"value": 2.5},
 ]
-"""One for each step of the survey."""
+"""An answer for each step of the survey."""
 
 
 async def answer_all(
@@ -101,7 +101,7 @@ async def answer_all(
 
 
 async def _main(path: Path) -> None:
-    """Resume the journal; each line of stdin is an answer, each of stdout what comes then."""
+    """Resume the journal; each line of stdin is an answer, each line of stdout the next step."""
     trigger = Trigger()
     session = WizardSession(survey(trigger), Journal(path))
     read: Callable[[], str] = sys.stdin.readline

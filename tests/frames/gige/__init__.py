@@ -1,1 +1,1 @@
-"""Cameras that speak GigE Vision."""
+"""Tests of cameras with GigE Vision."""

@@ -1,7 +1,7 @@
 """A GigE Vision camera on real sockets, with all the faults of a network on request.
 
 It is written from the standard and shares no code with the driver. Each row of a frame begins with
-the frame's number, so that rows of two frames in one picture are seen.
+the frame's number, so that a test notices rows of two frames in one picture.
 """
 
 import asyncio
@@ -203,16 +203,16 @@ DESCRIPTION = """<?xml version="1.0" encoding="utf-8"?>
 
 @dataclass
 class Mischief:
-    """Faults of packets, by a seed.
+    """Random faults of packets.
 
     Attributes:
-        seed: of the dice.
-        drop: share of packets that are lost, also of those that are sent again.
+        seed: seed of the random numbers.
+        drop: share of packets that are lost, resent ones included.
         double: share of packets that come twice.
-        reorder: a packet may come that many places late.
+        reorder: a packet may come this many places late.
         resend: "answer", "ignore", or "refuse": by PACKET_UNAVAILABLE.
-        restart_at: before the frame of that number the block ids begin anew.
-        stop_after: the camera is unplugged behind that frame, in the middle of it.
+        restart_at: number of the frame before which the block ids restart.
+        stop_after: number of the frame in the middle of which the camera is unplugged.
         skip: numbers of frames of which nothing is sent.
     """
 
@@ -231,33 +231,33 @@ class Camera:
     """See :func:`camera`.
 
     Attributes:
-        port: that it listens at.
-        mischief: what happens to packets.
-        extended: whether its ids have 64 bits.
-        first_id: of its first block.
-        test_packets: the largest that come through; 0: it sends none.
-        packed: whether its description is zipped.
-        ticks: of its clock in a second; 0: it has none.
-        pending: seconds that it puts each request off.
-        deaf: it answers nothing.
-        refuse: status that it answers writes to an address with.
-        taken_by: address of another application that controls it.
-        mute_when_taken: it answers nothing instead of ACCESS_DENIED, as aravis' fake camera.
+        port: port of the camera.
+        mischief: faults of the packets.
+        extended: whether block ids have 64 bits.
+        first_id: id of the first block.
+        test_packets: size of the largest that come through; 0: no test packets.
+        packed: whether the description is zipped.
+        ticks: ticks of the clock in a second; 0: no clock.
+        pending: seconds by which each request is put off.
+        deaf: whether no request is answered.
+        refuse: status of the answer to writes, by address.
+        taken_by: address of another application that controls the camera.
+        mute_when_taken: whether there is no answer in place of ACCESS_DENIED, as from aravis' fake
+            camera.
         payload_type: payload type in leader and trailer.
         chunk_type: the same while the camera sends chunk data: 0x4001, 4 or 5.
-        latches: whether its clock can be read by a register.
-        plan: what becomes of the next triggers, one after the other: "" for a picture, "ignore",
-            "busy", "missed" by an event, "lose" for no packet, "cut" for a packet that never
-            comes, "double" for two pictures, "late SECONDS" for an exposure that begins late, and
-            not once it was stopped,
-            "slow SECONDS" for a picture that is sent long after its exposure, also to whoever has
-            it started anew, "early" for a picture right before it that nobody triggered.
-        tells_events: whether it has events.
-        lose_acks: acknowledgements of events that it does not get.
+        latches: whether the clock can be read by a register.
+        plan: outcomes of the next triggers, one after the other: "" for a picture, "ignore",
+            "busy", "missed" by an event, "lose" for no packet, "cut" for a packet that never comes,
+            "double" for two pictures, "late SECONDS" for an exposure that begins late, and not once
+            it was stopped, "slow SECONDS" for a picture that is sent long after its exposure, even
+            into the next stream, "early" for an untriggered picture right before.
+        tells_events: whether the camera has events.
+        lose_acks: number of acknowledgements of events that are lost.
         acked: ids of the events that were acknowledged.
         exposed: number of the picture by the number of the trigger that caused it.
-        sent: numbers of the frames that it began to send.
-        asked: the packets that it was asked for once more.
+        sent: numbers of the frames whose sending began.
+        asked: packets that were requested again.
     """
 
     mischief: Mischief = field(default_factory=Mischief)
@@ -453,13 +453,13 @@ class Camera:
         return 0
 
     def take_away(self, by: str) -> None:
-        """Have another application take control."""
+        """Give control to another application."""
         self.taken_by, self.owner = by, None
         self.words[0xA00] = 0
         self.words[0xA14] = int.from_bytes(socket.inet_aton(by), "big")
 
     def user_set(self, command: int) -> None:
-        """Load or save a user set; the command's register says when that is done."""
+        """Load or save a user set; the command's register shows when that is done."""
         self.words[command] = 0
         place = self.words[USER_SET]
         if command == USER_SAVE:
@@ -471,7 +471,7 @@ class Camera:
     # events
 
     def tell(self, name: str, block: int = 0, data: bytes = b"", ticks: int | None = None) -> None:
-        """Send an event, as often as it takes until it is acknowledged, if it is switched on."""
+        """Send an event until it is acknowledged, if the event is switched on."""
         place, number = EVENTS[name]
         if not self.words[NOTIFY + 4 * place] or not self.words[0xB00]:
             return
@@ -510,7 +510,7 @@ class Camera:
         return any(self.words[TRIGGERS + 16 * kind] for kind in (0, 1))
 
     def pull(self, source: int) -> int:
-        """Take a trigger, by software (0) or by a line (1); return the status of the answer."""
+        """Handle a trigger, by software (0) or by a line (1); return the status of the answer."""
         if not self.words[TRIGGERS] or self.words[TRIGGERS + 4] != source or not self.streaming:
             return 0 if source else 0x8006
         what = self.plan.pop(0) if self.plan else ""
@@ -580,7 +580,7 @@ class Camera:
                 return
 
     def expose(self, what: str = "", ticks: int | None = None) -> None:
-        """Take a picture, and send it."""
+        """Take and send a picture."""
         self.show(*self.counted(), what, ticks)
 
     def counted(self) -> tuple[int, int]:
@@ -621,7 +621,7 @@ class Camera:
         return rows.tobytes() + bytes(self.words[PAYLOAD_EXTRA])
 
     def chunks(self, number: int) -> bytes:
-        """Return what follows the pixels: the end of their chunk, and three more chunks."""
+        """Return the bytes after the pixels: the end of their chunk, and three more chunks."""
         pixels = self.words[HEIGHT] * self.words[WIDTH] * (self.words[FORMAT] >> 16 & 0xFF) // 8
         exposure = struct.pack(">II", self.words[EXPOSURE], self.words[EXPOSURE + 4])
         counter = struct.pack(">HHI", 0xFF00 | self.words[LINES], 0, 0)[:4] + struct.pack(
@@ -645,10 +645,10 @@ class Camera:
             ">HHQIIIIIHH", 0, self.payload_type, ticks, self.words[FORMAT], self.words[WIDTH],
             self.words[HEIGHT], 0, 0, 0, 0,
         )  # fmt: skip
-        said = {4: (len(data),), 5: (len(data), self.words[HEIGHT], 7)}.get(
+        sizes = {4: (len(data),), 5: (len(data), self.words[HEIGHT], 7)}.get(
             self.payload_type, (self.words[HEIGHT],)
         )
-        trailer = struct.pack(f">HH{len(said)}I", 0, self.payload_type, *said)
+        trailer = struct.pack(f">HH{len(sizes)}I", 0, self.payload_type, *sizes)
         if self.payload_type == 4:  # chunk data of the first version: no size
             leader = leader[:12]
         payload = [header(3, 1 + at) + part for at, part in enumerate(parts)]
@@ -696,7 +696,7 @@ def _texts(*parts: tuple[bytes, int]) -> bytes:
 
 
 def number_in(frame: Any) -> int:
-    """Return a frame's number; fail where it has rows of two, or a row is not at its place."""
+    """Return a frame's number; fail for rows of two frames, or for a row at a wrong place."""
     rows = np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.stride)
     numbers = rows[:, :4].copy().view(">u4")[:, 0]
     assert len(set(numbers.tolist())) == 1, f"rows of the frames {sorted(set(numbers.tolist()))}"
@@ -724,7 +724,7 @@ class _Messages(asyncio.DatagramProtocol):
 
 @asynccontextmanager
 async def camera(**options: Any) -> AsyncIterator[Camera]:
-    """Have a camera on 127.0.0.1; the options are those of :class:`Camera`."""
+    """Run a camera on 127.0.0.1; the options are those of :class:`Camera`."""
     inside = Camera(**options)
     loop = asyncio.get_running_loop()
     transport, _ = await loop.create_datagram_endpoint(

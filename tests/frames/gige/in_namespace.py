@@ -1,4 +1,4 @@
-"""Reads frames of aravis' fake camera; run in a network namespace of its own, by test_aravis.py.
+"""Read frames of aravis' fake camera; test_aravis.py runs this in its own network namespace.
 
 ``python -m tests.frames.gige.in_namespace FRAMES QUERY [CAMERA'S ARGUMENTS]`` prints JSON.
 """
@@ -21,7 +21,7 @@ PROGRAM = "arv-fake-gv-camera-0.8"
 
 
 def wrong_in(frame: smartcam.frames.Frame) -> str:
-    """Return what is wrong in a picture of the fake camera: a ramp that moves with its id."""
+    """Return the fault of a picture of the fake camera: a ramp that moves with its id."""
     number = (frame.sequence - 1) % 65535 + 1
     ramp = np.arange(frame.width)[None, :] + np.arange(frame.height)[:, None]
     wrong = frame.array() != (ramp + number) % 255
@@ -29,7 +29,7 @@ def wrong_in(frame: smartcam.frames.Frame) -> str:
 
 
 async def discovered() -> list[str]:
-    """Return the cameras once the fake one is up."""
+    """Wait for the fake camera, and return the cameras."""
     for _ in range(20):
         if found := await smartcam.frames.discover("gige"):
             return [f"{one.url} {one.name}" for one in found]

@@ -1,4 +1,4 @@
-"""Packets of a stream, written by hand from the standard."""
+"""Make packets of a stream by hand, from the standard."""
 
 import struct
 
@@ -18,8 +18,8 @@ def leader(
     pixels: int = 0x01080001,
     extended: bool = False,
 ) -> bytes:
-    said = struct.pack(">HHQIIIIIHH", 0, kind, ticks, pixels, *size, 0, 0, 0, 0)
-    return header(1, block, 0, extended=extended) + said
+    body = struct.pack(">HHQIIIIIHH", 0, kind, ticks, pixels, *size, 0, 0, 0, 0)
+    return header(1, block, 0, extended=extended) + body
 
 
 def payload(block: int, packet: int, data: bytes, *, extended: bool = False) -> bytes:
@@ -31,11 +31,11 @@ def trailer(block: int, packet: int, rows: int = 16, *, extended: bool = False) 
 
 
 FULL = 60
-"""Bytes of pixels in a full packet: a frame of 16x16 has four of them, and one of 16."""
+"""Bytes of pixels in a full packet: a frame of 16x16 has four full packets, and one of 16 bytes."""
 
 
 def frame(block: int, number: int, *, extended: bool = False) -> list[bytes]:
-    """Return the packets of a frame of 16x16 pixels, all of which are the number."""
+    """Return the packets of a frame of 16x16 pixels, whose values are all the number."""
     data = bytes([number % 256]) * 256
     parts = [data[at : at + FULL] for at in range(0, 256, FULL)]
     return [

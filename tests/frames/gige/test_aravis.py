@@ -1,4 +1,4 @@
-"""The driver against a camera of other people's: aravis' fake one, in a network namespace."""
+"""Test the driver with another project's camera: aravis' fake one, in a network namespace."""
 
 import json
 import os
@@ -15,12 +15,12 @@ from tests.processes import network_namespace
 pytestmark = pytest.mark.long
 
 FRAMES = 3000
-"""The fake camera's ids begin at 65400 or so: they go round, which is at 65535."""
+"""The fake camera's ids begin near 65400, and restart after 65535."""
 
 
 @pytest.fixture(scope="module")
 def namespace() -> list[str]:
-    """Return the command that runs another one in a namespace of its own."""
+    """Return the command that runs another command in its own namespace."""
     return network_namespace(PROGRAM, "aravis-tools")
 
 
@@ -35,33 +35,33 @@ def read(namespace: list[str], frames: int, query: str, *arguments: str) -> dict
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode()
-    said: dict[str, Any] = json.loads(done.stdout)
-    return said
+    output: dict[str, Any] = json.loads(done.stdout)
+    return output
 
 
 def test_thousands_of_frames_are_whole(namespace: list[str]) -> None:
-    said = read(namespace, FRAMES, "format=Mono8&size=320x64&fps=500&packet_size=1400")
-    assert said["found"] == ["gige://127.0.0.1 Aravis Fake (FAKE01)"]
-    assert said["format"] == "Mono8 320x64 at 500/s"
-    assert "Fake FAKE01 is controlled by another application" in said["second"]
-    assert said["wrong"] == []
-    assert said["offered"] + said["lost"] >= FRAMES
-    assert said["delivered"] > FRAMES // 20
+    output = read(namespace, FRAMES, "format=Mono8&size=320x64&fps=500&packet_size=1400")
+    assert output["found"] == ["gige://127.0.0.1 Aravis Fake (FAKE01)"]
+    assert output["format"] == "Mono8 320x64 at 500/s"
+    assert "Fake FAKE01 is controlled by another application" in output["second"]
+    assert output["wrong"] == []
+    assert output["offered"] + output["lost"] >= FRAMES
+    assert output["delivered"] > FRAMES // 20
 
 
 def test_with_packets_lost_frames_are_whole_or_counted(namespace: list[str]) -> None:
-    """The fake camera drops packets, and sends none again."""
-    said = read(namespace, 600, "format=Mono8&size=320x64&fps=200&packet_size=1400", "-r", "10")
-    assert said["wrong"] == []
-    assert said["lost"] > 20
-    assert said["delivered"] > 100
-    assert said["offered"] + said["lost"] == pytest.approx(said["span"], abs=5)
+    """The fake camera drops packets, and resends none."""
+    output = read(namespace, 600, "format=Mono8&size=320x64&fps=200&packet_size=1400", "-r", "10")
+    assert output["wrong"] == []
+    assert output["lost"] > 20
+    assert output["delivered"] > 100
+    assert output["offered"] + output["lost"] == pytest.approx(output["span"], abs=5)
 
 
-def test_triggers_have_each_their_own_picture(namespace: list[str]) -> None:
-    """The fake camera takes a software trigger 25 times a second, and counts its pictures on."""
-    said = read(namespace, 0, "format=Mono8&size=320x64&packet_size=1400&trigger=Software")
-    assert said["wrong"] == []
-    first, *others = said["sequences"]
+def test_each_trigger_has_its_own_picture(namespace: list[str]) -> None:
+    """The fake camera accepts 25 software triggers a second, and numbers its pictures on."""
+    output = read(namespace, 0, "format=Mono8&size=320x64&packet_size=1400&trigger=Software")
+    assert output["wrong"] == []
+    first, *others = output["sequences"]
     assert others == list(range(first + 1, first + 20))
-    assert said["started"] == 1
+    assert output["started"] == 1

@@ -1,4 +1,4 @@
-"""Packets in any order, with any of them missing: whole frames or losses."""
+"""Packets in any order, some missing, give whole frames or losses."""
 
 import random
 
@@ -16,7 +16,7 @@ START = 100.0
 
 
 class Stream:
-    """An assembler with a clock: 1 ms a packet."""
+    """An assembler whose clock advances by 1 ms a packet."""
 
     def __init__(self, *, extended: bool = False, resend: bool = True) -> None:
         self.inside = Assembler(256, FULL + (20 if extended else 8), resend=resend)
@@ -42,7 +42,7 @@ class Stream:
         assert len(self.inside._blocks) <= MAX_OPEN_BLOCKS
 
     def wait(self, seconds: float) -> None:
-        """Let time pass, as a timer does it."""
+        """Advance the time, as a timer does."""
         end = self.now + seconds
         for _ in range(1000):
             deadline = self.inside.next_deadline()
@@ -109,8 +109,8 @@ def test_each_frame_is_whole_or_lost(
         begun = seen_id(kept[0][1], extended)
         spanned = stream.inside._newest - (0 if begun <= MAX_OPEN_BLOCKS else begun - 1)
         assert len(stream.pictures) + stream.lost == spanned
-    told = sum(one.lost for one in stream.pictures) + stream.inside.take_lost()
-    assert told == stream.lost
+    reported = sum(one.lost for one in stream.pictures) + stream.inside.take_lost()
+    assert reported == stream.lost
     if not drop and reorder <= 3:
         assert len(stream.pictures) >= 24 - (MAX_OPEN_BLOCKS if start > MAX_OPEN_BLOCKS else 0)
 
@@ -126,7 +126,7 @@ def test_the_packets_of_one_frame_in_any_order(order: list[int], extended: bool)
 
 
 @given(st.sets(st.integers(0, 6), min_size=1, max_size=6))
-def test_exactly_what_is_missing_is_asked_for(missing: set[int]) -> None:
+def test_exactly_the_missing_packets_are_requested(missing: set[int]) -> None:
     stream = Stream()
     packets = frame(1, 1)
     stream.feed(*(one for at, one in enumerate(packets) if at not in missing), *frame(2, 2))
@@ -147,7 +147,7 @@ def test_random_bytes_make_no_picture_of_two_and_raise_nothing(
     dice = random.Random(seed)  # noqa: S311 - it is to come again
     stream = Stream()
     packets = [one for number in range(1, 6) for one in frame(number, number)]
-    mixed = [one for one in noise if one[4:5] not in (b"\x03", b"\x83")]  # pixels are believed
+    mixed = [one for one in noise if one[4:5] not in (b"\x03", b"\x83")]  # the pixels count
     for one in mixed:
         packets.insert(dice.randrange(len(packets)), one)
     stream.feed(*packets)
@@ -165,7 +165,7 @@ def test_random_packets_raise_nothing(noise: list[bytes]) -> None:
         assert len(inside._blocks) <= MAX_OPEN_BLOCKS
 
 
-def test_nothing_answers_and_the_frame_is_lost_after_its_tries() -> None:
+def test_frame_without_resent_packets_is_lost_after_all_tries() -> None:
     stream = Stream()
     first, second = frame(1, 1), frame(2, 2)
     stream.feed(*first[:3], *first[4:], *second)
@@ -175,7 +175,7 @@ def test_nothing_answers_and_the_frame_is_lost_after_its_tries() -> None:
     assert stream.pictures[0].lost == 1
 
 
-def test_a_packet_that_the_camera_has_no_longer_loses_its_frame_at_once() -> None:
+def test_packet_gone_from_the_camera_loses_its_frame_at_once() -> None:
     stream = Stream()
     first = frame(1, 1)
     stream.feed(*first[:3], *first[4:], *frame(2, 2), header(3, 1, 3, 0x800C))
@@ -183,7 +183,7 @@ def test_a_packet_that_the_camera_has_no_longer_loses_its_frame_at_once() -> Non
     assert stream.inside.counts.refused == 1
 
 
-def test_a_packet_not_sent_yet_is_asked_for_again() -> None:
+def test_packet_not_sent_yet_is_requested_again() -> None:
     stream = Stream()
     first = frame(1, 1)
     stream.feed(*first[:3], *first[4:], *frame(2, 2))
@@ -194,7 +194,7 @@ def test_a_packet_not_sent_yet_is_asked_for_again() -> None:
     assert stream.numbers == [1, 2]
 
 
-def test_the_rest_of_the_last_frame_is_asked_for_after_a_silence() -> None:
+def test_rest_of_the_last_frame_is_requested_after_a_silence() -> None:
     stream = Stream()
     packets = frame(1, 1)
     stream.feed(*packets[:4])
@@ -204,7 +204,7 @@ def test_the_rest_of_the_last_frame_is_asked_for_after_a_silence() -> None:
     assert stream.numbers == [1]
 
 
-def test_more_than_is_worth_asking_for_is_lost() -> None:
+def test_frame_with_too_many_missing_packets_is_lost() -> None:
     inside = Assembler(FULL * 1000, FULL + 8)
     one = leader(1, 1, (60, 1000))
     inside.feed(memoryview(one), len(one), 0.0, 0.0)
@@ -214,7 +214,7 @@ def test_more_than_is_worth_asking_for_is_lost() -> None:
     assert inside.counts.lost == 1
 
 
-def test_a_leader_may_come_long_before_its_pixels() -> None:
+def test_leader_may_come_long_before_its_pixels() -> None:
     stream = Stream()
     packets = frame(1, 1)
     stream.feed(packets[0])
@@ -225,7 +225,7 @@ def test_a_leader_may_come_long_before_its_pixels() -> None:
 
 
 @pytest.mark.parametrize("clock", [True, False])
-def test_ids_begin_anew(clock: bool) -> None:
+def test_block_ids_may_restart(clock: bool) -> None:
     stream = Stream()
     tick = 1 if clock else 0
 
@@ -245,17 +245,17 @@ def test_ids_begin_anew(clock: bool) -> None:
     assert stream.lost == 0
 
 
-def test_ids_that_begin_anew_in_the_middle_of_a_frame_mix_nothing() -> None:
+def test_restarted_block_ids_mix_no_frames() -> None:
     stream = Stream()
     stream.feed(*frame(1, 1), *frame(2, 2)[:4])
     stream.feed(*frame(2, 12))  # the same id, another picture
     stream.feed(*frame(3, 13))
     stream.wait(1)
     assert stream.numbers == [1, 12, 13]
-    assert stream.lost == 2  # the old 2, and the new 1 of which nothing came
+    assert stream.lost == 2  # the old frame 2, and the new frame 1, of which no packet came
 
 
-def test_late_and_doubled_packets_of_done_frames_do_nothing() -> None:
+def test_late_and_doubled_packets_of_done_frames_are_ignored() -> None:
     stream = Stream()
     first = frame(1, 1)
     stream.feed(*first, *first, *frame(2, 2), *first[1:])
@@ -275,7 +275,7 @@ def test_a_gap_of_many_frames_is_counted() -> None:
     assert stream.lost == 499
 
 
-def test_the_oldest_is_given_up_where_too_many_are_open() -> None:
+def test_oldest_open_frame_is_given_up_at_the_limit() -> None:
     stream = Stream()
     for number in range(1, MAX_OPEN_BLOCKS + 3):
         packets = frame(number, number)
@@ -288,8 +288,8 @@ def test_the_oldest_is_given_up_where_too_many_are_open() -> None:
     "wrong",
     [
         payload(1, 2, bytes(FULL - 1)),  # short, and not the last one
-        payload(1, 9, bytes(FULL)),  # behind the frame's end
-        trailer(1, 2),  # before what came
+        payload(1, 9, bytes(FULL)),  # after the frame's end
+        trailer(1, 2),  # before the received packets
         payload(1, 4, bytes(FULL), extended=True),
         header(7, 1, 4),
     ],
@@ -327,7 +327,7 @@ def test_a_camera_that_sends_fewer_rows_gives_a_lower_picture() -> None:
         (leader(1, 1)[:12], "expected 12 bytes"),
     ],
 )
-def test_a_leader_that_cannot_be_read_is_said(first: bytes, text: str) -> None:
+def test_unreadable_leader_is_an_error(first: bytes, text: str) -> None:
     stream = Stream()
     stream.feed(first)
     assert isinstance(stream.inside.fault, MessageError)

@@ -1,4 +1,4 @@
-"""Chunk data: what the camera sends with each picture, on the frame."""
+"""Chunk data that a camera sends with each picture is on the frame."""
 
 import asyncio
 
@@ -10,7 +10,7 @@ from tests.frames.gige.camera import camera, number_in
 
 
 @pytest.mark.parametrize("chunk_type", [0x4001, 4, 5])
-async def test_values_that_come_with_a_picture_are_on_its_frame(chunk_type: int) -> None:
+async def test_chunk_values_of_a_picture_are_on_its_frame(chunk_type: int) -> None:
     async with (
         camera(chunk_type=chunk_type) as there,
         smartcam.frames.open(
@@ -50,13 +50,13 @@ async def test_without_chunks_there_are_no_values() -> None:
             await source.features["ChunkFrameID"].get()
 
 
-async def test_chunk_data_that_cannot_be_read_is_told_and_the_picture_stays() -> None:
+async def test_unreadable_chunk_data_is_reported_and_the_picture_stays() -> None:
     async with (
         camera(payload_type=0x4001) as there,
         smartcam.frames.open(f"gige://127.0.0.1:{there.port}?packet_size=576") as source,
     ):
         there.words[cameras.PAYLOAD_EXTRA] = 700
-        await source.features["BlackLevel"].set(1.0)  # its PayloadSize is read anew
+        await source.features["BlackLevel"].set(1.0)  # PayloadSize is read again
         frame = await source.newest()
         assert number_in(frame)
         assert frame.chunks == {}
@@ -64,7 +64,7 @@ async def test_chunk_data_that_cannot_be_read_is_told_and_the_picture_stays() ->
 
 
 @pytest.mark.parametrize("rows", [40, 47])
-async def test_chunk_data_of_another_size_than_the_features_say_is_no_picture(rows: int) -> None:
+async def test_chunk_data_of_another_size_than_in_the_features_is_no_picture(rows: int) -> None:
     async with (
         camera(chunk_type=4) as there,
         smartcam.frames.open(
@@ -74,7 +74,7 @@ async def test_chunk_data_of_another_size_than_the_features_say_is_no_picture(ro
     ):
         frame = await anext(reader)
         assert (frame.width, frame.height, frame.stride) == (64, 48, 64)
-        there.words[cameras.HEIGHT] = rows  # a lock that it does not keep
+        there.words[cameras.HEIGHT] = rows  # a lock that the camera does not keep
         with pytest.raises(
             smartcam.exceptions.FrameFormatError,
             match=rf"64x48 has 3072 bytes, the chunk that came has {64 * rows}",

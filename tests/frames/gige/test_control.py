@@ -28,7 +28,7 @@ def ack(status: int, command: int, request: int, payload: bytes = b"") -> bytes:
 
 
 class Peer(asyncio.DatagramProtocol):
-    """Answers as told."""
+    """A peer with given answers."""
 
     def __init__(self, answers: Answers) -> None:
         self._answers = answers
@@ -44,7 +44,7 @@ class Peer(asyncio.DatagramProtocol):
 
 
 async def asked(answers: Answers) -> tuple[int | FrameSourceError, Peer, ControlChannel]:
-    """Read a register of a peer that answers as told."""
+    """Read a register of a peer with given answers."""
     loop = asyncio.get_running_loop()
     transport, peer = await loop.create_datagram_endpoint(
         lambda: Peer(answers), local_addr=("127.0.0.1", 0)
@@ -106,21 +106,21 @@ async def test_silence_and_endless_pending_end() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
         ((0x8003, 0x81, b""), "INVALID_ADDRESS"),
         ((0, 0x85, WORD), "expected an answer 0x0081 of 4 bytes, got 0x0085 of 4"),
         ((0, 0x81, b""), "got 0x0081 of 0"),
     ],
 )
-async def test_a_wrong_answer_is_said(answer: tuple[int, int, bytes], said: str) -> None:
+async def test_wrong_answer_is_an_error(answer: tuple[int, int, bytes], message: str) -> None:
     error, _, _ = await asked(lambda request, _: [ack(answer[0], answer[1], request, answer[2])])
     assert isinstance(error, FrameSourceError)
-    assert said in str(error)
+    assert message in str(error)
     assert not isinstance(error, RequestRefusedError) or error.status == 0x8003
 
 
-async def test_where_nothing_listens_is_said_at_once() -> None:
+async def test_closed_port_is_reported_at_once() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -161,8 +161,8 @@ async def test_cameras_are_found() -> None:
 
 
 def info(address: str, serial: str) -> Found:
-    said = DeviceInfo("02:00:00:00:00:02", address, "Maker", "Tester", "1", serial, "left")
-    return Found(said, address, address != "10.0.0.9")
+    device = DeviceInfo("02:00:00:00:00:02", address, "Maker", "Tester", "1", serial, "left")
+    return Found(device, address, address != "10.0.0.9")
 
 
 async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,8 +173,11 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     monkeypatch.setattr(driver, "find", found)
     address = FrameAddress.parse("gige://?serial=B")
     assert await _places.place(address, _places.wanted(address)) == ("10.0.0.9", 3956)
-    for url, said in (("gige://", "expected one camera, found 2"), ("gige://?serial=C", "found 0")):
-        with pytest.raises(FrameSourceError, match=said) as caught:
+    for url, message in (
+        ("gige://", "expected one camera, found 2"),
+        ("gige://?serial=C", "found 0"),
+    ):
+        with pytest.raises(FrameSourceError, match=message) as caught:
             await GigEDriver(FrameAddress.parse(url)).open()
         assert caught.value.available[0] == 'gige://10.0.0.8 "left" Maker Tester (A)'
     first, second = await GigEDriver.discover()
@@ -206,25 +209,25 @@ async def test_a_camera_gets_an_address() -> None:
         assert not found.remark
 
 
-async def test_a_camera_that_is_not_there_is_said() -> None:
+async def test_missing_camera_is_reported() -> None:
     async with camera() as there:
         with pytest.raises(FrameSourceError, match="answers; there are 02:00:00:00:00:01 Maker"):
             await force_address("02:00:00:00:00:02", "127.0.5.6/8", places=HERE, port=there.port)
         assert not there.forced
 
 
-async def test_a_camera_that_somebody_controls_refuses() -> None:
+async def test_camera_under_other_control_refuses() -> None:
     async with camera() as there:
         there.owner = ("127.0.0.1", 1)
         with pytest.raises(FrameSourceError, match="ACCESS_DENIED"):
             await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
 
 
-async def test_a_camera_that_does_not_take_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_camera_that_ignores_its_address_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(force, "APPEAR_TIMEOUT", 0.1)
     async with camera() as there:
         there.answer_forceip_only = True
-        with pytest.raises(FrameTimeoutError, match="does not answer a search by it"):
+        with pytest.raises(FrameTimeoutError, match="does not answer at it within"):
             await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
 
 
@@ -243,7 +246,7 @@ async def test_a_camera_that_does_not_take_it_is_said(monkeypatch: pytest.Monkey
         (MAC, "127.0.5.6/8", {"gateway": "here"}, "gateway: expected"),
     ],
 )
-async def test_addresses_that_are_none_are_refused(
+async def test_invalid_addresses_are_refused(
     mac: Any, address: str, more: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=text):

@@ -1,4 +1,4 @@
-"""Descriptions of cameras: what is read of them, and what a hostile one cannot do."""
+"""Descriptions of cameras, valid and hostile ones."""
 
 import contextlib
 import io
@@ -46,7 +46,7 @@ def zipped(text: bytes, name: str = "a.xml") -> bytes:
         ("Local:///a.zip;1000;20?SchemaVersion=1.1.0", ("a.zip", 0x1000, 0x20)),
     ],
 )
-def test_a_url_tells_where_it_lies(url: str, place: tuple[str, int, int]) -> None:
+def test_url_gives_the_place_of_the_description(url: str, place: tuple[str, int, int]) -> None:
     assert locate(url) == place
 
 
@@ -60,12 +60,12 @@ def test_another_url_is_refused(url: str) -> None:
         locate(url)
 
 
-def test_it_is_unpacked() -> None:
+def test_description_is_unpacked() -> None:
     assert unpack(zipped(b"<a/>")) == b"<a/>"
     assert unpack(b"<a/>\0\0\0") == b"<a/>"
 
 
-def test_what_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_archive_of_too_many_bytes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_description, "MAX_PLAIN_BYTES", 10_000)
     with pytest.raises(MessageError, match="more than 10000"):
         unpack(zipped(bytes(10_001)))
@@ -81,7 +81,7 @@ def test_a_damaged_archive_is_refused_or_read(at: int, byte: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (b"", "no XML"),
         (b"<a>", "no XML"),
@@ -93,8 +93,8 @@ def test_a_damaged_archive_is_refused_or_read(at: int, byte: int) -> None:
         (described("<Group>" * 40 + "</Group>" * 40).encode(), "32 levels"),
     ],
 )  # fmt: skip
-def test_what_is_no_description_is_refused(text: bytes, said: str) -> None:
-    with pytest.raises(MessageError, match=said):
+def test_text_without_a_description_is_refused(text: bytes, message: str) -> None:
+    with pytest.raises(MessageError, match=message):
         parse(text)
 
 
@@ -162,7 +162,7 @@ async def test_bits_count_from_the_highest_in_big_endian_registers() -> None:
     assert await there.get("Little") == 1
     await there.set("Big", 9)
     assert memory.data[:4] == bytes([1, 2, 3, 9])
-    with pytest.raises(FrameSourceError, match="256 has no room in 8 bits"):
+    with pytest.raises(FrameSourceError, match="256 does not fit into 8 bits"):
         await there.set("Big", 256)
 
 
@@ -195,7 +195,7 @@ KNIFE = (
 
 
 @pytest.mark.parametrize(
-    ("inside", "said"),
+    ("inside", "message"),
     [
         (KNIFE.format("A", "A", "X"), "in a circle"),
         (KNIFE.format("A", "B", "X") + KNIFE.format("B", "A", "X"), "in a circle"),
@@ -216,14 +216,14 @@ KNIFE = (
         ('<Float Name="A"><pValue>Gone</pValue></Float>', "no node 'Gone'"),
     ],
 )  # fmt: skip
-async def test_a_description_that_leads_nowhere_is_said(inside: str, said: str) -> None:
+async def test_description_with_dangling_references_is_refused(inside: str, message: str) -> None:
     there, _ = features(described('<Integer Name="Five"><Value>5</Value></Integer>' + inside))
-    with pytest.raises(FrameSourceError, match=f"feature A: .*{said}"):
+    with pytest.raises(FrameSourceError, match=f"feature A: .*{message}"):
         await there.get("A")
 
 
 async def test_a_fan_of_variables_is_bounded() -> None:
-    """Each level asks the next one twice: without a bound 2 to the 40 reads."""
+    """Each level reads the next one twice: without a bound 2 to the 40 reads."""
     knives = "".join(
         f'<IntSwissKnife Name="N{at}"><pVariable Name="X">N{at + 1}</pVariable>'
         f'<pVariable Name="Y">N{at + 1}</pVariable><Formula>X + Y</Formula></IntSwissKnife>'
@@ -318,7 +318,7 @@ def test_a_damaged_stream_in_the_archive_is_refused() -> None:
         unpack(bytes(data))
 
 
-# what comes with messages
+# chunks and events
 
 
 def chunk(number: int, data: bytes) -> bytes:
@@ -326,7 +326,7 @@ def chunk(number: int, data: bytes) -> bytes:
 
 
 class NoMemory:
-    """A camera that is not to be asked."""
+    """A camera that must not be read."""
 
     async def read(self, address: int, length: int) -> bytes:
         raise AssertionError(f"{length} bytes at {address:#x} were read")
@@ -370,13 +370,13 @@ def test_any_bytes_are_chunks_or_an_error(data: bytes) -> None:
     assert sum(len(one) + 8 for one in found.values()) == len(data)
 
 
-def test_a_chunk_that_is_too_short_gives_no_value() -> None:
+def test_too_short_chunk_gives_no_value() -> None:
     values, problems = chunk_features().read({0xA0000001: memoryview(bytes(7)), 3: memoryview(b"")})
     assert values == {}
     assert "ChunkExposureTime: expected 8 bytes at 0x0, its message has 7" in problems
 
 
-def test_a_chunk_that_did_not_come_gives_no_value() -> None:
+def test_missing_chunk_gives_no_value() -> None:
     values, problems = chunk_features().read({3: memoryview(struct.pack(">I", 0x01080001))})
     assert values == {"ChunkPixelFormat": "Mono8"}
     assert not problems
@@ -437,7 +437,7 @@ def test_several_events_in_one_message() -> None:
         message(0xC0, *[item_of(1)] * 101),
     ],
 )
-def test_what_is_no_event_is_refused(data: bytes) -> None:
+def test_bytes_without_an_event_are_refused(data: bytes) -> None:
     with pytest.raises(MessageError):
         decode_events(data)
 

@@ -1,4 +1,4 @@
-"""Events of a camera: told through its message channel, acknowledged, each taken once."""
+"""Events of a camera's message channel are acknowledged, and each counts once."""
 
 import asyncio
 import socket
@@ -37,7 +37,7 @@ async def test_events_come_with_their_data(extended: bool) -> None:
         async with source.events("Plain", "FrameTriggerMissed", timeout=5) as events:
             assert there.words[cameras.NOTIFY + 8] == 1
             there.tell("Plain", 7, ticks=2_000_000)
-            there.tell("ExposureEnd")  # which nobody asked for
+            there.tell("ExposureEnd")  # which no reader wants
             there.tell("FrameTriggerMissed", 0, ticks=3_000_000)
             first, second = await anext(events), await anext(events)
         assert (first.name, first.number, first.block, first.device_time) == (
@@ -64,7 +64,7 @@ async def test_the_data_of_an_event_are_its_features() -> None:
         assert "its message has 16" in event.remark
 
 
-async def test_an_event_whose_acknowledgement_was_lost_is_taken_once() -> None:
+async def test_event_with_a_lost_acknowledgement_counts_once() -> None:
     async with opened(lose_acks=2) as (there, source):
         async with source.events("Plain", timeout=1) as events:
             there.tell("Plain", 1)
@@ -76,7 +76,7 @@ async def test_an_event_whose_acknowledgement_was_lost_is_taken_once() -> None:
         assert there.acked == [1, 2]
 
 
-async def test_a_slow_reader_loses_the_oldest_and_is_told() -> None:
+async def test_slow_reader_loses_the_oldest_and_gets_the_count() -> None:
     async with opened() as (there, source), source.events("Plain", size=3, timeout=5) as events:
         for block in range(1, 11):
             there.tell("Plain", block)
@@ -86,7 +86,7 @@ async def test_a_slow_reader_loses_the_oldest_and_is_told() -> None:
         assert [one.lost for one in seen] == [7, 0, 0]
 
 
-async def test_two_readers_share_one_event_and_the_last_switches_it_off() -> None:
+async def test_last_of_two_readers_switches_the_event_off() -> None:
     async with opened() as (there, source), source.events("Plain", timeout=5) as first:
         async with source.events("Plain", "ExposureEnd", timeout=5) as second:
             there.tell("Plain", 4)
@@ -95,7 +95,7 @@ async def test_two_readers_share_one_event_and_the_last_switches_it_off() -> Non
         assert there.words[cameras.NOTIFY] == 0
 
 
-async def test_an_event_that_the_camera_does_not_have_is_said() -> None:
+async def test_event_that_the_camera_lacks_is_an_error() -> None:
     async with opened() as (_, source):
         with pytest.raises(FrameSourceError, match="did you mean 'ExposureEnd'") as caught:
             await source.events("ExposurEnd").__aenter__()
@@ -114,13 +114,13 @@ async def test_odd_names_are_refused(names: Any) -> None:
             source.events(*names)
 
 
-async def test_other_sources_tell_none() -> None:
+async def test_other_sources_have_no_events() -> None:
     async with smartcam.frames.open("synthetic://") as source:
-        with pytest.raises(UnsupportedError, match="tells no events"):
+        with pytest.raises(UnsupportedError, match="reports no events"):
             await source.events("ExposureEnd").__aenter__()
 
 
-async def test_what_others_send_is_no_event() -> None:
+async def test_datagrams_of_other_senders_are_no_events() -> None:
     async with opened() as (there, source), source.events("Plain", timeout=0.5) as events:
         item = struct.pack(">HHHHQ", 0, 0x9004, 0, 1, 5)
         datagram = struct.pack(">BBHHH", 0x42, 1, 0xC0, len(item), 1) + item
@@ -131,12 +131,12 @@ async def test_what_others_send_is_no_event() -> None:
                 await anext(events)
 
 
-async def test_a_camera_that_is_gone_ends_its_events() -> None:
+async def test_lost_camera_ends_its_events() -> None:
     async with opened(heartbeat=0.6) as (there, source):
         events = source.events("Plain", timeout=30)
         async with events:
             there.deaf = True
-            with pytest.raises(FrameSourceError, match="has not answered"):
+            with pytest.raises(FrameSourceError, match="no answer for"):
                 await anext(events)
 
 

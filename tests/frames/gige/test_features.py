@@ -1,4 +1,4 @@
-"""Features of a camera at run time: read, set, described, executed, while it streams or not."""
+"""Features of a camera are read, set, described and executed, with and without a stream."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -92,7 +92,7 @@ async def test_a_feature_is_described_with_range_unit_entries_and_access() -> No
         ("Nothing", 1, "not available now"),
     ],
 )
-async def test_what_cannot_be_set_is_said(name: str, value: Any, text: str) -> None:
+async def test_features_that_cannot_be_set_are_errors(name: str, value: Any, text: str) -> None:
     async with opened() as (there, source):
         before = dict(there.words)
         with pytest.raises(FrameSourceError) as caught:
@@ -126,13 +126,13 @@ async def test_commands_are_executed_to_their_end() -> None:
             await source.features["BlackLevel"].execute()
 
 
-async def test_a_command_that_is_not_done_in_time_is_said() -> None:
+async def test_command_that_is_not_done_in_time_is_an_error() -> None:
     async with opened() as (_, source):
         with pytest.raises(FrameTimeoutError, match="UserSetSave to be done within"):
             await source.features["UserSetSave"].execute(timeout=0.05)
 
 
-async def test_features_are_set_while_it_streams() -> None:
+async def test_features_are_set_during_a_stream() -> None:
     async with opened() as (_, source), source.reader() as reader:
         for number in range(20):
             frame = await anext(reader)
@@ -141,7 +141,7 @@ async def test_features_are_set_while_it_streams() -> None:
         assert source.statistics().started == 1
 
 
-async def test_a_new_size_is_the_streams() -> None:
+async def test_new_size_is_the_size_of_the_next_stream() -> None:
     async with opened() as (_, source):
         assert (source.format.width, source.format.height) == (64, 48)
         await source.features["Width"].set(128)
@@ -157,7 +157,7 @@ async def test_a_new_size_is_the_streams() -> None:
         assert source.format.width == 32
 
 
-async def test_many_at_once_are_not_mixed() -> None:
+async def test_concurrent_requests_are_not_mixed() -> None:
     async with opened() as (_, source):
         await source.features["BlackLevel"].set(2.5)
         names = ["Width", "Height", "BlackLevel", "PixelFormat", "ExposureTime"] * 8
@@ -165,7 +165,7 @@ async def test_many_at_once_are_not_mixed() -> None:
         assert values == [64, 48, 2.5, "Mono8", 1000.0] * 8
 
 
-async def test_a_camera_that_was_lost_is_opened_anew_for_a_feature() -> None:
+async def test_lost_camera_is_reopened_for_a_feature() -> None:
     async with opened(heartbeat=0.6) as (there, source):
         there.deaf = True
         with pytest.raises(FrameSourceError):
@@ -175,7 +175,7 @@ async def test_a_camera_that_was_lost_is_opened_anew_for_a_feature() -> None:
         assert await source.features["Width"].get() == 64
 
 
-async def test_a_source_that_is_closed_has_none() -> None:
+async def test_closed_source_has_no_features() -> None:
     async with opened() as (there, source):
         exposure = source.features["ExposureTime"]
         assert await exposure.get()
@@ -184,7 +184,7 @@ async def test_a_source_that_is_closed_has_none() -> None:
     assert there.words[0xA00] == 0
 
 
-async def test_a_feature_that_is_asked_for_while_it_closes_does_not_keep_the_camera() -> None:
+async def test_request_during_the_closing_does_not_keep_the_camera() -> None:
     async with camera(pending=0.05) as there:
         source = smartcam.frames.open(f"gige://127.0.0.1:{there.port}")
         async with source:
@@ -195,13 +195,13 @@ async def test_a_feature_that_is_asked_for_while_it_closes_does_not_keep_the_cam
         assert there.words[0xA00] == 0
 
 
-async def test_other_sources_say_that_they_have_none() -> None:
+async def test_other_sources_report_that_they_have_no_features() -> None:
     async with smartcam.frames.open("synthetic://") as source:
         with pytest.raises(UnsupportedError, match="has no features"):
             await source.features["ExposureTime"].get()
 
 
-async def test_cancelled_at_each_await_the_next_call_works() -> None:
+async def test_next_call_works_after_a_cancellation_at_each_await() -> None:
     async with opened() as (_, source):
         steps = 0
         while True:

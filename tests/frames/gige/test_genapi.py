@@ -1,4 +1,4 @@
-"""Our features beside EMVA's own GenApi: the same value, or an error, never another value."""
+"""Compare features with EMVA's own GenApi: the same value or an error, never another value."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.long
 
 SIZE = 0x2000
 MEMORY = bytes((7 * place + place // 256) % 256 for place in range(SIZE - 8)) + b"Serial\0\0"
-"""Every register has something in it."""
+"""Every register has a value."""
 
 
 class Port(genapi.AbstractPort):  # type: ignore[misc, name-defined]
@@ -45,7 +45,7 @@ class Port(genapi.AbstractPort):  # type: ignore[misc, name-defined]
 
 
 class Memory:
-    """The device's memory, for our features."""
+    """The device's memory, for smartcam's features."""
 
     def __init__(self) -> None:
         self.data = bytearray(MEMORY)
@@ -69,7 +69,7 @@ def both(inside: str) -> tuple[Any, Port, GenicamFeatures, Memory]:
 
 
 def value_of(node: Any) -> Any:
-    """Return GenApi's value in our words."""
+    """Return GenApi's value in smartcam's form."""
     value = node.value
     return value.rstrip("\0") if isinstance(value, str) else value
 
@@ -242,7 +242,7 @@ CASES = {
 }
 
 OURS_ONLY_ERRORS: set[str] = set()
-"""Cases in which GenApi has a value and we have an error, which is allowed but written down."""
+"""Cases with a value in GenApi and an error here: allowed, but listed."""
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -287,7 +287,7 @@ SETTINGS: dict[str, tuple[str, list[Any]]] = {
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-async def test_what_is_set_is_what_genapi_sets(name: str) -> None:
+async def test_set_bytes_are_those_of_genapi(name: str) -> None:
     inside, values = SETTINGS[name]
     for value in values:
         theirs, port, ours, memory = both(inside)
@@ -314,7 +314,7 @@ SMALL = st.integers(0, 40)
 
 @st.composite
 def formulas(draw: st.DrawFn, depth: int = 3) -> str:
-    """Draw a formula of whole numbers."""
+    """Generate a formula of whole numbers."""
     kind = draw(st.integers(0, 5)) if depth else 0
     if kind == 0:
         return draw(st.sampled_from(["A", "B"]) | SMALL.map(str) | SMALL.map(hex))

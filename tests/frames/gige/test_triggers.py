@@ -52,7 +52,7 @@ async def test_each_trigger_returns_the_picture_that_it_caused() -> None:
     assert "by the camera's clock exposed" in frame.trigger.evidence[1]
 
 
-async def test_without_a_clock_the_evidence_says_on_what_it_rests() -> None:
+async def test_evidence_without_a_clock_names_its_basis() -> None:
     async with triggered(latches=False, tells_events=False) as (there, source):
         frame = await source.trigger()
         assert number_in(frame) == there.exposed[1]
@@ -61,7 +61,7 @@ async def test_without_a_clock_the_evidence_says_on_what_it_rests() -> None:
         assert evidence.startswith("only this program may trigger it by software")
 
 
-async def test_readers_get_the_frame_too() -> None:
+async def test_readers_also_get_the_frame() -> None:
     async with triggered() as (_, source), source.reader() as reader:
         frame = await source.trigger()
         assert await anext(reader) is frame
@@ -69,7 +69,7 @@ async def test_readers_get_the_frame_too() -> None:
 
 @pytest.mark.parametrize("latches", [True, False])
 @pytest.mark.parametrize("late", ["late 0.4", "slow 0.25", "slow 0.4"])
-async def test_a_late_picture_of_a_timed_out_trigger_is_not_the_next_ones(
+async def test_late_picture_of_a_timed_out_trigger_is_not_used_for_the_next(
     late: str, latches: bool
 ) -> None:
     async with triggered("trigger=software&fps=2", latches=latches) as (there, source):
@@ -77,14 +77,14 @@ async def test_a_late_picture_of_a_timed_out_trigger_is_not_the_next_ones(
         there.plan = [late]
         with pytest.raises(TriggerTimeoutError, match="no picture of the trigger within"):
             await source.trigger(timeout=0.2)
-        there.plan = ["late 0.3"]  # the old one may come while this one is waited for
+        there.plan = ["late 0.3"]  # the old picture may come during this wait
         frame = await source.trigger()
         assert number_in(frame) == there.exposed[3]
         await asyncio.sleep(0.5)
         assert number_in(await source.trigger()) == there.exposed[4]
 
 
-async def test_a_late_picture_in_the_next_stream_is_told_by_the_cameras_clock() -> None:
+async def test_camera_clock_identifies_a_late_picture_in_the_next_stream() -> None:
     async with triggered() as (there, source):
         there.plan = ["", "slow 0.5", "late 0.6"]
         await source.trigger()
@@ -102,7 +102,7 @@ async def test_a_picture_exposed_before_the_trigger_is_never_returned() -> None:
         assert number_in(frame) == there.exposed[1] == 2
 
 
-async def test_a_missed_trigger_says_that_an_older_picture_came() -> None:
+async def test_missed_trigger_reports_that_an_older_picture_came() -> None:
     async with triggered() as (there, source):
         await source.trigger()
         there.plan = ["ignore"]
@@ -124,7 +124,7 @@ async def test_an_incomplete_picture_is_lost_and_not_replaced(resend: str) -> No
         assert number_in(await source.trigger()) == there.exposed[3]
 
 
-async def test_a_picture_behind_a_lost_one_is_not_the_triggers() -> None:
+async def test_picture_after_a_lost_one_is_not_used() -> None:
     async with triggered("trigger=line1") as (there, source):
 
         async def pulse() -> None:
@@ -152,7 +152,7 @@ async def test_a_lost_picture_times_out_and_the_next_trigger_works() -> None:
         assert number_in(await source.trigger()) == there.exposed[3]
 
 
-async def test_a_trigger_that_the_camera_missed_is_said() -> None:
+async def test_trigger_that_the_camera_missed_is_reported() -> None:
     async with triggered() as (there, source):
         await source.trigger()
         there.plan = ["missed"]
@@ -161,7 +161,7 @@ async def test_a_trigger_that_the_camera_missed_is_said() -> None:
         assert number_in(await source.trigger()) == there.exposed[3]
 
 
-async def test_a_timeout_tells_which_block_was_exposed() -> None:
+async def test_timeout_reports_the_exposed_block() -> None:
     async with triggered() as (there, source):
         there.plan = ["", "lose"]
         await source.trigger()
@@ -178,7 +178,7 @@ async def test_events_with_other_ids_than_the_pictures_prove_nothing() -> None:
             assert "by the camera's clock" in frame.trigger.evidence[0]
 
 
-async def test_a_picture_of_another_block_than_the_event_names_is_not_the_triggers() -> None:
+async def test_picture_of_another_block_than_the_events_is_not_used() -> None:
     async with triggered() as (there, source):
         assert number_in(await source.trigger()) == there.exposed[1]
         there.event_ids_off = 1
@@ -205,14 +205,14 @@ async def test_one_trigger_at_a_time_waits_or_is_busy() -> None:
         assert source.statistics().started == 1
 
 
-async def test_a_second_picture_of_one_trigger_is_not_the_next_ones() -> None:
+async def test_second_picture_of_one_trigger_is_not_used_for_the_next() -> None:
     async with triggered() as (there, source):
         there.plan = ["double"]
         assert number_in(await source.trigger()) == 1
         assert number_in(await source.trigger()) == there.exposed[2] == 3
 
 
-async def test_a_line_is_triggered_by_whoever_can_set_it() -> None:
+async def test_function_that_sets_a_line_triggers_it() -> None:
     async with triggered("trigger=Line1") as (there, source):
 
         async def pulse() -> None:
@@ -248,24 +248,24 @@ async def test_a_camera_that_streams_by_itself_takes_no_trigger() -> None:
 async def test_a_trigger_that_needs_another_one_is_refused() -> None:
     async with triggered() as (there, source):
         there.words[cameras.TRIGGERS + 16] = 1
-        await source.features["BlackLevel"].set(1.0)  # it is read anew
+        await source.features["BlackLevel"].set(1.0)  # the exposure is read again
         with pytest.raises(UnsupportedError, match="On for AcquisitionStart"):
             await source.trigger()
 
 
-async def test_a_source_without_a_trigger_says_so() -> None:
+async def test_source_without_a_trigger_reports_it() -> None:
     async with smartcam.frames.open("synthetic://") as source:
         with pytest.raises(UnsupportedError, match="has no trigger"):
             await source.trigger()
 
 
-async def test_a_wait_for_frames_says_that_a_trigger_is_waited_for() -> None:
+async def test_timeout_of_a_reader_reports_the_awaited_trigger() -> None:
     async with triggered() as (_, source):
         with pytest.raises(FrameTimeoutError, match="TriggerMode is On for FrameStart, Trigger"):
             await source.newest(timeout=0.2)
 
 
-async def test_a_camera_that_waits_for_triggers_is_not_stuck() -> None:
+async def test_camera_without_triggers_is_not_reported_as_stuck() -> None:
     async with (
         camera() as there,
         smartcam.frames.open(
@@ -279,22 +279,22 @@ async def test_a_camera_that_waits_for_triggers_is_not_stuck() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0, -1, float("nan"), "1", None])
-async def test_a_time_that_is_none_is_refused(seconds: Any) -> None:
+async def test_invalid_timeout_is_refused(seconds: Any) -> None:
     async with smartcam.frames.open("synthetic://") as source:
         with pytest.raises(ConfigurationError):
             await source.trigger(timeout=seconds)
 
 
-async def test_a_camera_that_is_gone_ends_the_trigger_with_its_error() -> None:
+async def test_lost_camera_ends_the_trigger_with_its_error() -> None:
     async with triggered(heartbeat=0.6) as (there, source):
         await source.trigger()
         there.plan = ["ignore"]
         asyncio.get_running_loop().call_later(0.05, setattr, there, "deaf", True)
-        with pytest.raises(FrameSourceError, match="has not answered"):
+        with pytest.raises(FrameSourceError, match="no answer for"):
             await source.trigger(timeout=20)
 
 
-async def test_cancelled_at_each_await_the_next_trigger_has_its_own_picture() -> None:
+async def test_trigger_after_a_cancellation_has_its_own_picture() -> None:
     async with triggered() as (there, source):
         steps = 0
         while True:
@@ -312,7 +312,7 @@ async def test_cancelled_at_each_await_the_next_trigger_has_its_own_picture() ->
 
 
 @pytest.mark.parametrize("seed", range(3))
-async def test_on_a_bad_network_no_trigger_gets_anothers_picture(seed: int) -> None:
+async def test_bad_network_gives_no_trigger_the_picture_of_another(seed: int) -> None:
     mischief = Mischief(seed=seed, drop=0.05, double=0.1, reorder=3)
     outcomes = {"picture": 0, "lost": 0}
     async with triggered(mischief=mischief) as (there, source):
@@ -341,7 +341,7 @@ AUTOMATIC = cameras.DESCRIPTION.replace(
 
 
 @pytest.mark.real_time
-async def test_exposure_that_is_set_while_it_streams_counts_for_the_frames_from_then_on() -> None:
+async def test_exposure_set_during_a_stream_is_on_the_next_frames() -> None:
     async with (
         camera() as there,
         smartcam.frames.open(f"gige://127.0.0.1:{there.port}?packet_size=576") as source,
@@ -353,13 +353,13 @@ async def test_exposure_that_is_set_while_it_streams_counts_for_the_frames_from_
         assert frame.duration == pytest.approx(1.0 + 0.01)
         await source.features["ExposureTime"].set(1000.0)
         frame = await reader.after(time.monotonic() - 0.9, timeout=30)
-        assert frame.duration == pytest.approx(1.0 + 0.01)  # it may have begun before
+        assert frame.duration == pytest.approx(1.0 + 0.01)  # the exposure may have begun before
         async with asyncio.timeout(30):
             while (await anext(reader)).duration > 0.02:
                 pass
 
 
-async def test_exposure_that_the_camera_chooses_is_the_frames_own_or_the_longest() -> None:
+async def test_automatic_exposure_is_the_frames_own_or_the_longest() -> None:
     async with (
         camera(description=AUTOMATIC.encode()) as there,
         smartcam.frames.open(f"gige://127.0.0.1:{there.port}?packet_size=576") as source,

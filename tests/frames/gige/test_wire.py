@@ -1,4 +1,4 @@
-"""Packets of control and stream, byte by byte, and anything that is none."""
+"""Packets of control and stream, byte by byte, and invalid bytes."""
 
 import contextlib
 

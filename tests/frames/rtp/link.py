@@ -22,7 +22,7 @@ TUN = (0x400454CA, 0x1001)  # TUNSETIFF; IFF_TUN and IFF_NO_PI
 
 
 class Link:
-    """Two namespaces, and what carries packets between them.
+    """Two namespaces, and the process that carries packets between them.
 
     Attributes:
         loss: share of the packets that do not arrive, either way.
@@ -37,7 +37,7 @@ class Link:
         self._thread.start()
 
     def within(self, number: int) -> tuple[str, ...]:
-        """Return what a command begins with that runs at one of the two ends."""
+        """Return the begin of a command that runs at one of the two ends."""
         return ("ip", "netns", "exec", self.spaces[number])
 
     def close(self) -> None:
@@ -67,7 +67,7 @@ def run(*arguments: str) -> None:
 
 @contextlib.contextmanager
 def thin_link(rate: str) -> Iterator[Link]:
-    """Give a link whose ends send at a rate, such as ``20mbit``; skip where none can be made."""
+    """Give a link with a rate, such as ``20mbit``; skip the test if links are impossible."""
     fcntl = pytest.importorskip("fcntl", reason="there are no namespaces here")
     for tool in ("ip", "tc"):
         if shutil.which(tool) is None:

@@ -1,4 +1,4 @@
-"""H.264 in packets: by hand from RFC 6184, and any frames over any bad way."""
+"""H.264 in packets: by hand from RFC 6184, and any frames over any bad link."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def took(depacketizer: Depacketizer, *packets: RtpPacket) -> list[AccessUnit]:
 
 
 def begun() -> Depacketizer:
-    """Return one that has had a whole frame: the next sequence number is 1."""
+    """Return a depacketizer after a whole frame: the next sequence number is 1."""
     made = Depacketizer(window=8)
     first = made.take(packet(KEY, 0, 77, last=True))
     assert [one.begins for one in first] == [True]
@@ -56,7 +56,7 @@ def begun() -> Depacketizer:
 # units
 
 
-def test_units_are_what_stands_between_start_codes() -> None:
+def test_units_are_the_bytes_between_start_codes() -> None:
     data = b"\0\0\0\0\1" + SPS + b"\0\0\1" + PPS + b"\0\0\0\1" + SLICE + b"\0\0"
     assert units(data) == [SPS, PPS, SLICE]
     assert parameter_sets(data) == (SPS, PPS)
@@ -66,7 +66,7 @@ def test_units_are_what_stands_between_start_codes() -> None:
 @pytest.mark.parametrize(
     "data", [b"", SLICE, b"\1\0\0\1" + SLICE, b"\0\0\1", b"\0\0\1\x80", b"\0\0\1\x7c\1"]
 )
-def test_what_has_no_units_is_told(data: bytes) -> None:
+def test_bytes_without_units_are_refused(data: bytes) -> None:
     with pytest.raises(FrameFormatError, match="annex B"):
         units(data)
 
@@ -100,7 +100,7 @@ def test_a_large_unit_is_cut_into_parts() -> None:
     assert [one.payload[:2].hex() for one in made] == ["7c85", "7c45"]
 
 
-def test_what_is_no_frame_uses_no_number() -> None:
+def test_packet_without_a_frame_uses_no_number() -> None:
     packetizer = H264Packetizer(sequence=5)
     with pytest.raises(FrameFormatError):
         packetizer.packets(b"nothing", 0)
@@ -129,14 +129,14 @@ def test_packets_of_every_kind_become_a_frame() -> None:
 @pytest.mark.parametrize(
     "payloads",
     [
-        ["7c 05 aa"],  # a part without a beginning
-        ["7c 85 aa"],  # one without an end
-        ["7c 85 aa", "7c 41 bb"],  # of another kind
+        ["7c 05 aa"],  # a fragment without a beginning
+        ["7c 85 aa"],  # a fragment without an end
+        ["7c 85 aa", "7c 41 bb"],  # a fragment of another kind
         ["7c 85 aa", "7c 85 bb"],  # begun twice
-        ["7c 85 aa", "419a20"],  # left for another
-        ["7c c5 aa"],  # begun and ended in one
+        ["7c 85 aa", "419a20"],  # interrupted by another unit
+        ["7c c5 aa"],  # begin and end in one fragment
         ["7c 85"],
-        ["7c 98 aa", "7c 58 bb"],  # a part of what is no unit
+        ["7c 98 aa", "7c 58 bb"],  # a fragment of no unit
         ["78"],
         ["78 0005 67"],
         ["78 0000"],
@@ -147,7 +147,7 @@ def test_packets_of_every_kind_become_a_frame() -> None:
         [""],
     ],
 )
-def test_what_cannot_be_is_damaged_and_nothing_after_it(payloads: list[str]) -> None:
+def test_impossible_unit_damages_its_frame_and_no_later_one(payloads: list[str]) -> None:
     depacketizer = begun()
     last = len(payloads)
     for number, payload in enumerate(payloads, 1):
@@ -162,7 +162,7 @@ def test_a_frame_without_marker_ends_with_the_next_one() -> None:
     assert [one.data for one in made] == [annex_b(SLICE), annex_b(PPS, SLICE)]
 
 
-def test_what_comes_behind_a_marker_is_no_frame_of_its_own() -> None:
+def test_packet_after_a_marker_is_no_frame_of_its_own() -> None:
     depacketizer = begun()
     assert len(took(depacketizer, packet(SLICE, 1, 9, last=True))) == 1
     assert took(depacketizer, packet(SLICE, 2, 9, last=True)) == []
@@ -174,14 +174,14 @@ def wary() -> Depacketizer:
     return Depacketizer(window=8, wary=True)
 
 
-def test_a_marker_proves_itself_before_it_is_believed() -> None:
+def test_marker_ends_frames_only_after_it_proved_reliable() -> None:
     depacketizer = wary()
     taken = [took(depacketizer, packet(KEY, number, number, True)) for number in range(6)]
     made = [[one.timestamp for one in some] for some in taken]
     assert made == [[], [0], [1, 2], [3], [4], [5]]
 
 
-def test_another_stream_s_marker_proves_itself_anew() -> None:
+def test_marker_of_another_stream_has_to_prove_reliable_again() -> None:
     depacketizer = wary()
     took(depacketizer, *(packet(KEY, number, number, True) for number in range(4)))
     assert depacketizer.proofs == 3
@@ -211,7 +211,7 @@ def test_a_marker_on_parameters_ends_no_frame_whatever_their_timestamp() -> None
         assert depacketizer.damaged == 0
 
 
-def test_a_frame_whose_marker_is_not_believed_ends_after_a_while() -> None:
+def test_frame_with_an_unreliable_marker_ends_after_a_time() -> None:
     depacketizer = wary()
     assert depacketizer.take(packet(KEY, 0, 7, last=True), 5.0) == []
     assert (depacketizer.marked_at, depacketizer.tail()) == (5.0, None)
@@ -247,7 +247,7 @@ def test_parameters_can_only_begin_a_frame() -> None:
     assert (made.data, made.lost, made.damaged) == (annex_b(SPS, PPS, SLICE), 2, 0)
 
 
-def test_who_waits_tells_for_what_and_since_when() -> None:
+def test_waiting_depacketizer_reports_its_first_missing_packet() -> None:
     depacketizer = begun()
     assert (depacketizer.missing(), depacketizer.waits_since()) == ([], None)
     assert depacketizer.take(packet(SLICE, 4, 12, last=True), 5.0) == []
@@ -262,7 +262,7 @@ def test_who_waits_tells_for_what_and_since_when() -> None:
     assert depacketizer.duplicates == 1
 
 
-def test_who_is_in_the_midst_of_a_frame_tells_with_what_it_goes_on() -> None:
+def test_incomplete_frame_reports_its_next_packet() -> None:
     depacketizer = begun()
     assert depacketizer.tail() is None
     assert took(depacketizer, packet(PPS, 1, 9)) == []
@@ -282,12 +282,12 @@ def test_another_ssrc_is_a_new_stream() -> None:
     assert depacketizer.streams == 2
 
 
-def test_numbers_that_jump_are_believed_when_a_second_one_follows() -> None:
+def test_second_packet_confirms_a_jump_of_numbers() -> None:
     for jump in (MAX_PACKETS_AHEAD + 100, -5000):
         depacketizer = begun()
         assert took(depacketizer, packet(KEY, jump, 9, last=True)) == []
         (here,) = took(depacketizer, packet(SLICE, 1, 8, last=True))
-        assert not here.begins  # one alone is a stray
+        assert not here.begins  # a single packet is a stray
         strays = [packet(KEY, jump + one, 20 + one, last=True) for one in range(3)]
         made = took(depacketizer, *strays)
         assert [(one.timestamp, one.begins) for one in made] == [(21, True), (22, False)]
@@ -306,7 +306,7 @@ def test_memory_is_bounded() -> None:
         assert len(depacketizer.missing()) <= 8
 
 
-# any frames, any way
+# any frames, any link
 
 UNITS = st.builds(
     lambda kind, body: bytes((0x40 | kind,)) + bytes(1 + byte % 255 for byte in body),
@@ -337,7 +337,7 @@ def test_any_frames_come_back(
 
 
 @given(FRAMES, st.integers(0, 0xFFFF), st.randoms(use_true_random=False), st.floats(0, 0.4))
-def test_only_whole_frames_come_in_order_and_what_is_missing_is_counted(
+def test_only_whole_frames_come_in_order_and_losses_are_counted(
     frames: list[list[bytes]], sequence: int, chance: random.Random, loss: float
 ) -> None:
     packetizer, depacketizer = H264Packetizer(96, 1, sequence, MTU), Depacketizer(window=8)
@@ -370,7 +370,7 @@ def test_only_whole_frames_come_in_order_and_what_is_missing_is_counted(
 
 
 @given(st.lists(st.binary(max_size=8), max_size=30), st.randoms(use_true_random=False))
-def test_any_payloads_are_taken(payloads: list[bytes], chance: random.Random) -> None:
+def test_any_payloads_are_accepted(payloads: list[bytes], chance: random.Random) -> None:
     depacketizer = Depacketizer(window=4)
     for payload in payloads:
         number, stamp = chance.randrange(40), chance.randrange(3)
@@ -384,7 +384,7 @@ def test_any_payloads_are_taken(payloads: list[bytes], chance: random.Random) ->
 
 
 @pytest.mark.parametrize("size", [(640, 480), (322, 242), (256, 16), (1920, 1080)])
-async def test_size_stands_in_the_parameters(size: tuple[int, int]) -> None:
+async def test_size_is_read_from_the_parameters(size: tuple[int, int]) -> None:
     async with Codecs(threads=1) as codecs:
         frame = frame_of(np.zeros(size[::-1], np.uint8), "Mono8", 1)
         data = bytes((await codecs.h264_encoder().encode(frame)).data)
@@ -404,7 +404,7 @@ def golomb(number: int) -> str:
 def test_size_of_interlaced_pictures_and_of_a_high_profile() -> None:
     fields = f"{100:08b}{0:08b}{40:08b}"
     fields += golomb(0) + golomb(1) + golomb(0) + golomb(0) + "0"  # 4:2:0, 8 bits
-    fields += "1" + "1" + golomb(16) + "0" * 7  # one list of scales, which ends at once (-8)
+    fields += "1" + "1" + golomb(16) + "0" * 7  # a list of scales that ends at once (-8)
     fields += golomb(0) + golomb(1) + "0" + golomb(0) + golomb(0) + golomb(1) + golomb(5)
     fields += golomb(4) + "0" + golomb(119) + golomb(33)
     fields += "0" + "1" + "1"  # in fields
@@ -421,7 +421,7 @@ def test_any_parameters_are_read_or_refused(data: bytes) -> None:
             assert min(picture_size(head + data)) > 0
 
 
-def test_description_says_all_that_a_player_needs() -> None:
+def test_description_has_all_fields_of_a_player() -> None:
     text = description("239.1.2.3", 5004, 97, session=8, ttl=3, sets=(SPS, PPS), name="a\r\nb")
     assert text == (
         "v=0\r\no=- 8 0 IN IP4 239.1.2.3\r\ns=a b\r\nc=IN IP4 239.1.2.3/3\r\nt=0 0\r\n"

@@ -1,6 +1,6 @@
 """H.264 over a thin link that loses packets: 20 Mbit/s, 5 %, and an outage.
 
-Run with ``-s``, the figures are printed.
+With ``-s``, the figures are printed.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_pictures_over_a_link_that_loses_packets(link: Link, crf: int, repair: f
     assert None not in numbers
     assert numbers == sorted(set(numbers))
     assert share > (0.9 if repair else 0.3)
-    assert ages[int(len(ages) * 0.99)] < 1000  # it is asked for 150
+    assert ages[int(len(ages) * 0.99)] < 1000  # the encoder's target is 150
     assert after[0][2] - ended < 5e9  # for 1 s
     assert (counted["repaired"] > 0) == bool(repair)
     assert counted["lost"] > 0

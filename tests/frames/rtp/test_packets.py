@@ -33,7 +33,7 @@ GOLDEN: list[tuple[str, packets.Report]] = [
 ]
 
 
-def test_packet_is_what_the_layout_says() -> None:
+def test_packet_has_the_documented_layout() -> None:
     assert PACKET.pack() == PLAIN
     assert packets.RtpPacket.parse(PLAIN) == PACKET
     assert packets.RtpPacket.parse(memoryview(PLAIN)) == PACKET
@@ -46,15 +46,15 @@ def test_packet_is_what_the_layout_says() -> None:
         "90 e0 fffe 00015f90 deadbeef bede0001 aabbccdd 0102",  # an extension of one word
         "90 e0 fffe 00015f90 deadbeef bede0000 0102",  # and an empty one
         "a0 e0 fffe 00015f90 deadbeef 0102 000003",  # padding
-        "b1 e0 fffe 00015f90 deadbeef 0000000a bede0001 aabbccdd 0102 01",  # all of it
+        "b1 e0 fffe 00015f90 deadbeef 0000000a bede0001 aabbccdd 0102 01",  # the whole payload
     ],
 )
-def test_what_stands_around_the_payload_is_taken_off(data: str) -> None:
+def test_header_extension_and_padding_are_removed(data: str) -> None:
     assert packets.RtpPacket.parse(bytes.fromhex(data)) == PACKET
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         ("80 e0 fffe 00015f90 deadbe", "expected 12 bytes or more, got 11"),
         ("40 e0 fffe 00015f90 deadbeef 0102", "expected version 2, got 1"),
@@ -65,13 +65,13 @@ def test_what_stands_around_the_payload_is_taken_off(data: str) -> None:
         ("a0 e0 fffe 00015f90 deadbeef 0102 04", "expected 1 to 3 bytes, got 4"),
     ],
 )
-def test_what_is_no_packet_is_told(data: str, said: str) -> None:
-    with pytest.raises(MessageError, match=said):
+def test_bytes_without_a_packet_are_refused(data: str, message: str) -> None:
+    with pytest.raises(MessageError, match=message):
         packets.RtpPacket.parse(bytes.fromhex(data))
 
 
 @pytest.mark.parametrize(("data", "report"), GOLDEN)
-def test_report_is_what_the_layout_says(data: str, report: packets.Report) -> None:
+def test_report_has_the_documented_layout(data: str, report: packets.Report) -> None:
     assert report.pack() == bytes.fromhex(data)
     assert packets.parse_rtcp(bytes.fromhex(data)) == [report]
     assert packets.is_rtcp(bytes.fromhex(data))
@@ -86,7 +86,7 @@ def test_compound_is_read_in_order_and_unknown_kinds_are_left_out() -> None:
     assert packets.parse_rtcp(other + packets.compound(*reports) + unnamed) == reports
 
 
-def test_padding_of_the_last_report_is_taken_off() -> None:
+def test_padding_of_the_last_report_is_removed() -> None:
     padded = "a1 cb 0002 00000001 00000004"
     assert packets.parse_rtcp(bytes.fromhex("80 c9 0001 00000002" + padded)) == [
         packets.ReceiverReport(2),
@@ -106,7 +106,7 @@ def test_padding_of_the_last_report_is_taken_off() -> None:
         "80 60 0001 00000002",
         "80 c9 0002 00000002",  # longer than the datagram
         "80 c9 0000",  # no SSRC
-        "82 c9 0007 00000002" + BLOCK,  # two blocks said, one there
+        "82 c9 0007 00000002" + BLOCK,  # two blocks counted, one present
         "81 c8 0006 00000001 83aa7e80 80000000 00015f90 00000003 00000fa0",
         "81 ca 0002 00000002 01 09 61 00",
         "81 ca 0002 00000002 01 02 61 62",  # no end of the list
@@ -116,13 +116,13 @@ def test_padding_of_the_last_report_is_taken_off() -> None:
         "81 ce 0001 00000002",
     ],
 )
-def test_report_that_does_not_fit_is_told(data: str) -> None:
+def test_report_that_does_not_fit_is_refused(data: str) -> None:
     with pytest.raises(MessageError):
         packets.parse_rtcp(bytes.fromhex(data))
 
 
 @given(st.lists(st.integers(0, 0xFFFF), max_size=60, unique=True))
-def test_all_that_is_missing_is_asked_for_and_nothing_else(sequences: list[int]) -> None:
+def test_all_missing_packets_and_no_others_are_requested(sequences: list[int]) -> None:
     (found,) = packets.parse_rtcp(packets.PacketsMissing(1, 2, tuple(sequences)).pack())
     assert isinstance(found, packets.PacketsMissing)
     assert sorted(found.sequences) == sorted(sequences)
@@ -136,7 +136,7 @@ def test_any_bytes_are_read_or_refused(data: bytes) -> None:
                 assert read(head + data) is not None
 
 
-def test_a_loss_beyond_its_field_is_held_within() -> None:
+def test_loss_count_is_limited_to_its_field() -> None:
     for lost, kept in ((1 << 30, (1 << 23) - 1), (-(1 << 30), -(1 << 23))):
         assert packets.ReportBlock.parse(packets.ReportBlock(1, 0, lost, 0, 0).pack()).lost == kept
 

@@ -61,7 +61,7 @@ def seen(source: FrameSource) -> RtpStatistics:
 
 
 def patient(source: FrameSource) -> FrameSource:
-    """Have a source wait for what is missing, however slow the machine is."""
+    """Make a source wait for missing packets, even on a slow machine."""
     driver = source.driver
     assert isinstance(driver, RtpDriver)
     driver._plan = driver._plan._replace(repair=LIMIT)
@@ -69,7 +69,7 @@ def patient(source: FrameSource) -> FrameSource:
 
 
 def number_of(frame: Frame) -> int:
-    """Return a picture's number, having seen that it is whole."""
+    """Check that a picture is whole, and return its number."""
     shown = frame.grey()
     stamp = read_stamp(shown)
     assert stamp is not None, "a broken picture"
@@ -86,14 +86,14 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 async def read(source: FrameSource, enough: Any) -> list[Frame]:
-    """Return the frames that come until there is enough of them."""
+    """Return the frames that come until a condition is true."""
     found: list[Frame] = []
     async with asyncio.timeout(LIMIT):
         async for frame in source:
             found.append(frame)
             if enough(found):
                 return found
-    raise AssertionError("it ended")
+    raise AssertionError("the source ended")
 
 
 async def drain(reader: FrameReader) -> None:
@@ -130,16 +130,16 @@ async def test_pictures_come_whole_and_in_order_with_their_times(
         told = seen(source)
         assert told.packets >= len(got)
         assert (told.lost, told.strange, told.overflows) == (0, 0, 0)
-        assert told.damaged <= 1  # the one that it came into the midst of
+        assert told.damaged <= 1  # the refresh that the receiver joined late
         sent = sender.statistics()
         (one,) = sent.receivers
         assert one.address == f"{HOST}:{port + 1}"
         assert (one.loss, one.lost) == (0, 0)
         assert sent.frames >= len(got)
-        assert sent.anew >= 1  # for who joined
+        assert sent.anew >= 1  # for the new receiver
 
 
-async def test_packets_that_are_lost_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_lost_packets_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 10_000)
     monkeypatch.setattr(feedback, "MAX_RESEND_AGE", LIMIT)
     port = two_ports()
@@ -166,7 +166,7 @@ async def test_packets_that_are_lost_are_sent_again(monkeypatch: pytest.MonkeyPa
             assert sender.statistics().resent >= seen(source).repaired
 
 
-async def test_a_frame_s_end_is_asked_for_before_the_next_frame_comes() -> None:
+async def test_end_of_a_frame_is_requested_before_the_next_frame() -> None:
     port, packetizer = two_ports(), H264Packetizer(mtu_payload=200)
     async with Codecs(threads=1) as codecs:
         pictures = [frame_of(stamped(number), "Mono8") for number in (1, 2)]
@@ -185,7 +185,7 @@ async def test_a_frame_s_end_is_asked_for_before_the_next_frame_comes() -> None:
 
         async def asked(packet: bytes) -> None:
             wanted = (RtpPacket.parse(packet).sequence,)
-            while True:  # what is late is asked for more than once
+            while True:  # late packets are requested more than once
                 for report in parse_rtcp(await asyncio.get_running_loop().sock_recv(rtcp, 2000)):
                     if isinstance(report, PacketsMissing) and report.sequences == wanted:
                         return
@@ -240,7 +240,7 @@ async def test_a_key_frame_in_the_midst_of_a_refresh_is_shown_at_once(
 
 
 @pytest.mark.parametrize("back", [True, False], ids=["with key frames", "by refresh alone"])
-async def test_after_a_loss_no_picture_is_broken_and_it_goes_on(back: bool) -> None:
+async def test_stream_goes_on_after_a_loss_without_a_broken_picture(back: bool) -> None:
     port = two_ports()
     async with way(port) as between, frames.open(DRAWN) as drawn:
         between.back = back
@@ -266,7 +266,7 @@ async def test_after_a_loss_no_picture_is_broken_and_it_goes_on(back: bool) -> N
                 assert sender.statistics().anew == 0
 
 
-async def test_another_stream_takes_its_place_when_the_first_is_silent() -> None:
+async def test_another_stream_replaces_a_silent_one() -> None:
     port = two_ports()
     async with frames.open(DRAWN) as drawn:
         url = f"rtp://{HOST}:{port}?{SIZE}"
@@ -287,14 +287,14 @@ async def test_another_stream_takes_its_place_when_the_first_is_silent() -> None
                             assert number_of(await anext(reader))
             with pytest.raises(FrameSourceError, match="said goodbye"):
                 await drain(reader)
-        async with (  # the sender began again
+        async with (  # the sender restarted
             frames.open(url, timeout=LIMIT, linger=LIMIT) as source,
             RtpSender(drawn, f"{HOST}:{port}"),
         ):
             assert len(await read(source, lambda found: len(found) > 2)) == 3
 
 
-async def test_silence_is_told() -> None:
+async def test_silence_is_reported() -> None:
     port = two_ports()
     with pytest.raises(
         FrameSourceError, match=r"expected a whole picture .* within 0.1 s, got non"
@@ -320,7 +320,7 @@ async def test_pictures_of_another_size_are_refused() -> None:
 
 
 @pytest.mark.long
-async def test_what_cannot_be_decoded_at_all_is_told() -> None:
+async def test_stream_that_cannot_be_decoded_is_reported() -> None:
     port = two_ports()
     async with Codecs(threads=1) as codecs:
         key = bytes((await codecs.h264_encoder().encode(frame_of(stamped(1), "Mono8"))).data)
@@ -339,7 +339,7 @@ async def test_what_cannot_be_decoded_at_all_is_told() -> None:
             await waiting
 
 
-async def test_a_decoder_that_is_too_slow_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_slow_decoder_restarts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 4)
     port, packetizer = two_ports(), H264Packetizer()
     async with Codecs(threads=1) as codecs:
@@ -447,7 +447,7 @@ async def test_sender_ends_with_its_source() -> None:
             await sender.__aenter__()
 
 
-async def test_what_a_sender_is_told_wrongly() -> None:
+async def test_wrong_parameters_of_a_sender_are_refused() -> None:
     _, source = scripted()
     for to in ("host", "host:0", "host:65535", ":5004", "host:x"):
         with pytest.raises(ConfigurationError, match="expected HOST:PORT"):
@@ -467,7 +467,7 @@ async def test_what_a_sender_is_told_wrongly() -> None:
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "message"),
     [
         ("sise=1x1", "unknown parameter 'sise'.*size"),
         ("size=1", "WIDTHxHEIGHT"),
@@ -476,8 +476,8 @@ async def test_what_a_sender_is_told_wrongly() -> None:
         ("timeout=0", "timeout"),
     ],
 )
-def test_url_that_is_wrong(query: str, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
+def test_url_that_is_wrong(query: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         frames.open(f"rtp://{HOST}:5004?{query}")
     with pytest.raises(ConfigurationError, match="HOST:PORT"):
         frames.open("rtp://:65535")
@@ -487,7 +487,7 @@ async def test_port_that_is_in_use() -> None:
     port = two_ports()
     with socket.socket(type=socket.SOCK_DGRAM) as other:
         other.bind((HOST, port + 1))
-        with pytest.raises(FrameSourceError, match=r"cannot listen there.*in use"):
+        with pytest.raises(FrameSourceError, match=r"cannot listen on this port.*in use"):
             async with frames.open(f"rtp://{HOST}:{port}?{SIZE}"):
                 pass
     async with frames.open(f"rtp://{HOST}:{port}?{SIZE}"):
@@ -495,7 +495,7 @@ async def test_port_that_is_in_use() -> None:
 
 
 @pytest.mark.parametrize("turns", range(12))
-async def test_cancelled_anywhere_leaves_nothing_behind(turns: int) -> None:
+async def test_cancellation_anywhere_leaves_nothing_open(turns: int) -> None:
     port = two_ports()
 
     async def once() -> None:

@@ -1,4 +1,4 @@
-"""A way between sender and receiver on the loopback, that does what a test says."""
+"""A link between sender and receiver on the loopback, with faults that a test chooses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HOST = "127.0.0.1"
 def two_ports() -> int:
     """Return a port that is free, and the next one, too.
 
-    They are below those that a system gives to who asks for any: other tests get none of them.
+    They are below the system's range of automatic ports: other tests get none of them.
     """
     while True:
         port = 10_000 + 2 * secrets.randbelow(10_000)
@@ -37,9 +37,9 @@ class Way:
     """Carries RTP and RTCP to a receiver, and RTCP back.
 
     Attributes:
-        port: that a sender sends to.
-        passes: says of each packet of RTP whether it arrives.
-        back: whether what the receiver says does.
+        port: port for a sender.
+        passes: returns whether a packet of RTP arrives.
+        back: whether packets of the receiver arrive.
         carried: packets of RTP that arrived.
     """
 

@@ -1,4 +1,4 @@
-"""A client of RTSP over a bare socket, which believes nothing."""
+"""A client of RTSP over a bare socket, which checks each answer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Codecs, H264Decoder, RtspServer
 
 LIMIT = 20.0
-"""Seconds for an answer: the server waits itself, for a frame."""
+"""Seconds for an answer: the server waits for a frame."""
 
 TCP = "RTP/AVP/TCP;unicast;interleaved=0-1"
 
@@ -34,7 +34,7 @@ class Reply(NamedTuple):
 
 
 class Client:
-    """One connection: what comes between the answers is kept by its channel."""
+    """A connection that keeps the packets between the answers, by channel."""
 
     def __init__(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, base: str
@@ -103,7 +103,7 @@ class Client:
         return Reply(int(found[1]), headers, body)
 
     async def start(self) -> bytes:
-        """Read a packet, and return b""; or the first byte of an answer."""
+        """Read a packet and return b"", or return the first byte of an answer."""
         first = await self._read(1)
         if first != b"$":
             assert first == b"R", f"neither a packet nor an answer begins with {first!r}"
@@ -119,7 +119,7 @@ class Client:
         return self.packets[channel].pop(0)
 
     async def ended(self) -> bool:
-        """Return whether the server ends the connection; what comes before is kept."""
+        """Return whether the server ends the connection; earlier packets are kept."""
         try:
             while await self.start() == b"":
                 pass
@@ -128,7 +128,7 @@ class Client:
         return False
 
     async def everything(self) -> bytes:
-        """Return what comes until the connection ends, in whatever way."""
+        """Return the bytes that come until the connection ends."""
         found = bytearray()
         try:
             while data := await self._some():
@@ -151,7 +151,7 @@ class Client:
 
 
 def digest(reply: Reply, method: str, url: str, user: str, password: str) -> str:
-    """Return what answers a challenge (RFC 2617, section 3.2.2, without qop)."""
+    """Return the answer to a challenge (RFC 2617, section 3.2.2, without qop)."""
     found = re.search(r'Digest realm="([^"]+)", nonce="([^"]+)"', reply.headers["www-authenticate"])
     assert found is not None
     realm, nonce = found.groups()
@@ -167,7 +167,7 @@ def digest(reply: Reply, method: str, url: str, user: str, password: str) -> str
 
 
 class Watcher:
-    """Makes pictures of packets, and reads their numbers."""
+    """Decodes packets to pictures, and reads their numbers."""
 
     def __init__(self, codecs: Codecs, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
         self.depacketizer = Depacketizer(window=0)  # the loopback keeps the order
@@ -178,7 +178,7 @@ class Watcher:
         self.numbers: list[int] = []
 
     async def see(self, packet: bytes) -> int | None:
-        """Take a packet; return the number of the picture that is whole with it."""
+        """Add a packet; return the number of the picture that it completes."""
         read = RtpPacket.parse(packet)
         self.sequences.append(read.sequence)
         number = None

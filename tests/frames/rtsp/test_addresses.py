@@ -1,4 +1,4 @@
-"""URLs, transports and passwords as clients say them."""
+"""URLs, transports and passwords in clients' requests."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_urls(url: str, target: RtspTarget) -> None:
 @pytest.mark.parametrize(
     "url", ["*", "/left", "http://h/left", "rtsp:///left", "rtsp://h:x/a", "rtsp://[h/a"]
 )
-def test_what_is_no_url(url: str) -> None:
+def test_text_that_is_no_url_is_refused(url: str) -> None:
     with pytest.raises(RtspError, match="URL") as caught:
         target_of(url)
     assert caught.value.status == 400
@@ -103,7 +103,7 @@ def test_the_right_password_passes_as_often_as_wanted() -> None:
     challenge = challenged(gate)
     for method in ("DESCRIBE", "SETUP", "PLAY") * 5:
         gate.check(asked(digest(challenge, method, URL, "me", "secret"), method))
-    # live555 says the stream where it asks for the track
+    # live555 names the stream in its request for the track
     gate.check(asked(digest(challenge, "SETUP", URL, "me", "secret"), "SETUP", f"{URL}/track1"))
     gate.check(asked(digest(challenge, "PLAY", f"{URL}/", "me", "secret"), "PLAY", f"{URL}/"))
 
@@ -149,11 +149,11 @@ def test_no_text_is_an_authorization(text: str) -> None:
 
 
 def test_basic_is_refused_unless_asked_for() -> None:
-    said = asked("Basic " + base64.b64encode("me:gehe\u00edm".encode()).decode())
-    PasswordGate(Authentication("me", "gehe\u00edm", basic=True)).check(said)
+    request = asked("Basic " + base64.b64encode("me:gehe\u00edm".encode()).decode())
+    PasswordGate(Authentication("me", "gehe\u00edm", basic=True)).check(request)
     for other in (Authentication("me", "gehe\u00edm"), Authentication("me", "x", basic=True)):
         with pytest.raises(RtspError, match="wrong user or password") as caught:
-            PasswordGate(other).check(said)
+            PasswordGate(other).check(request)
         schemes = [value.partition(" ")[0] for _, value in caught.value.headers]
         assert schemes == (["Digest", "Basic"] if other.basic else ["Digest"])
 

@@ -33,7 +33,7 @@ MESSAGES = (
 
 
 def read(*pieces: bytes) -> list[messages.RtspRequest | messages.ChannelData]:
-    """Return what is cut from pieces, each of which is looked at when it comes."""
+    """Return the messages in pieces that are parsed one after the other."""
     parser, found = messages.RequestParser(), []
     for piece in pieces:
         parser.feed(piece)
@@ -77,7 +77,7 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
                     found.append(message)
             except messages.RtspError as error:
                 return found, error.status if error.fatal else -1
-        assert parser.waiting <= messages.ROOM
+        assert parser.waiting <= messages.MAX_MESSAGE_BYTES
         return found, 0
 
     data = b"".join(parts)
@@ -116,13 +116,13 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
         ),
     ],
 )
-def test_what_cannot_be_a_request_is_refused(data: bytes, status: int, text: str) -> None:
+def test_bytes_without_a_request_are_refused(data: bytes, status: int, text: str) -> None:
     with pytest.raises(messages.RtspError, match=text) as caught:
         read(data)
     assert (caught.value.status, caught.value.fatal) == (status, True)
 
 
-def test_a_half_message_is_known_as_one() -> None:
+def test_half_message_is_recognized() -> None:
     parser = messages.RequestParser()
     for data, midst in ((b"\r\n", False), (b"OPT", True), (b"IONS * RTSP/1.0\r\n", True)):
         parser.feed(data)

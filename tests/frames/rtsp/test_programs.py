@@ -1,4 +1,4 @@
-"""Other people's programs as viewers, and our own driver, which is FFmpeg's client."""
+"""Other projects' programs as viewers, and the own driver."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("no_leaks")]
 
 USER, SECRET = "me", "a password"
 LIMIT = 60.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 SMALL = "synthetic://?size=256x64&fps=60"
 
@@ -36,7 +36,7 @@ async def served(url: str = SMALL, **options: Any) -> AsyncIterator[RtspServer]:
 
 
 def named(server: RtspServer) -> str:
-    """Return the URL with the password in it."""
+    """Return the URL with the password."""
     secret = SECRET.replace(" ", "%20")
     return server.url("left").replace("rtsp://", f"rtsp://{USER}:{secret}@")
 
@@ -49,23 +49,23 @@ def program(name: str, package: str) -> str:
 
 
 async def run(*command: str) -> tuple[int, str]:
-    """Return what a program ends with and says."""
+    """Return the status and the output of a program."""
     process = await asyncio.create_subprocess_exec(
         *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
     )
     try:
         async with asyncio.timeout(LIMIT):
-            said, _ = await process.communicate()
+            output, _ = await process.communicate()
     except BaseException:
         process.kill()
         await process.wait()
         raise
     assert process.returncode is not None
-    return process.returncode, said.decode()
+    return process.returncode, output.decode()
 
 
 @pytest.mark.parametrize("transport", ["tcp", pytest.param("udp", marks=pytest.mark.long)])
-async def test_our_own_driver_sees_the_numbers(transport: str) -> None:
+async def test_own_driver_reads_the_stamped_numbers(transport: str) -> None:
     async with served() as server:
         url = f"{named(server)}#transport={transport}"
         numbers = []
@@ -85,19 +85,19 @@ async def test_our_own_driver_sees_the_numbers(transport: str) -> None:
 async def test_ffprobe(transport: str) -> None:
     ffprobe = program("ffprobe", "ffmpeg")
     async with served() as server:
-        ended, said = await run(
+        ended, output = await run(
             *(ffprobe, "-v", "warning", "-rtsp_transport", transport, "-count_frames"),
             *("-show_entries", "stream=codec_name,width,height,nb_read_frames"),
             *("-read_intervals", "%+1", "-of", "default=noprint_wrappers=1", named(server)),
         )
-        *said_so, counted = said.splitlines()
-        assert (ended, said_so) == (0, ["codec_name=h264", "width=256", "height=64"])
-        # of a second of 60; a slow machine leaves some out
+        *quiet, counted = output.splitlines()
+        assert (ended, quiet) == (0, ["codec_name=h264", "width=256", "height=64"])
+        # of 60 in a second; a slow machine skips some
         assert int(counted.partition("=")[2]) >= 10
         wrong = named(server).replace("a%20password", "wrong")
-        ended, said = await run(ffprobe, "-v", "error", "-rtsp_transport", transport, wrong)
+        ended, output = await run(ffprobe, "-v", "error", "-rtsp_transport", transport, wrong)
         assert ended != 0
-        assert "401 Unauthorized" in said
+        assert "401 Unauthorized" in output
 
 
 @pytest.mark.long
@@ -111,19 +111,19 @@ async def test_gstreamer(transport: str) -> None:
     if (await run(inspect, "--exists", "avdec_h264"))[0] != 0:
         pytest.skip("needs avdec_h264: apt-get install gstreamer1.0-libav")
     async with served() as server:
-        ended, said = await run(
+        ended, output = await run(
             *(launch, "rtspsrc", f"location={server.url('left')}", f"user-id={USER}"),
             *(f"user-pw={SECRET}", f"protocols={transport}", "!", "rtph264depay", "!"),
             *("h264parse", "!", "avdec_h264", "!", "fakesink", "num-buffers=30"),
         )
-        assert ended == 0, said
-        assert "Got EOS from element" in said
-        assert "ERROR" not in said
+        assert ended == 0, output
+        assert "Got EOS from element" in output
+        assert "ERROR" not in output
         assert server.statistics()["left"].sent >= 30
 
 
 @pytest.mark.long
-async def test_a_program_that_is_stopped_and_one_that_is_killed_harm_nobody() -> None:
+async def test_stopped_and_killed_programs_disturb_no_other_viewer() -> None:
     ffmpeg = program("ffmpeg", "ffmpeg")
     url = "synthetic://?size=1280x1024&fps=30"
     async with served(url, crf=1, keyint=2) as server:
@@ -151,14 +151,14 @@ async def test_a_program_that_is_stopped_and_one_that_is_killed_harm_nobody() ->
 
 
 async def counted(server: RtspServer, what: str, count: int) -> None:
-    """Wait until something was counted."""
+    """Wait until a counter exceeds 0."""
     async with asyncio.timeout(LIMIT):
         while getattr(server.statistics()["left"], what) != count:  # noqa: ASYNC110 - it has no event
             await asyncio.sleep(0.05)
 
 
 async def more(server: RtspServer, frames: int) -> None:
-    """Wait until so many more frames were sent."""
+    """Wait until a number of further frames were sent."""
     until = server.statistics()["left"].sent + frames
     async with asyncio.timeout(LIMIT):
         while server.statistics()["left"].sent < until:  # noqa: ASYNC110 - it has no event

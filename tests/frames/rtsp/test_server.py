@@ -55,7 +55,7 @@ async def server() -> AsyncIterator[tuple[ScriptedDriver, RtspServer]]:
 
 
 def connections(server: RtspServer) -> set[Any]:
-    """Return those that are open."""
+    """Return the open connections."""
     assert server._serving is not None
     return set(server._serving.places)
 
@@ -93,7 +93,7 @@ async def test_a_stream_is_described(server: Served) -> None:
     assert sps[1:4].hex().upper() == found[1]
 
 
-async def test_what_each_method_answers(server: Served) -> None:
+async def test_answer_to_each_method(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as client:
         assert (await client.ask("OPTIONS", "*")).headers["public"] == PUBLIC
@@ -171,7 +171,7 @@ async def test_refusals(
         (b"x" * 5000, 400),
     ],
 )
-async def test_what_is_no_rtsp_ends_the_connection(
+async def test_bytes_without_rtsp_end_the_connection(
     server: Served, data: bytes, status: int
 ) -> None:
     _, serving = server
@@ -200,7 +200,7 @@ async def test_many_requests_at_once_are_answered_in_order(server: Served) -> No
             assert (await client.reply()).headers["cseq"] == str(number)
 
 
-async def test_half_a_request_has_its_time(server: Served) -> None:
+async def test_half_a_request_ends_the_connection_after_a_time(server: Served) -> None:
     _, serving = server
     loop = asyncio.get_running_loop()
     async with await Client.connect(serving) as client:
@@ -215,7 +215,7 @@ async def test_half_a_request_has_its_time(server: Served) -> None:
         assert loop.time() - before == pytest.approx(REQUEST_TIMEOUT, abs=0.2)
 
 
-async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
+async def test_idle_connection_is_closed(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as client:
         assert (await client.ask("OPTIONS")).status == 200
@@ -226,7 +226,7 @@ async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
         assert await client.ended()
 
 
-async def test_packets_without_a_session_are_left_but_not_many(server: Served) -> None:
+async def test_few_packets_without_a_session_are_ignored(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as client:
         client.writer.write(b"$\1\0\0" * MAX_STRAY_PACKETS)
@@ -237,7 +237,7 @@ async def test_packets_without_a_session_are_left_but_not_many(server: Served) -
         assert asyncio.get_running_loop().time() - before < 1
 
 
-async def test_who_goes_while_it_waits_for_a_description_leaves_nothing(server: Served) -> None:
+async def test_client_that_leaves_during_a_describe_leaves_nothing_open(server: Served) -> None:
     driver, serving = server
     async with await Client.connect(serving) as client:
         client.writer.write(f"DESCRIBE {client.base} RTSP/1.0\r\nCSeq: 1\r\n\r\n".encode())
@@ -247,7 +247,7 @@ async def test_who_goes_while_it_waits_for_a_description_leaves_nothing(server: 
     await driver.rests()
 
 
-async def test_to_stop_is_finished_also_where_it_is_cancelled() -> None:
+async def test_cancelled_stop_is_finished() -> None:
     driver, source = scripted(stall=None)
     async with source:
         server = RtspServer({"left": source}, port=0)
@@ -265,7 +265,7 @@ async def test_to_stop_is_finished_also_where_it_is_cancelled() -> None:
         await server.stop()
 
 
-async def test_who_takes_no_answers_is_cut_off(server: Served) -> None:
+async def test_client_that_reads_no_answers_is_disconnected(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving, room=4096) as client:
         client.writer.write(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n" * 10_000)
@@ -285,12 +285,12 @@ async def test_passwords() -> None:
         for method in ("DESCRIBE", "SETUP", "PLAY", "GET_PARAMETER", "TEARDOWN"):
             wrong = digest(asked, method, client.base, "me", "wrong")
             assert (await client.ask(method, Authorization=wrong)).status == 401
-        assert driver.calls == ["open"]  # nobody has had the device stream
+        assert driver.calls == ["open"]  # the device never streamed
         right = digest(asked, "DESCRIBE", client.base, "me", "secret")
         assert (await described(client, driver, Authorization=right)).status == 200
 
 
-async def test_who_guesses_is_cut_off() -> None:
+async def test_client_that_guesses_passwords_is_disconnected() -> None:
     async with (
         served(user="me", password=SECRET) as (_, serving),
         await Client.connect(serving) as client,
@@ -300,7 +300,7 @@ async def test_who_guesses_is_cut_off() -> None:
         assert await client.ended()
 
 
-async def test_a_camera_that_is_gone_is_told_and_tried_again(server: Served) -> None:
+async def test_lost_camera_is_reported_and_reopened(server: Served) -> None:
     driver, serving = server
     driver.fails["start"] = GoneError("scripted: it was unplugged")
     async with await Client.connect(serving) as client:
@@ -312,7 +312,7 @@ async def test_a_camera_that_is_gone_is_told_and_tried_again(server: Served) -> 
     assert driver.calls.count("start") == 3
 
 
-async def test_a_camera_that_is_silent_is_told(server: Served) -> None:
+async def test_silent_camera_is_reported(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as client:
         asking = asyncio.create_task(client.ask("DESCRIBE"))
@@ -323,19 +323,19 @@ async def test_a_camera_that_is_silent_is_told(server: Served) -> None:
     assert (reply.status, reply.body) == (503, b"scripted: no frame came within 5 s\n")
 
 
-async def test_there_are_so_many_connections_and_viewers() -> None:
+async def test_connections_and_viewers_are_limited() -> None:
     async with served(max_connections=2, max_viewers=1) as (_, serving):
         async with await Client.connect(serving) as one, await Client.connect(serving) as two:
             await one.set_up()
             assert (await two.ask("SETUP", Transport=TCP)).status == 453
             async with await Client.connect(serving) as three:
-                assert await two.ended()  # it has no session, and makes room
+                assert await two.ended()  # closed to make room for three
                 assert (await one.ask("TEARDOWN")).status == 200
                 await three.set_up()
         await until(lambda: not connections(serving))
 
 
-async def test_where_each_connection_has_a_session_the_newcomer_is_refused() -> None:
+async def test_newcomer_is_refused_when_all_connections_have_sessions() -> None:
     async with served(max_connections=2) as (_, serving):
         async with await Client.connect(serving) as one, await Client.connect(serving) as two:
             await one.set_up()
@@ -371,7 +371,7 @@ async def test_sessions_of_one_connection(server: Served) -> None:
         assert serving.statistics()["left"].viewers == 7
 
 
-async def test_nobody_else_can_end_a_session(server: Served) -> None:
+async def test_other_connections_cannot_end_a_session(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as one, await Client.connect(serving) as two:
         await one.set_up()
@@ -379,7 +379,7 @@ async def test_nobody_else_can_end_a_session(server: Served) -> None:
         assert serving.statistics()["left"].viewers == 1
 
 
-async def test_it_starts_and_stops_as_often_as_wanted() -> None:
+async def test_server_starts_and_stops_repeatedly() -> None:
     _, source = scripted()
     async with source:
         server = RtspServer({"left": source}, port=0)
@@ -394,7 +394,7 @@ async def test_it_starts_and_stops_as_often_as_wanted() -> None:
             await server.stop()
 
 
-async def test_what_cannot_be_served() -> None:
+async def test_sources_that_cannot_be_served_are_refused() -> None:
     _, source = scripted()
     for wrong, text in (
         ({}, "expected a source"),
@@ -418,7 +418,7 @@ async def test_what_cannot_be_served() -> None:
                 await RtspServer({"a": source}, port=port).start()
 
 
-async def test_its_url_has_a_name_that_others_know() -> None:
+async def test_url_has_a_name_that_other_hosts_resolve() -> None:
     _, source = scripted()
     assert RtspServer({"a": source}).url("a") == "rtsp://127.0.0.1:8554/a"
     assert RtspServer({"a": source}, host="::1", port=1).url("a") == "rtsp://[::1]:1/a"

@@ -11,7 +11,7 @@ import pytest
 from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import Codecs
 from tests.frames.drivers import GoneError, scripted
-from tests.frames.inside import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
+from tests.frames.inside import KEY_FRAME_INTERVAL, LINGER, MAX_FAILURES, SharedH264
 from tests.frames.pictures import frame_of, stamped
 from tests.handmade import until
 
@@ -27,7 +27,7 @@ def drawn(number: int) -> Frame:
 
 
 class Viewer:
-    """Keeps what it is handed."""
+    """Keeps its frames."""
 
     def __init__(self) -> None:
         self.units: list[tuple[int, bool]] = []
@@ -48,7 +48,7 @@ class Stream:
         self.shared = SharedH264(source, codecs.h264_encoder())
 
     async def give(self, *numbers: int) -> None:
-        """Give frames, each when the one before it is encoded."""
+        """Give frames, each after the encoding of the last one."""
         await self.driver.streams()
         for number in numbers:
             before = self.shared.counts.encoded + self.shared.counts.failed
@@ -78,7 +78,7 @@ async def test_twenty_viewers_are_one_encoder(stream: Stream) -> None:
     assert (stream.shared.counts.encoded, stream.shared.counts.keys) == (3, 1)
 
 
-async def test_nobody_there_nothing_streams(stream: Stream) -> None:
+async def test_without_viewers_the_source_does_not_stream(stream: Stream) -> None:
     assert stream.driver.calls == ["open"]
     viewer = Viewer()
     stream.shared.join(viewer)
@@ -93,7 +93,7 @@ async def test_nobody_there_nothing_streams(stream: Stream) -> None:
     assert viewer.units == [(1, True), (2, True)]
 
 
-async def test_who_comes_back_in_time_finds_it_streaming_and_nothing_was_encoded_meanwhile(
+async def test_returning_viewer_joins_a_running_stream_that_encoded_nothing(
     stream: Stream,
 ) -> None:
     viewer = Viewer()
@@ -110,7 +110,7 @@ async def test_who_comes_back_in_time_finds_it_streaming_and_nothing_was_encoded
     assert stream.driver.calls == ["open", "start"]
 
 
-async def test_key_frames_come_for_who_joins_and_no_more_often_than_bounded(
+async def test_key_frames_for_new_viewers_keep_the_least_interval(
     stream: Stream,
 ) -> None:
     first, second, third = Viewer(), Viewer(), Viewer()
@@ -121,7 +121,7 @@ async def test_key_frames_come_for_who_joins_and_no_more_often_than_bounded(
     stream.shared.join(third)
     stream.shared.key_frame()
     await stream.give(4)
-    await asyncio.sleep(KEY_PAUSE)
+    await asyncio.sleep(KEY_FRAME_INTERVAL)
     await stream.give(5, 6)
     assert [number for number, key in first.units if key] == [1, 5]
     assert second.units == [(3, False), (4, False), (5, True), (6, False)]
@@ -139,7 +139,7 @@ async def test_a_slow_encoder_skips_and_never_lags(stream: Stream) -> None:
     assert [number for number, _ in viewer.units] == [1, 4]
 
 
-async def test_what_it_is_is_told_before_anybody_looks_and_once_for_all_who_ask(
+async def test_description_is_made_once_before_the_first_viewer(
     stream: Stream,
 ) -> None:
     asking = [asyncio.create_task(stream.shared.first(5.0)) for _ in range(3)]
@@ -152,14 +152,14 @@ async def test_what_it_is_is_told_before_anybody_looks_and_once_for_all_who_ask(
     await stream.driver.rests()
 
 
-async def test_a_source_that_gives_nothing_is_told_in_time(stream: Stream) -> None:
+async def test_silent_source_is_reported_in_time(stream: Stream) -> None:
     before = asyncio.get_running_loop().time()
     with pytest.raises(FrameTimeoutError, match="scripted: no frame came within 5 s"):
         await stream.shared.first(5.0)
     assert asyncio.get_running_loop().time() - before == pytest.approx(5.0, abs=0.1)
 
 
-async def test_a_source_that_ends_takes_its_viewers_along_and_is_tried_again(
+async def test_ended_source_ends_its_viewers_and_is_reopened(
     stream: Stream,
 ) -> None:
     viewer = Viewer()
@@ -186,7 +186,7 @@ async def test_the_end_of_a_recording_is_an_end(stream: Stream) -> None:
     assert stream.driver.sink is not None
     stream.driver.sink.ended(None)
     await until(lambda: viewer.error)
-    assert str(viewer.error) == "scripted: it has ended"
+    assert str(viewer.error) == "scripted: the source has ended"
 
 
 async def test_one_damaged_frame_is_left_out_but_not_all(stream: Stream) -> None:
@@ -208,7 +208,7 @@ async def test_one_damaged_frame_is_left_out_but_not_all(stream: Stream) -> None
     assert isinstance(viewer.error, FrameFormatError)
 
 
-async def test_a_source_that_is_closed_is_told(no_leaks: None) -> None:
+async def test_closed_source_is_reported(no_leaks: None) -> None:
     _, source = scripted()
     async with Codecs(threads=1) as codecs:
         shared = SharedH264(source, codecs.h264_encoder())
@@ -217,7 +217,7 @@ async def test_a_source_that_is_closed_is_told(no_leaks: None) -> None:
         await shared.close()
 
 
-async def test_closing_answers_who_asks(stream: Stream) -> None:
+async def test_closing_answers_waiting_requests(stream: Stream) -> None:
     asking = asyncio.create_task(stream.shared.first(5.0))
     await stream.driver.streams()
     await stream.shared.close()

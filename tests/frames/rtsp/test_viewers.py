@@ -1,4 +1,4 @@
-"""Viewers get whole pictures, the newest ones, and none is held up for another."""
+"""Viewers get whole pictures, the newest ones, and no viewer delays another."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from smartcam.frames import Codecs, RtspServer
 from smartcam.frames._streaming.rtsp.session import (
     CLOCK,
     REPORT_INTERVAL,
-    TIMEOUT,
+    SESSION_TIMEOUT,
 )
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.inside import (
-    KEY_PAUSE,
+    KEY_FRAME_INTERVAL,
     LINGER,
     SECONDS_FROM_1900_TO_1970,
     STALL_TIMEOUT,
@@ -52,14 +52,14 @@ LARGE, SMALL = (640, 480), (256, 64)
 
 
 def noise(number: int, size: tuple[int, int] = LARGE) -> Frame:
-    """Return a picture that no codec makes small."""
+    """Return a picture of noise, which no codec makes small."""
     picture = np.random.default_rng(number).integers(0, 255, size[::-1], np.uint8)
     write_stamp(picture, number, number)
     return frame_of(picture, "Mono8", number)
 
 
 class Stage:
-    """A server, and its device that a test has give frames."""
+    """A server whose device gives the frames of a test."""
 
     def __init__(self, driver: ScriptedDriver, server: RtspServer, codecs: Codecs) -> None:
         self.driver, self.server, self.codecs = driver, server, codecs
@@ -69,7 +69,7 @@ class Stage:
         return self.server.statistics()["left"]
 
     async def give(self, *frames: Frame) -> None:
-        """Give frames, each when the one before it was encoded."""
+        """Give frames, each after the encoding of the last one."""
         await self.driver.streams()
         for frame in frames:
             before = self.counts.encoded
@@ -108,7 +108,7 @@ async def seen(client: Client, watcher: Watcher) -> int:
 
 
 class Ports:
-    """A client's two ports, read by a test."""
+    """The two UDP ports of a client."""
 
     def __init__(self) -> None:
         self.sockets = port_pair("127.0.0.1", socket.AF_INET)
@@ -184,7 +184,7 @@ async def test_twenty_viewers_are_encoded_once(stage: Stage) -> None:
     assert (counts.encoded, counts.keys, counts.sent, counts.skipped) == (3, 1, 60, 0)
 
 
-async def test_who_does_not_read_skips_and_harms_nobody_and_comes_back_whole() -> None:
+async def test_viewer_that_does_not_read_skips_frames_and_resumes_whole() -> None:
     async with staged(crf=5) as stage:
         good, stalled = stage.watcher(LARGE), stage.watcher(LARGE)
         async with (
@@ -200,15 +200,15 @@ async def test_who_does_not_read_skips_and_harms_nobody_and_comes_back_whole() -
             assert stage.counts.skipped > 0
             sent = stage.counts.sent - 12
             got = [await seen(two, stalled) for _ in range(sent)]
-            assert got == list(range(1, sent + 1))  # none in between is missing
-            await asyncio.sleep(KEY_PAUSE)
+            assert got == list(range(1, sent + 1))  # no picture in between is missing
+            await asyncio.sleep(KEY_FRAME_INTERVAL)
             await stage.give(noise(20), noise(21))
             assert await seen(two, stalled) in (20, 21)  # Watcher decodes from a key frame only
             assert stalled.depacketizer.lost == 0
             assert good.numbers == list(range(1, 13))
 
 
-async def test_who_takes_nothing_is_cut_off() -> None:
+async def test_viewer_that_reads_nothing_is_disconnected() -> None:
     async with staged(crf=5) as stage:
         good = stage.watcher(LARGE)
         async with (
@@ -230,7 +230,7 @@ async def test_who_takes_nothing_is_cut_off() -> None:
             assert await two.ended()
 
 
-async def test_who_vanishes_harms_nobody(stage: Stage, ports: Ports) -> None:
+async def test_vanished_viewer_disturbs_no_other(stage: Stage, ports: Ports) -> None:
     watcher = stage.watcher()
     async with await Client.connect(stage.server) as one:
         await one.play()
@@ -249,7 +249,7 @@ async def test_who_vanishes_harms_nobody(stage: Stage, ports: Ports) -> None:
     await stage.driver.rests()
 
 
-async def test_a_camera_that_vanishes_is_told(stage: Stage, ports: Ports) -> None:
+async def test_vanished_camera_is_reported(stage: Stage, ports: Ports) -> None:
     async with (
         await Client.connect(stage.server) as one,
         await Client.connect(stage.server) as two,
@@ -270,7 +270,7 @@ async def test_a_camera_that_vanishes_is_told(stage: Stage, ports: Ports) -> Non
         assert stage.counts.viewers == 0
 
 
-async def test_reports_tell_what_a_timestamp_is_in_utc(stage: Stage) -> None:
+async def test_reports_map_timestamps_to_utc(stage: Stage) -> None:
     async with await Client.connect(stage.server) as client:
         await client.play()
         await stage.show(1)
@@ -291,16 +291,16 @@ async def test_reports_tell_what_a_timestamp_is_in_utc(stage: Stage) -> None:
         assert a.packets >= 1
 
 
-async def test_a_viewer_over_udp_has_to_be_heard(stage: Stage, ports: Ports) -> None:
+async def test_udp_viewer_has_to_send_reports(stage: Stage, ports: Ports) -> None:
     report = compound(ReceiverReport(1), SourceDescription(1, "x"))
     async with await Client.connect(stage.server) as client:
         await client.play(ports.transport)
         control = int(client.transport.partition("server_port=")[2].split(";")[0].split("-")[1])
-        await asyncio.sleep(TIMEOUT - 5)
+        await asyncio.sleep(SESSION_TIMEOUT - 5)
         ports.sockets[1].sendto(report, ("127.0.0.1", control))
-        await asyncio.sleep(TIMEOUT - 5)
+        await asyncio.sleep(SESSION_TIMEOUT - 5)
         assert (await client.ask("GET_PARAMETER")).status == 200
-        await asyncio.sleep(TIMEOUT - 5)
+        await asyncio.sleep(SESSION_TIMEOUT - 5)
         ports.sockets[1].sendto(b"no report", ("127.0.0.1", control))
         assert stage.counts.viewers == 1
         await asyncio.sleep(10)
@@ -308,24 +308,24 @@ async def test_a_viewer_over_udp_has_to_be_heard(stage: Stage, ports: Ports) -> 
         assert await client.ended()
 
 
-async def test_a_viewer_over_the_connection_that_takes_pictures_need_say_nothing(
+async def test_tcp_viewer_that_reads_pictures_need_send_nothing(
     stage: Stage,
 ) -> None:
     async with await Client.connect(stage.server) as client:
         await client.play()
-        await asyncio.sleep(3 * TIMEOUT)
+        await asyncio.sleep(3 * SESSION_TIMEOUT)
         await client.ask("PAUSE")
-        await asyncio.sleep(TIMEOUT + 2)
+        await asyncio.sleep(SESSION_TIMEOUT + 2)
         assert await client.ended()
 
 
-async def test_a_session_that_nobody_uses_ends_alone(stage: Stage) -> None:
+async def test_unused_session_ends(stage: Stage) -> None:
     watcher = stage.watcher()
     async with await Client.connect(stage.server) as client:
         await client.set_up("RTP/AVP/TCP;unicast;interleaved=2-3")
         client.session = ""
         await client.play()
-        await asyncio.sleep(TIMEOUT + 2)
+        await asyncio.sleep(SESSION_TIMEOUT + 2)
         assert (stage.counts.viewers, stage.counts.silent) == (1, 1)
         await stage.show(1)
         assert await seen(client, watcher) == 1
@@ -337,19 +337,19 @@ async def test_a_report_on_a_channel_counts_and_may_ask_for_a_key_frame(stage: S
         await client.play()
         await stage.show(1)
         assert await seen(client, watcher) == 1
-        await asyncio.sleep(KEY_PAUSE)
+        await asyncio.sleep(KEY_FRAME_INTERVAL)
         assert watcher.depacketizer is not None
         lost = PictureLost(1, int(client.transport.partition("ssrc=")[2][:8], 16))
         data = compound(ReceiverReport(1), lost)
         client.writer.write(b"$\1" + len(data).to_bytes(2, "big") + data)
-        client.writer.write(b"$\1\0\4none$\5\0\1x")  # what is none is left
+        client.writer.write(b"$\1\0\4none$\5\0\1x")  # invalid packets are ignored
         assert (await client.ask("OPTIONS")).status == 200
         await stage.show(2)
         assert stage.counts.keys == 2
 
 
 class Full:
-    """A socket that has no room for some time."""
+    """A socket whose buffer is full for some time."""
 
     def __init__(self, real: socket.socket, room: int) -> None:
         self._real, self.room = real, room
@@ -364,7 +364,7 @@ class Full:
         return self._real.sendto(data, to)
 
 
-async def test_datagrams_that_have_no_room_are_dropped_and_it_begins_anew(
+async def test_datagrams_beyond_the_buffer_are_dropped_and_a_key_frame_follows(
     ports: Ports, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Full] = []
@@ -384,7 +384,7 @@ async def test_datagrams_that_have_no_room_are_dropped_and_it_begins_anew(
             assert await ports.seen(watcher) == 1
             await stage.give(noise(2, SMALL), noise(3, SMALL))
             made[0].room = 1_000_000
-            await asyncio.sleep(KEY_PAUSE)
+            await asyncio.sleep(KEY_FRAME_INTERVAL)
             await stage.give(noise(4, SMALL))
             watcher.decoder.lost()
             assert await ports.seen(watcher) == 4
@@ -392,7 +392,7 @@ async def test_datagrams_that_have_no_room_are_dropped_and_it_begins_anew(
             assert (stage.counts.sent, stage.counts.skipped) == (2, 2)
 
 
-def test_a_report_of_another_host_counts_not() -> None:
+def test_report_of_another_host_does_not_count() -> None:
     heard: list[bytes] = []
     port = delivery._ControlPort("192.0.2.1", heard.append)
     port.datagram_received(b"theirs", ("192.0.2.2", 5001))

@@ -1,1 +1,1 @@
-"""The RTSP client against cameras made by hand, and other people's servers."""
+"""Tests of the RTSP client with emulated cameras and other projects' servers."""

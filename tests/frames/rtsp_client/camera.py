@@ -1,4 +1,4 @@
-"""A camera that answers by RTSP as it is told, made by hand; it shares nothing with the client."""
+"""An emulated RTSP camera whose answers a test chooses; it shares no code with the client."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class Camera:
 
     Attributes:
         answers: bytes instead of the usual answer, by method; None: silence.
-        packets: what it sends of each frame, behind the head of a channel.
-        before: what it does before it answers a method.
+        packets: function that returns the packets of a frame, without the head of a channel.
+        before: actions before the answer to a method.
     """
 
     frames: list[bytes]
@@ -287,7 +287,7 @@ def jpeg_packets(data: bytes, sequence: int, stamp: int) -> list[bytes]:
 
 
 def sender_report(utc: int, stamp: int) -> bytes:
-    """Return RTCP that tells a time, in seconds since 1970, of a timestamp (RFC 3550, 6.4.1)."""
+    """Return RTCP with the time, seconds since 1970, of a timestamp (RFC 3550, 6.4.1)."""
     return struct.pack("!BBHIIIIII", 0x80, 200, 6, 7, 2_208_988_800 + utc, 0, stamp, 1, 1)
 
 

@@ -1,4 +1,4 @@
-"""RTSP servers that do wrong: each ends with an error that says why, and none keeps us waiting."""
+"""Faulty RTSP servers: each ends with an error that names the cause, in time."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("no_leaks")]
 
 LIMIT = 20.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 SHORT, LONG = 0.8, 10.0
-"""Timeouts, in seconds: of silent servers, and of those whose answer ends it sooner."""
+"""Timeouts, in seconds: of silent servers, and of servers whose answer ends the test sooner."""
 
 WHO = "me:s3cret@"
 
@@ -48,19 +48,19 @@ def encoded() -> list[bytes]:
 
 
 class Bad(NamedTuple):
-    """A server that does wrong.
+    """A faulty server.
 
     Attributes:
-        said: part of the error's text.
-        do: makes a camera this server.
-        timeout: seconds, as the URL has them.
+        message: part of the error's text.
+        do: function that makes a camera this server.
+        timeout: seconds in the URL.
         user: user and password of the URL.
         how: further parameters of the URL.
         error: type of the error.
         scheme: scheme of the URL.
     """
 
-    said: str
+    message: str
     do: Callable[[Camera], None]
     timeout: float = LONG
     user: str = ""
@@ -69,18 +69,18 @@ class Bad(NamedTuple):
     scheme: str = "rtsp"
 
 
-def answers(**said: Any) -> Callable[[Camera], None]:
-    """Have methods answered so: by a status, by bytes, or by silence (None)."""
-    return lambda camera: camera.answers.update(said)
+def answers(**given: Any) -> Callable[[Camera], None]:
+    """Answer methods by a status, by bytes, or not at all (None)."""
+    return lambda camera: camera.answers.update(given)
 
 
 def describes(text: str) -> Callable[[Camera], None]:
-    """Have the streams described so."""
+    """Describe the streams by a text."""
     return lambda camera: setattr(camera, "sdp", text)
 
 
 def first(method: str, do: Callable[[Session], Any]) -> Callable[[Camera], None]:
-    """Have something done before a method is answered; without end it is never answered."""
+    """Run an action before the answer to a method; without ``end`` no answer follows."""
 
     async def before(session: Session) -> None:
         made = do(session)
@@ -91,12 +91,12 @@ def first(method: str, do: Callable[[Session], Any]) -> Callable[[Camera], None]
 
 
 def sends(change: Callable[[int, list[bytes]], list[bytes]]) -> Callable[[Camera], None]:
-    """Have other packets sent instead of a picture's."""
+    """Send other packets instead of a picture's."""
     return lambda camera: setattr(camera, "change", change)
 
 
 def while_playing(do: Callable[[Session], bool]) -> Callable[[Camera], None]:
-    """Have something done after 20 pictures of the second connection, which is the reader's."""
+    """Run an action after 20 pictures of the second connection, the reader's."""
 
     async def ends(session: Session, number: int) -> bool:
         return number == 20 and session.camera.connections == 2 and do(session)
@@ -139,7 +139,7 @@ def forget(session: Session) -> bool:
 
 
 def drip(begin: bytes, again: bytes, every: float = 0.02) -> Callable[[Session], Any]:
-    """Send a beginning and then a few bytes again and again."""
+    """Send a beginning and then a few bytes repeatedly."""
 
     async def go_on(session: Session) -> None:
         with suppress(ConnectionError):
@@ -156,19 +156,19 @@ def challenges(shown: str) -> Callable[[Camera], None]:
     """Refuse each request with a challenge, a new one each time."""
 
     def refuse(request: Request) -> bytes:
-        said = shown.replace("NUMBER", request.cseq)
-        return answered(request, "401 Unauthorized", f"WWW-Authenticate: {said}")
+        challenge = shown.replace("NUMBER", request.cseq)
+        return answered(request, "401 Unauthorized", f"WWW-Authenticate: {challenge}")
 
     return answers(OPTIONS=refuse, DESCRIBE=refuse)
 
 
 def to(place: str) -> Callable[[Camera], None]:
-    """Send each request elsewhere."""
+    """Redirect each request."""
     return answers(OPTIONS=lambda one: answered(one, "302 Moved", f"Location: {place}"))
 
 
 def set_up_as(transport: str) -> Callable[[Camera], None]:
-    """Answer SETUP with another transport than the one that was asked for."""
+    """Answer SETUP with another transport than the requested one."""
     return answers(
         SETUP=lambda one: answered(one, "200 OK", "Session: 1", f"Transport: {transport}")
     )
@@ -184,7 +184,7 @@ def other_type(_: int, packets: list[bytes]) -> list[bytes]:
 
 
 def no_marker(_: int, packets: list[bytes]) -> list[bytes]:
-    """Return packets of which a picture never ends: no marker, and one time for all."""
+    """Return packets of a picture without an end: no marker, and one time for all."""
     return [one[:1] + bytes([one[1] & 0x7F]) + one[2:4] + bytes(4) + one[8:] for one in packets]
 
 
@@ -197,7 +197,7 @@ def garbage(number: int, packets: list[bytes]) -> list[bytes]:
 
 
 def rootless(camera: Camera) -> None:
-    """Send no picture that others do not go before."""
+    """Send only pictures that depend on earlier ones."""
     camera.frames = [one for one in camera.frames if len(units(one)) == 1]
     camera.frames = (camera.frames * COUNT)[:COUNT]
 
@@ -228,7 +228,7 @@ NO_PICTURE = "expected a whole picture, got none within"
 MANY_TRACKS = "v=0\r\n" + "m=audio 0 RTP/AVP 8\r\n" * 2000
 
 BAD: dict[str, Bad] = {
-    # it cannot be asked
+    # servers that do not answer
     "silent": Bad("an answer to OPTIONS, got none within", answers(OPTIONS=None), SHORT),
     "hangs up at once": Bad("server closed the connection", first("OPTIONS", hang_up)),
     "resets the connection": Bad("the connection is lost", first("DESCRIBE", reset)),
@@ -272,7 +272,7 @@ BAD: dict[str, Bad] = {
         "a body of 65536 bytes at most",
         answers(DESCRIBE=HEAD + b"Content-Length: 2000000000\r\n\r\n" + b"a=x\r\n" * 99),
     ),
-    # it refuses, or sends us away
+    # servers that refuse or redirect
     "does not know the stream": Bad("DESCRIBE: 404 Not Found", answers(DESCRIBE="404 Not Found")),
     "speaks a later version only": Bad(
         "DESCRIBE: 505 RTSP Version Not Supported",
@@ -305,7 +305,7 @@ BAD: dict[str, Bad] = {
     "redirects to no server": Bad(
         "expected a redirect to rtsp://HOST", to("http://[::"), how="&elsewhere=yes"
     ),
-    # its description, or its way, is none of ours
+    # servers with an unsupported description or transport
     "describes nothing": Bad("got 0 bytes without", answers(DESCRIBE=HEAD + b"\r\n")),
     "describes by a page": Bad("got 13 bytes without a stream", HTML),
     "describes by bytes of nothing": Bad("bytes without a stream", describes("\0\xff" * 3000)),
@@ -332,12 +332,12 @@ BAD: dict[str, Bad] = {
         "expected RTP/AVP/TCP;unicast, as it was asked for, got 'RTP/AVP'",
         set_up_as("RTP/AVP/UDP;unicast;client_port=5000-5001"),
     ),
-    # it goes silent
+    # servers that become silent
     "is silent after the description": Bad(
         "an answer to SETUP, got none within", answers(SETUP=None), SHORT
     ),
     "is silent after PLAY": Bad("an answer to PLAY, got none within", answers(PLAY=None), SHORT),
-    # it plays, and no picture comes of it
+    # servers that play without a picture
     "sends nothing": Bad(NO_PICTURE, sends(lambda *_: []), SHORT),
     "sends nothing by UDP": Bad(NO_PICTURE, sends(lambda *_: []), SHORT, how="&transport=udp"),
     "sends reports only": Bad(NO_PICTURE, reports_only, SHORT),
@@ -351,7 +351,7 @@ BAD: dict[str, Bad] = {
         r"the server ended the session (TEARDOWN)",
         first("PLAY", say(b"TEARDOWN * RTSP/1.0\r\nCSeq: 1\r\n\r\n")),
     ),
-    # it played
+    # servers that fail after pictures
     "hangs up": Bad("the server closed the connection", while_playing(hang_up)),
     "says goodbye": Bad("the server ended the stream (over", while_playing(tell_goodbye)),
     "ends the session": Bad(
@@ -371,28 +371,28 @@ BAD: dict[str, Bad] = {
 
 
 async def read_all(url: str) -> None:
-    """Read the pictures of a source as long as there are any."""
+    """Read all pictures of a source."""
     async with frames.open(url) as source:
         async for _ in source:
             pass
 
 
 @pytest.mark.parametrize("name", BAD)
-async def test_bad_server_is_told_in_time(encoded: list[bytes], name: str) -> None:
+async def test_bad_server_is_reported_in_time(encoded: list[bytes], name: str) -> None:
     bad, camera = BAD[name], Camera(encoded)
     bad.do(camera)
     loop = asyncio.get_running_loop()
     began = loop.time()
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"{bad.scheme}://{bad.user}{where}#timeout={bad.timeout}{bad.how}"
-        with pytest.raises(bad.error, match=re.escape(bad.said)) as got:
+        with pytest.raises(bad.error, match=re.escape(bad.message)) as got:
             await read_all(url)
     assert "s3cret" not in str(got.value)
     assert loop.time() - began < LIMIT
     assert len(camera.asked) < 20
 
 
-async def test_server_of_another_size_is_told(encoded: list[bytes]) -> None:
+async def test_server_of_another_size_is_reported(encoded: list[bytes]) -> None:
     camera = Camera(encoded)
     async with frames.Codecs(threads=1) as codecs:
         small = await codecs.h264_encoder().encode(frame_of(stamped(0, 256, 64), "Mono8"))
@@ -409,7 +409,7 @@ async def test_server_of_another_size_is_told(encoded: list[bytes]) -> None:
 
 @asynccontextmanager
 async def socket_that(listens: bool) -> AsyncIterator[str]:
-    """Give the address of a socket where nobody answers, or nobody takes a connection."""
+    """Give the address of a socket that does not answer, or accepts no connection."""
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
         if listens:
@@ -418,10 +418,10 @@ async def socket_that(listens: bool) -> AsyncIterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("listens", "said"),
+    ("listens", "message"),
     [(False, "cannot be read: Connection refused"), (True, "an answer to OPTIONS, got none")],
 )
-async def test_server_that_is_not_there_or_takes_nobody_is_told(listens: bool, said: str) -> None:
+async def test_missing_or_full_server_is_reported(listens: bool, message: str) -> None:
     async with asyncio.timeout(LIMIT), socket_that(listens) as where:
-        with pytest.raises(FrameSourceError, match=said):
+        with pytest.raises(FrameSourceError, match=message):
             await read_all(f"rtsp://{where}/cam#timeout={SHORT}")

@@ -1,4 +1,4 @@
-"""Cameras that do odd things give all their pictures; test_bad_servers has worse ones."""
+"""Unusual cameras give all their pictures; test_bad_servers has faulty ones."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("no_leaks")]
 
 LIMIT = 30.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 WHO = "me:s3cret@"
 
@@ -63,7 +63,7 @@ def camera(encoded: list[bytes]) -> Camera:
 
 
 async def read(camera: Camera, count: int = 12, user: str = "", how: str = "") -> list[Frame]:
-    """Return frames, each of which is one that was drawn."""
+    """Check that frames are drawn ones, and return them."""
     got: list[Frame] = []
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"rtsp://{user}{where}#timeout=3{how}"
@@ -86,7 +86,7 @@ def in_a_row(got: list[Frame]) -> bool:
     return all((after - before) % COUNT == 1 for before, after in itertools.pairwise(found))
 
 
-# what cameras are like
+# kinds of cameras
 
 
 def sdp(old: str, new: str) -> dict[str, Any]:
@@ -147,10 +147,10 @@ async def test_an_odd_camera_gives_all_its_pictures(camera: Camera, name: str, h
     assert "TEARDOWN" in camera.methods
 
 
-async def test_a_camera_may_send_from_another_address_that_its_server_says(
+async def test_camera_may_send_from_the_address_in_its_answer(
     camera: Camera,
 ) -> None:
-    camera.sender = camera.source = "127.0.0.2"  # as behind a recorder
+    camera.sender = camera.source = "127.0.0.2"  # like a camera behind a recorder
     assert in_a_row(await read(camera, how="&transport=udp"))
     camera.source = ""
     with pytest.raises(FrameSourceError, match="expected a whole picture, got none"):
@@ -158,7 +158,7 @@ async def test_a_camera_may_send_from_another_address_that_its_server_says(
 
 
 @pytest.mark.parametrize("between", [" \r\n ", '"'])
-async def test_parameters_may_stand_in_several_lines(encoded: list[bytes], between: str) -> None:
+async def test_parameters_may_be_in_several_lines(encoded: list[bytes], between: str) -> None:
     camera = Camera([without_sets(one) for one in encoded])
     sets = sprop(encoded[0])
     if between == '"':
@@ -169,7 +169,7 @@ async def test_parameters_may_stand_in_several_lines(encoded: list[bytes], betwe
     assert in_a_row(await read(camera))
 
 
-async def test_parameters_may_stand_in_the_description_alone(encoded: list[bytes]) -> None:
+async def test_parameters_may_be_in_the_description_alone(encoded: list[bytes]) -> None:
     camera = Camera([without_sets(one) for one in encoded])
     camera.sdp = SDP.replace(
         "packetization-mode=1", f"packetization-mode=1; sprop-parameter-sets={sprop(encoded[0])}"
@@ -194,14 +194,14 @@ async def test_h265_may_have_its_parameters_in_the_description_alone() -> None:
     frames_made = h265_pictures()
     sets = {one[0] >> 1: one for one in units(frames_made[0]) if one[0] >> 1 in (32, 33, 34)}
     names = dict(zip((32, 33, 34), ("sprop-vps", "sprop-sps", "sprop-pps"), strict=True))
-    said = ";".join(
+    parameters = ";".join(
         f"{name}={base64.b64encode(sets[kind]).decode()}" for kind, name in names.items()
     )
     bare = [
         b"".join(b"\0\0\0\1" + one for one in units(data) if one[0] >> 1 < 32)
         for data in frames_made
     ]
-    sdp = H265.replace("a=control:track1", f"a=fmtp:96 {said}\r\na=control:track1")
+    sdp = H265.replace("a=control:track1", f"a=fmtp:96 {parameters}\r\na=control:track1")
     assert in_a_row(await read(Camera(bare, sdp, cut=h265_packets)))
 
 
@@ -346,7 +346,7 @@ async def test_bytes_between_the_packets_are_skipped(camera: Camera) -> None:
     assert in_a_row(await read(camera))
 
 
-async def test_a_server_may_ask_something(camera: Camera) -> None:
+async def test_server_may_send_a_request(camera: Camera) -> None:
     async def ask(session: Session, number: int) -> bool:
         if number == 3:
             session.writer.write(b"OPTIONS * RTSP/1.0\r\nCSeq: 9\r\n\r\n")
@@ -354,11 +354,11 @@ async def test_a_server_may_ask_something(camera: Camera) -> None:
 
     camera.ends = ask
     assert in_a_row(await read(camera))
-    (said,) = {(one.url, one.cseq) for one in camera.asked if one.method == "RTSP/1.0"}
-    assert said == ("200", "9")
+    (answer,) = {(one.url, one.cseq) for one in camera.asked if one.method == "RTSP/1.0"}
+    assert answer == ("200", "9")
 
 
-async def test_packets_on_channels_that_were_not_told(camera: Camera) -> None:
+async def test_packets_on_unknown_channels(camera: Camera) -> None:
     camera.answers["SETUP"] = lambda one: (
         f"RTSP/1.0 200 OK\r\nCSeq: {one.cseq}\r\nSession: 1\r\n"
         "Transport: RTP/AVP/TCP;unicast;interleaved=4-5\r\n\r\n"
@@ -382,15 +382,15 @@ CHALLENGES = {
 
 
 @pytest.mark.parametrize("kind", CHALLENGES)
-async def test_a_password_is_shown_as_it_is_asked_for(camera: Camera, kind: str) -> None:
+async def test_password_is_sent_in_the_requested_way(camera: Camera, kind: str) -> None:
     def gate(request: Request) -> Any:
-        said = request.headers.get("authorization", "")
+        given = request.headers.get("authorization", "")
         hashed = "sha256" if kind in ("sha", "both") else "md5"
         if kind == "basic":
-            ok = said == "Basic bWU6czNjcmV0"
+            ok = given == "Basic bWU6czNjcmV0"
         else:
-            ok = said.startswith("Digest") and digest(request, "me", "s3cret", hashed)
-            ok |= kind == "digest" and said.startswith('Digest username="me", realm="a \\"b\\""')
+            ok = given.startswith("Digest") and digest(request, "me", "s3cret", hashed)
+            ok |= kind == "digest" and given.startswith('Digest username="me", realm="a \\"b\\""')
         if ok:
             return ""
         shown = "".join(f"WWW-Authenticate: {one}\r\n" for one in CHALLENGES[kind])
@@ -417,7 +417,7 @@ async def test_a_nonce_may_be_new_for_each_request(camera: Camera) -> None:
     assert in_a_row(await read(camera, user=WHO))
 
 
-async def test_another_host_is_gone_to_on_request_and_gets_no_password(
+async def test_redirect_to_another_host_gets_no_password(
     camera: Camera, encoded: list[bytes]
 ) -> None:
     other = Camera(encoded)
@@ -438,7 +438,7 @@ async def test_another_host_is_gone_to_on_request_and_gets_no_password(
 # while it plays
 
 
-async def test_a_session_is_kept_alive_and_a_refusal_changes_the_way(camera: Camera) -> None:
+async def test_session_is_kept_alive_by_another_method_after_a_refusal(camera: Camera) -> None:
     camera.session = "1;timeout=1"
     camera.answers["GET_PARAMETER"] = "405 Method Not Allowed"
     got = await read(camera, 150)
@@ -447,7 +447,7 @@ async def test_a_session_is_kept_alive_and_a_refusal_changes_the_way(camera: Cam
     assert asked[:2] == ["GET_PARAMETER", "OPTIONS"]
 
 
-async def test_keeping_it_alive_may_stay_without_an_answer(camera: Camera) -> None:
+async def test_keep_alive_request_may_have_no_answer(camera: Camera) -> None:
     camera.session = "1;timeout=1"
     camera.answers["GET_PARAMETER"] = None
     assert in_a_row(await read(camera, 200))
@@ -488,7 +488,7 @@ async def test_no_picture_is_broken_and_each_loss_is_counted(
     assert len(found) == 40
 
 
-async def test_times_follow_the_camera_s_clock_as_soon_as_it_tells(camera: Camera) -> None:
+async def test_times_follow_the_camera_s_clock_after_its_first_report(camera: Camera) -> None:
     async def report(session: Session, number: int) -> bool:
         if number == 15:
             stamp = number * 3000 + (1 << 32) - 30_000 & 0xFFFFFFFF
@@ -509,7 +509,7 @@ async def test_times_follow_the_camera_s_clock_as_soon_as_it_tells(camera: Camer
 
 
 @pytest.mark.parametrize(
-    ("way", "said"),
+    ("way", "message"),
     [
         ("closes", "the server closed the connection"),
         ("says goodbye", "the server ended the stream .over."),
@@ -518,8 +518,8 @@ async def test_times_follow_the_camera_s_clock_as_soon_as_it_tells(camera: Camer
         ("forgets the session", "454 Session Not Found"),
     ],
 )
-async def test_a_stream_that_ends_says_why_and_the_next_reader_connects_anew(
-    camera: Camera, way: str, said: str
+async def test_ended_stream_reports_its_cause_and_the_next_reader_reconnects(
+    camera: Camera, way: str, message: str
 ) -> None:
     async def end(session: Session, number: int) -> bool:
         if number != 20 or camera.connections != 2:
@@ -542,14 +542,14 @@ async def test_a_stream_that_ends_says_why_and_the_next_reader_connects_anew(
         camera_on(camera) as where,
         frames.open(f"rtsp://{where}#timeout=3") as source,
     ):
-        with pytest.raises(FrameSourceError, match=said):
+        with pytest.raises(FrameSourceError, match=message):
             async for _ in source:
                 pass
         assert numbers([await source.newest()])
         assert camera.connections == 3
 
 
-async def test_cancelled_anywhere_it_leaves_nothing(camera: Camera) -> None:
+async def test_cancellation_anywhere_leaves_nothing_open(camera: Camera) -> None:
     async with camera_on(camera) as where:
         for steps in (0, 1, 3, 5, 8, 13, 21, 34, 55):
             source = frames.open(f"rtsp://{where}")

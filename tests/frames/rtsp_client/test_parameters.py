@@ -1,4 +1,4 @@
-"""A camera's parameters by RTSP as features, and what a camera that has none says."""
+"""A camera's parameters by RTSP are features; a camera may have none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("no_leaks")]
 
 LIMIT = 30.0
-"""Seconds that only a failure reaches."""
+"""Seconds after which a test fails."""
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +36,12 @@ def encoded() -> list[bytes]:
 
 
 class Parameters:
-    """Answers as RFC 2326, sections 10.8, 10.9 and 11.3, have them.
+    """Answers by RFC 2326, sections 10.8, 10.9 and 11.3.
 
     Args:
         known: values by names.
         read_only: names that cannot be set.
-        in_session: whether it answers in a session alone.
+        in_session: whether requests need a session.
     """
 
     def __init__(self, known: dict[str, str], *read_only: str, in_session: bool = False) -> None:
@@ -103,22 +103,24 @@ async def test_a_parameter_is_read_and_set(
         described = await features["serial"].describe()
         assert (described.value, described.kind, described.access) == ("A17 b", "string", "rw")
         if playing:
-            assert camera.connections == connections  # the one that plays
+            assert camera.connections == connections  # the playing session
             assert (await anext(reader)).lost == 0
         reader.close()
     asked = [one for one in camera.asked if one.method.endswith("_PARAMETER")]
     assert all(one.body.endswith("\r\n") for one in asked)
 
 
-async def test_what_a_camera_refuses_is_told(encoded: list[bytes]) -> None:
+async def test_refusals_of_a_camera_are_errors(encoded: list[bytes]) -> None:
     camera = with_parameters(encoded)
     async with opened(camera) as source:
         features = source.features
-        with pytest.raises(FrameFeatureError, match=r"'hue': it has no such parameter.*451"):
+        with pytest.raises(FrameFeatureError, match=r"'hue': there is no such parameter.*451"):
             await features["hue"].get()
         with pytest.raises(FrameFeatureError, match=r"'serial': it can only be read.*458"):
             await features["serial"].set("B")
-        with pytest.raises(FrameFeatureError, match=r"'zoom': it does not take that value.*457"):
+        with pytest.raises(
+            FrameFeatureError, match=r"'zoom': the camera does not accept the value.*457"
+        ):
             await features["zoom"].set(11)
         asked = len(camera.asked)
         for name in ("a b", "a:b", "a\r\nzoom", "\xe9"):
@@ -132,7 +134,7 @@ async def test_what_a_camera_refuses_is_told(encoded: list[bytes]) -> None:
         with pytest.raises(UnsupportedError, match="cannot execute a command such as Reboot"):
             await features["Reboot"].execute()
         assert len(camera.asked) == asked
-        assert not source.has_features  # a list of them is not shown
+        assert not source.has_features  # the list of values is not shown
 
 
 @pytest.mark.parametrize(
@@ -140,12 +142,12 @@ async def test_what_a_camera_refuses_is_told(encoded: list[bytes]) -> None:
     [
         ("405 Method Not Allowed", UnsupportedError, "no such request: GET_PARAMETER: 405"),
         ("501 Not Implemented", UnsupportedError, "no such request: GET_PARAMETER: 501"),
-        ("", FrameFeatureError, "got none: it takes the request for a sign"),
+        ("", FrameFeatureError, "got none: the camera only takes the request"),
         ("403 Forbidden", FrameFeatureError, "it refuses that: GET_PARAMETER: 403 Forbidden"),
         (None, FrameTimeoutError, "an answer to GET_PARAMETER, got none within 1 s"),
     ],
 )
-async def test_a_camera_without_parameters_says_so(
+async def test_camera_without_parameters_reports_it(
     encoded: list[bytes], answer: Any, kind: type[Exception], text: str
 ) -> None:
     camera = Camera(encoded, answers={"GET_PARAMETER": answer})
@@ -171,7 +173,7 @@ async def test_an_answer_with_other_lines_gives_no_wrong_value(encoded: list[byt
             await source.features["focus"].get()
 
 
-async def test_a_value_that_cannot_be_read_back_is_the_one_given(encoded: list[bytes]) -> None:
+async def test_value_that_cannot_be_read_back_is_returned_as_given(encoded: list[bytes]) -> None:
     asked = Parameters({"zoom": "1"})
     camera = Camera(
         encoded, answers={"SET_PARAMETER": asked, "GET_PARAMETER": "501 Not Implemented"}
@@ -181,7 +183,7 @@ async def test_a_value_that_cannot_be_read_back_is_the_one_given(encoded: list[b
     assert asked.known == {"zoom": "4"}
 
 
-async def test_a_password_is_shown_for_a_parameter_too(encoded: list[bytes]) -> None:
+async def test_password_is_sent_for_a_parameter_too(encoded: list[bytes]) -> None:
     camera = with_parameters(encoded)
     asked, secret = camera.answers["GET_PARAMETER"], []
 
@@ -224,10 +226,10 @@ async def test_our_own_server_has_no_parameters() -> None:
         frames.open(server.url("left")) as source,
         source.reader() as reader,
     ):
-        for _ in range(2):  # with a session of its own, and in the one that plays
-            with pytest.raises(FrameFeatureError, match=r"'gain': it has no such parameter.*451"):
+        for _ in range(2):  # with an own session, and in the playing one
+            with pytest.raises(FrameFeatureError, match=r"'gain': there is no such parameter.*451"):
                 await source.features["gain"].get()
-            with pytest.raises(FrameFeatureError, match=r"'gain': it has no such parameter.*451"):
+            with pytest.raises(FrameFeatureError, match=r"'gain': there is no such parameter.*451"):
                 await source.features["gain"].set(1.5)
             await anext(reader)
 

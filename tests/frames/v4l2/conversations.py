@@ -1,8 +1,8 @@
-"""Conversations with the kernel's driver: recorded in a machine that has one, and replayed here.
+"""Record conversations with the kernel's driver on a machine that has one, and replay them here.
 
-A table has every answer once, and for each scenario which answers came, in their order. A replay
-demands the same questions in the same order. How many pictures a reader has taken when it ends is
-a matter of time: pictures that are left over are skipped, and where none is left there is none.
+A table has every answer once, and for each scenario the indices of its answers in their order. A
+replay demands the same questions in the same order. The number of pictures that a reader gets
+before its end depends on time: a replay skips pictures that are left over.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ STREAM = ("DQBUF", "QBUF")
 
 
 class Answer(NamedTuple):
-    """A question to the kernel, and its answer."""
+    """A call of the kernel, and the answer."""
 
     asked: str
     """``open``, ``close``, or an ioctl's name."""
     given: str
-    """The argument before, in hexadecimal digits without zeros at the end; a path."""
+    """The argument before the call, in hexadecimal digits without zeros at the end; or a path."""
     error: int
     """errno, or 0."""
     got: str
-    """The argument afterwards."""
+    """The argument after the call."""
     now: float
-    """Of a picture that was taken: when, seconds of the monotonic clock."""
+    """Time of a dequeued picture, seconds of the monotonic clock."""
 
 
 def digits(data: bytes | bytearray) -> str:
@@ -42,16 +42,16 @@ def digits(data: bytes | bytearray) -> str:
 
 
 class Recorder:
-    """Passes all on to the system, and writes down what came."""
+    """Passes calls on to the system, and records the answers."""
 
     def __init__(self) -> None:
         self.real = {name: getattr(system, name) for name in WRAPPED}
         self.answers: dict[Answer, int] = {}
         self.scenarios: dict[str, list[int]] = {}
-        self.told: list[int] = []
+        self.order: list[int] = []
 
     def begin(self, scenario: str) -> None:
-        self.told = self.scenarios[scenario] = []
+        self.order = self.scenarios[scenario] = []
 
     def table(self) -> str:
         """Return the table as JSON, an answer a line."""
@@ -61,7 +61,7 @@ class Recorder:
         return f'{{"nodes": {nodes},\n"answers": [\n{rows}\n],\n"scenarios": {scenarios}\n}}\n'
 
     def _tell(self, *what: Any) -> None:
-        self.told.append(self.answers.setdefault(Answer(*what), len(self.answers)))
+        self.order.append(self.answers.setdefault(Answer(*what), len(self.answers)))
 
     def open(self, path: str) -> int:
         try:
@@ -101,7 +101,7 @@ class Recorder:
 
 
 class Pages:
-    """A buffer; the driver writes other bytes into it when it has it back."""
+    """A buffer, which the driver overwrites as soon as it owns the buffer again."""
 
     def __init__(self, length: int) -> None:
         self.data = bytearray(length)
@@ -116,11 +116,7 @@ class Pages:
 
 
 class Replay:
-    """Answers as the kernel did, in the system's stead.
-
-    Args:
-        scenario: whose answers.
-    """
+    """Answers as the kernel did, in the system's stead."""
 
     def __init__(self, scenario: str) -> None:
         table = json.loads(TABLE.read_text())
@@ -164,7 +160,7 @@ class Replay:
             if request.name == "DQBUF":
                 self._time = answer.now
                 self._write(argument)
-                self._given = True  # the next one is there when the loop looks again
+                self._given = True  # the next picture is ready at the loop's next poll
                 asyncio.get_running_loop().call_soon(self._let)
             if request.name == "STREAMON":
                 self._streaming = device
@@ -195,7 +191,7 @@ class Replay:
     def _next(self, asked: str) -> Answer:
         with self._lock:
             while self.left and self.left[-1].asked != asked and self.left[-1].asked in STREAM:
-                self.left.pop()  # a picture that nobody waited for
+                self.left.pop()  # a picture that is left over
             assert self.left, f"{asked} is one question too many"
             answer = self.left.pop()
             assert answer.asked == asked, (answer, asked)
@@ -207,7 +203,7 @@ class Replay:
             raise OSError(answer.error, os.strerror(answer.error))
 
     def _show_whether_ready(self) -> None:
-        """Make the descriptor readable while a picture, or an error, is there."""
+        """Make the descriptor readable while a picture or an error is ready."""
         if self._streaming not in self.devices:
             return
         if self._picture_is_next() or (self.left and self.left[-1].asked == "QBUF"):

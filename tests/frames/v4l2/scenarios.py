@@ -1,4 +1,4 @@
-"""Programs that use a camera: run with the kernel's vivid and recorded, and run again."""
+"""Programs that use a camera: recorded with the kernel's vivid, and replayed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ URL = "v4l2:///dev/video0?format=YUYV&size=320x180&fps=25"
 
 
 FEW = {abi.fourcc(one): FORMATS[abi.fourcc(one)] for one in ("GREY", "YUYV")}
-"""Formats that are counted up when cameras are looked for: all would make a long table."""
+"""Formats that the search for cameras enumerates: all would make a long table."""
 
 CONTROLS = {
     "timestamp_source": 0xF0F018,
@@ -28,7 +28,7 @@ CONTROLS = {
     "inject_vidioc_streamon_error": 0xF0F045,
     "inject_fatal_streaming_error": 0xF0F046,
 }
-"""Some of vivid's, and their numbers."""
+"""Some controls of vivid, and their numbers."""
 
 
 def press(name: str, value: int = 1) -> None:
@@ -45,7 +45,7 @@ async def take(reader: FrameReader, count: int) -> list[Frame]:
 
 
 async def refusal(awaited: Awaitable[object]) -> FrameSourceError:
-    """Return the error that is expected."""
+    """Return the expected error."""
     try:
         await awaited
     except FrameSourceError as exc:
@@ -90,7 +90,7 @@ async def losses() -> tuple[list[Frame], int]:
 
 
 async def broken(name: str) -> tuple[FrameSourceError, list[Frame]]:
-    """Return how a stream ends, and what comes when it is begun anew."""
+    """Return the end of a stream, and the frames after a restart."""
     async with smartcam.frames.open(URL) as source:
         async with source.reader() as reader:
             await take(reader, 2)

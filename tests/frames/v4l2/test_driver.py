@@ -1,4 +1,4 @@
-"""The driver with the answers of a real kernel; tests/frames/vivid has them anew, with pictures."""
+"""Test the driver with recorded answers of a kernel; tests/frames/vivid uses a real one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Begin = Callable[[Replay], None]
 
 @pytest.fixture
 def begin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
-    """Have a replay answer in the system's stead; devices and buffers are to be given back."""
+    """Replay answers in the system's stead; check that devices and buffers are released."""
     played: list[Replay] = []
 
     def put(replay: Replay) -> None:
@@ -40,7 +40,7 @@ def begin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
 
 @pytest.fixture
 def play(begin: Begin) -> Player:
-    """Have the system answer as it did."""
+    """Replay the system's answers."""
 
     def play_scenario(scenario: str) -> Replay:
         replay = Replay(scenario)
@@ -51,11 +51,11 @@ def play(begin: Begin) -> Player:
 
 
 def whole(replay: Replay) -> None:
-    """See that all was asked that was asked of the kernel, but for pictures."""
+    """Check that all recorded calls were made, except for pictures."""
     assert [one for one in replay.left if one.asked not in ("DQBUF", "QBUF")] == []
 
 
-async def test_a_stream_is_whole_numbered_and_stamped_as_the_kernel_did(play: Player) -> None:
+async def test_stream_is_whole_with_the_kernel_s_numbers_and_times(play: Player) -> None:
     replay = play("stream")
     frames = await scenarios.stream()
     whole(replay)
@@ -63,7 +63,7 @@ async def test_a_stream_is_whole_numbered_and_stamped_as_the_kernel_did(play: Pl
     for one in frames:
         assert (one.width, one.height, one.stride, one.lost) == (320, 180, 640, 0)
         assert one.format.name == "YUV422_8"
-        # of the right buffer, and not of what the driver wrote into it afterwards
+        # from the right buffer, before the driver overwrote it
         assert one.data == bytes([one.sequence + 1]) * 115200
     assert {one.moment for one in frames} == {Moment.FRAME_END}
     steps = [b.captured - a.captured for a, b in itertools.pairwise(frames)]
@@ -72,14 +72,14 @@ async def test_a_stream_is_whole_numbered_and_stamped_as_the_kernel_did(play: Pl
     assert all(one.device_time is None for one in frames)
 
 
-async def test_a_stamp_of_the_start_of_the_exposure_is_told(play: Player) -> None:
+async def test_stamp_of_the_start_of_the_exposure_is_marked(play: Player) -> None:
     replay = play("exposure")
     frames = await scenarios.exposure()
     whole(replay)
     assert {(one.moment, one.duration) for one in frames} == {(Moment.EXPOSURE_START, 0.0)}
 
 
-async def test_a_stamp_that_cannot_be_is_arrival_and_said_once(
+async def test_impossible_stamp_becomes_the_arrival_and_is_logged_once(
     play: Player, caplog: pytest.LogCaptureFixture
 ) -> None:
     play("wrapped")
@@ -87,7 +87,7 @@ async def test_a_stamp_that_cannot_be_is_arrival_and_said_once(
     assert {one.moment for one in frames} == {Moment.ARRIVAL}
     assert all(abs((one.device_time or 0) - one.captured) > 1e9 for one in frames)
     assert all(0.08 <= one.duration < 0.3 for one in frames)
-    assert len([one for one in caplog.records if "cannot be" in one.getMessage()]) == 1
+    assert len([one for one in caplog.records if "not plausible" in one.getMessage()]) == 1
 
 
 async def test_lost_frames_and_buffers_with_errors_are_counted_once(play: Player) -> None:
@@ -103,7 +103,7 @@ async def test_lost_frames_and_buffers_with_errors_are_counted_once(play: Player
     numbers = {abi.FULL_BUFFER.unpack_from(one)[-1] for one in replay.taken}
     came = {one for one in numbers if one <= last} - wrong
     assert lost == last + 1 - len(came)
-    assert sum(one.lost for one in frames) == lost - 1  # that one was told at once
+    assert sum(one.lost for one in frames) == lost - 1  # that loss was reported at once
     assert not wrong & {one.sequence for one in frames}
 
 
@@ -111,7 +111,7 @@ async def test_lost_frames_and_buffers_with_errors_are_counted_once(play: Player
     ("scenario", "words"),
     [("gives_up", ["EIO"]), ("unplugged", ["ENODEV", "unplugged", "/dev/video0 (vivid-000"])],
 )
-async def test_a_stream_that_breaks_ends_its_readers_and_begins_anew(
+async def test_broken_stream_ends_its_readers_and_restarts(
     play: Player, scenario: str, words: list[str]
 ) -> None:
     replay = play(scenario)
@@ -122,7 +122,7 @@ async def test_a_stream_that_breaks_ends_its_readers_and_begins_anew(
     assert [(one.sequence, one.lost) for one in frames] == [(0, 0), (1, 0)]
 
 
-async def test_a_start_that_fails_says_where_and_leaves_nothing(play: Player) -> None:
+async def test_failed_start_names_its_step_and_leaves_nothing_open(play: Player) -> None:
     replay = play("no_start")
     errors, frames = await scenarios.no_start()
     whole(replay)
@@ -134,7 +134,7 @@ async def test_a_start_that_fails_says_where_and_leaves_nothing(play: Player) ->
     assert len(frames) == 1
 
 
-async def test_what_a_device_has_not_is_refused_with_what_it_has(play: Player) -> None:
+async def test_unsupported_settings_are_refused_with_the_possible_ones(play: Player) -> None:
     replay = play("refused")
     errors = await scenarios.refused()
     whole(replay)
@@ -157,7 +157,7 @@ async def test_what_a_device_has_not_is_refused_with_what_it_has(play: Player) -
     assert "hue: -128 to 128; default 0, now 0" in name.available
 
 
-async def test_a_device_in_use_says_so(play: Player) -> None:
+async def test_device_in_use_is_reported(play: Player) -> None:
     play("in_use")
     error = await scenarios.in_use()
     assert "EBUSY, it is in use by another program" in str(error)
@@ -177,9 +177,7 @@ async def test_controls_have_ranges_menus_and_values(play: Player) -> None:
     assert "expected 1 (Menu Item 1), 3 (Menu Item 3), 4 (Menu Item 4), got 2" in str(error)
 
 
-async def test_cameras_are_found_and_other_devices_left_out(
-    play: Player, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_only_cameras_are_found(play: Player, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "FORMATS", scenarios.FEW)
     replay = play("found")
     found = await scenarios.found()
@@ -201,11 +199,11 @@ async def test_a_device_that_may_not_be_opened_is_found_with_the_reason(
     monkeypatch.setattr(system, "open", refuse)
     found = await scenarios.found()
     assert len(found) == 6
-    assert all("EACCES, not allowed" in one.remark for one in found)
+    assert all("EACCES, access is denied" in one.remark for one in found)
 
 
 def changed(replay: Replay, monkeypatch: pytest.MonkeyPatch, **fields: int) -> None:
-    """Have the kernel say something else of each picture."""
+    """Change the kernel's fields of each picture."""
     places = {"used": 8, "flags": 12, "sequence": 56}
 
     def ioctl(device: int, request: abi.Ioctl, argument: bytearray) -> None:
@@ -228,8 +226,8 @@ async def test_half_a_picture_is_never_delivered(
 ) -> None:
     monkeypatch.setattr(stream, "MAX_BAD_IN_A_ROW", 3)
     changed(play("stream"), monkeypatch, used=57600)
-    said = await _reading(FrameFormatError)
-    assert "expected YUV422_8 320x180, 115200 bytes or more, got 57600 bytes 3 times" in said
+    message = await _reading(FrameFormatError)
+    assert "expected YUV422_8 320x180, 115200 bytes or more, got 57600 bytes 3 times" in message
 
 
 async def test_a_device_with_nothing_but_errors_ends(
@@ -256,7 +254,7 @@ async def test_stamps_of_an_unknown_clock_are_arrival(
     assert {(one.moment, one.device_time) for one in frames} == {(Moment.ARRIVAL, None)}
 
 
-async def test_a_driver_that_says_full_for_ever_and_gives_nothing_ends(
+async def test_driver_that_is_ready_for_ever_without_a_frame_ends(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     replay = play("stream")
@@ -267,11 +265,11 @@ async def test_a_driver_that_says_full_for_ever_and_gives_nothing_ends(
         replay.ioctl(device, request, argument)
 
     monkeypatch.setattr(system, "ioctl", ioctl)
-    assert "says that a picture is there, and gives no picture" in await _reading(FrameSourceError)
+    assert "reports a picture, but has none" in await _reading(FrameSourceError)
 
 
 @pytest.mark.parametrize("steps", range(0, 40, 3))
-async def test_a_start_that_is_cancelled_leaves_nothing(play: Player, steps: int) -> None:
+async def test_cancelled_start_leaves_nothing_open(play: Player, steps: int) -> None:
     play("stream")
 
     async def read() -> None:
@@ -298,7 +296,7 @@ async def test_a_start_that_is_cancelled_leaves_nothing(play: Player, steps: int
         ("v4l2:///dev/video0?control.gain=1&control.gain=2", "twice"),
     ],
 )
-def test_a_wrong_url_says_what_is_expected(url: str, words: str) -> None:
+def test_wrong_url_is_refused_with_the_expected_form(url: str, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         smartcam.frames.open(url)
 
@@ -326,22 +324,22 @@ DEFAULT, FULL, LIMITED = 0, 1, 2
         ("MJPG", 3, 2, LIMITED, "MJPEG"),
     ],
 )
-def test_colours_are_what_the_device_tells(
+def test_colours_are_those_of_the_device(
     fourcc: str, colorspace: int, encoding: int, quantization: int, name: str
 ) -> None:
     device = CaptureDevice.__new__(CaptureDevice)
     code = abi.fourcc(fourcc)
     layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
-    told = layout._replace(quantization=quantization)
-    assert device._coloured(FORMATS[code], told).name == name
-    # a kernel that does not know the fields leaves anything there
-    untold = told._replace(private=0)
-    by_colorspace = told._replace(ycbcr_enc=0, quantization=0)
-    assert device._coloured(FORMATS[code], untold) is device._coloured(FORMATS[code], by_colorspace)
+    read = layout._replace(quantization=quantization)
+    assert device._coloured(FORMATS[code], read).name == name
+    # an older kernel leaves any values in these fields
+    unset = read._replace(private=0)
+    by_colorspace = read._replace(ycbcr_enc=0, quantization=0)
+    assert device._coloured(FORMATS[code], unset) is device._coloured(FORMATS[code], by_colorspace)
 
 
 @pytest.mark.parametrize(("colorspace", "encoding"), [(2, 0), (8, 8), (10, 7)])
-def test_matrix_that_is_not_known_is_refused(colorspace: int, encoding: int) -> None:
+def test_unknown_matrix_is_refused(colorspace: int, encoding: int) -> None:
     device = CaptureDevice.__new__(CaptureDevice)
     device.path = "/dev/video0"
     code = abi.fourcc("YUYV")
@@ -355,15 +353,15 @@ def test_matrix_that_is_not_known_is_refused(colorspace: int, encoding: int) -> 
 FORMAT_FIELDS = struct.Struct("I" if abi.POINTER == 4 else "Q")
 COLOUR_FIELDS = struct.Struct("5I")
 COLOURS_AT = FORMAT_FIELDS.size + 6 * 4
-"""Byte of ``struct v4l2_format`` at which the color space stands; private, flags, encoding and
-quantization follow."""
+"""Offset of the color space in ``struct v4l2_format``; private, flags, encoding and quantization
+follow."""
 
 WEIGHTS = {"601": (0.299, 0.114), "709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
 """Shares of red and blue in Y, from the recommendations of ITU-R."""
 
 
 class ColouredDevice(Replay):
-    """The recorded device, whose format tells other colours, and whose picture is red.
+    """The recorded device with other colours in its format, and a red picture.
 
     Args:
         colours: color space, ``private``, encoding and quantization.
@@ -382,7 +380,7 @@ class ColouredDevice(Replay):
             COLOUR_FIELDS.pack_into(argument, COLOURS_AT, *fields)
 
     def close(self, device: int) -> None:
-        if self.left[-1].asked != "close":  # it was refused
+        if self.left[-1].asked != "close":  # the format was refused
             self.left = [Answer("close", "", 0, "", 0)]
         super().close(device)
 
@@ -398,10 +396,10 @@ def red_pixels(matrix: str, *, full: bool) -> bytes:
     red, blue = WEIGHTS[matrix]
     y, u, v = red, -red / (2 * (1 - blue)), 0.5
     if full:
-        said = [round(255 * y), round(128 + 255 * u), min(255, round(128 + 255 * v))]
+        values = [round(255 * y), round(128 + 255 * u), min(255, round(128 + 255 * v))]
     else:
-        said = [round(16 + 219 * y), round(128 + 224 * u), round(128 + 224 * v)]
-    return bytes([said[0], said[1], said[0], said[2]])
+        values = [round(16 + 219 * y), round(128 + 224 * u), round(128 + 224 * v)]
+    return bytes([values[0], values[1], values[0], values[2]])
 
 
 @pytest.mark.parametrize(
@@ -419,7 +417,7 @@ def red_pixels(matrix: str, *, full: bool) -> bytes:
         ((3, 0, 1, FULL), "709", False, "YCbCr709_422_8"),  # a kernel that only knows color spaces
     ],
 )
-async def test_red_of_an_open_device_is_red_whatever_colours_it_tells(
+async def test_red_of_an_open_device_is_red_with_any_matrix(
     begin: Begin, colours: tuple[int, int, int, int], matrix: str, full: bool, name: str
 ) -> None:
     begin(ColouredDevice(colours, red_pixels(matrix, full=full)))
@@ -428,7 +426,7 @@ async def test_red_of_an_open_device_is_red_whatever_colours_it_tells(
         assert abs(frame.rgb().astype(int) - [255, 0, 0]).max() <= 2
 
 
-async def test_open_device_of_another_matrix_is_refused_and_given_back(begin: Begin) -> None:
+async def test_open_device_of_another_matrix_is_refused_and_released(begin: Begin) -> None:
     begin(ColouredDevice((2, abi.PRIVATE_MAGIC, 0, DEFAULT), bytes(4)))
     with pytest.raises(FrameFormatError, match=r"the device has those of 240M \(color space 2"):
         await scenarios.opened(scenarios.URL)

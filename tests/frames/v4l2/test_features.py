@@ -1,4 +1,4 @@
-"""Controls as features: SFNC's names and units, the device's own where it has others."""
+"""Controls are features with SFNC's names and units, or else the device's own."""
 
 from dataclasses import replace
 from typing import Any, cast
@@ -28,7 +28,7 @@ WEBCAM = [
 
 
 class Webcam:
-    """A device that has the controls of a common webcam; it takes what a driver would take."""
+    """A device with the controls of a common webcam, which accepts the same values as a driver."""
 
     name = "webcam"
 
@@ -125,7 +125,7 @@ async def test_values_are_the_controls_numbers(
         ("Gian", 1, "did you mean 'Gain'"),
     ],
 )
-async def test_what_the_device_does_not_take_is_said(
+async def test_values_that_the_device_refuses_are_errors(
     features: DeviceFeatures, webcam: Webcam, name: str, value: Any, text: str
 ) -> None:
     with pytest.raises(FrameSourceError) as caught:

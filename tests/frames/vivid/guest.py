@@ -1,4 +1,4 @@
-"""Checks of the driver with the kernel's; runs in the machine, and writes their outcome."""
+"""Check the driver with the kernel's inside the machine, and write the outcome."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CHECKS: dict[str, Callable[[], Awaitable[None]]] = {}
 
 
 def check(function: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
-    """Have it checked, in the order of this file."""
+    """Run the checks in the order of this file."""
     CHECKS[function.__name__] = function
     return function
 
@@ -54,26 +54,26 @@ async def take(reader: FrameReader, count: int) -> list[Frame]:
 
 
 async def refused(url: str, *words: str, kind: type[FrameSourceError] = FrameSourceError) -> str:
-    """Return how opening was refused; each word stands in the text, or in what is available."""
+    """Return the error of an opening; its text or ``available`` contains each word."""
     try:
         async with smartcam.frames.open(url):
             pass
     except kind as exc:
-        said = f"{exc} {exc.available}"
-        assert all(one in said for one in words), (words, said)
-        return said
+        message = f"{exc} {exc.available}"
+        assert all(one in message for one in words), (words, message)
+        return message
     raise AssertionError(f"{url} was opened")
 
 
 async def ends(reader: FrameReader, *words: str) -> None:
-    """See that the stream ends with an error in which the words stand."""
-    said = ""
+    """Check that the stream ends with an error that contains the words."""
+    message = ""
     try:
         await take(reader, 100)
     except FrameSourceError as exc:
-        said = str(exc)
-    assert said, "100 frames came"
-    assert all(one in said for one in words), (words, said)
+        message = str(exc)
+    assert message, "100 frames came"
+    assert all(one in message for one in words), (words, message)
 
 
 def press(number: int, name: str, value: int = 1) -> None:
@@ -88,7 +88,7 @@ def press(number: int, name: str, value: int = 1) -> None:
 def open_devices() -> int:
     count = 0
     for one in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):  # the one that it was listed with
+        with contextlib.suppress(OSError):  # the listed name
             count += str(one.readlink()).startswith("/dev/video")
     return count
 
@@ -118,7 +118,7 @@ async def frames_are_whole_numbered_and_stamped() -> None:
         sums = [zlib.crc32(one.data) for one in frames]
         again = [zlib.crc32(one.data) for one in [*frames, *await take(reader, 6)][:6]]
     assert sums == again, "a buffer was written to that somebody holds"
-    assert len(set(sums)) == 6, "a picture came twice"  # its counter is drawn into it
+    assert len(set(sums)) == 6, "a picture came twice"  # the picture shows the counter
     steps = [b.sequence - a.sequence for a, b in itertools.pairwise(frames)]
     assert steps == [one.lost + 1 for one in frames[1:]]
     assert {(len(one.data), one.stride) for one in frames} == {(115200, 640)}
@@ -145,7 +145,7 @@ async def nothing_is_open_where_nobody_reads() -> None:
         began = time.process_time(), time.monotonic()
         await asyncio.sleep(5)
         part = (time.process_time() - began[0]) / (time.monotonic() - began[1])
-        assert part < 0.001, part  # the sleep's own, and no more
+        assert part < 0.001, part  # of the sleep itself only
 
 
 async def until(reached: Callable[[], bool]) -> None:
@@ -223,7 +223,7 @@ async def a_sequence_that_wraps_loses_nothing() -> None:
     assert frames[0].sequence < 2**32 <= frames[-1].sequence
     lost = sum(one.lost for one in frames)
     assert frames[-1].sequence - frames[0].sequence == 139 + lost
-    assert lost < 20  # a busy computer may lose some, and not thousands of millions
+    assert lost < 20  # a busy computer may lose some frames, but not billions
 
 
 @check
@@ -245,7 +245,7 @@ async def a_buffer_with_an_error_is_lost() -> None:
         assert reader.statistics().lost == 1
     numbers = [one.sequence for one in frames]
     assert numbers[-1] - numbers[0] in (4, 5), numbers
-    assert sum(one.lost for one in frames) == 0  # it was told when it came
+    assert sum(one.lost for one in frames) == 0  # reported at its arrival
 
 
 @check
@@ -301,7 +301,7 @@ async def what_a_device_has_not_is_listed() -> None:
     await refused("v4l2:///dev/video5", "several planes")
     os.seteuid(65534)
     try:
-        await refused("v4l2:///dev/video0", "EACCES", "not allowed")
+        await refused("v4l2:///dev/video0", "EACCES", "access is denied")
     finally:
         os.seteuid(0)
 
@@ -330,8 +330,10 @@ async def controls_are_listed_set_and_bounded() -> None:
             try:
                 await driver.set_control(name, value)
             except FrameSourceError as exc:
-                said = f"{exc} {exc.available}"
-                assert all(re.search(re.escape(one), said, re.IGNORECASE) for one in words), said
+                message = f"{exc} {exc.available}"
+                assert all(re.search(re.escape(one), message, re.IGNORECASE) for one in words), (
+                    message
+                )
             else:
                 raise AssertionError(name)
         await driver.set_control("hue", 0)
@@ -415,7 +417,7 @@ async def a_disconnected_device_ends_its_readers() -> None:
         press(3, "disconnect")
         await ends(reader, "ENODEV", "unplugged", "/dev/video0")
         await until(lambda: (open_devices(), maps()) == (0, 0))
-        assert (await source.newest()).sequence == 0  # the last one to close it plugs it in again
+        assert (await source.newest()).sequence == 0  # the last close plugs the device in again
 
 
 @check
@@ -441,7 +443,7 @@ async def nothing_is_left() -> None:
 
 async def all_checks(names: list[str]) -> dict[str, str]:
     came: dict[str, str] = {}
-    await smartcam.frames.discover("v4l2")  # what it imports comes from the other computer
+    await smartcam.frames.discover("v4l2")  # its imports are files of the other computer
     for name, function in CHECKS.items():
         if names and name not in names:
             continue

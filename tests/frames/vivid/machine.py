@@ -1,10 +1,10 @@
 """A computer with video devices: Debian's kernel and its driver vivid, in QEMU.
 
 It boots in about four seconds of its own time, sees this computer's files and cannot change them,
-and runs one Python program with this interpreter. Its time goes by the instructions that it has
-executed, and where it waits by ours: a busy computer makes it slower, and its programs do not see
-it. ``python -m tests.frames.vivid.machine fetch`` downloads and unpacks the kernel; ``... run
-SCRIPT [ARGUMENT ...]`` runs a program there, and ``... clock run SCRIPT`` with our time.
+and runs one Python program with this interpreter. Its clock counts executed instructions, and real
+time during waits: a busy computer makes the machine slower, unnoticed by its programs. ``python -m
+tests.frames.vivid.machine fetch`` downloads and unpacks the kernel; ``... run SCRIPT [ARGUMENT
+...]`` runs a program there, and ``... clock run SCRIPT`` with real time.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from collections.abc import Iterable
 from pathlib import Path
 
 CACHE = Path(tempfile.gettempdir()) / "smartcam-vivid-kernel"
-"""Folder of the kernel: ``vmlinuz`` and the modules that are used."""
+"""Folder of the kernel: ``vmlinuz`` and the needed modules."""
 
 ROOT = Path(__file__).resolve().parents[3]
 
 PACKAGES = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static"}
-"""Programs, and Debian's packages that have them."""
+"""Programs, and their packages in Debian."""
 
 BEFORE = ("virtio_pci", "9pnet_virtio", "9p")
-"""Modules that are loaded before there are files."""
+"""Modules that are loaded before the mount of the files."""
 
 DEVICES = "n_devs=5 node_types=0x1,0x1,0x1,0x20001,0x1 multiplanar=1,1,1,1,2"
 """Five cameras of vivid: the fourth has a metadata device, the fifth is multi-planar."""
@@ -57,7 +57,7 @@ poweroff -f
 
 
 def missing() -> str | None:
-    """Return what is not here, and where it comes from; None: all is here."""
+    """Return the missing parts, and their origin; None: all are here."""
     for program, package in (
         ("qemu-system-x86_64", "qemu-system-x86"),
         ("busybox", "busybox-static"),
@@ -70,7 +70,7 @@ def missing() -> str | None:
 
 
 def fetch() -> None:
-    """Download the kernel that this Debian has, and keep what is used of it."""
+    """Download this Debian's kernel, and keep the needed parts."""
     if (CACHE / "vmlinuz").exists():
         return
     shown = subprocess.run(
@@ -96,19 +96,19 @@ def fetch() -> None:
 
 
 def simple(module: str) -> str:
-    """Return a module's name as the kernel has it."""
+    """Return a module's name in the kernel's form."""
     return module.replace("-", "_")
 
 
 def with_dependencies(names: Iterable[str], modules: dict[str, Path]) -> list[str]:
-    """Return modules and what they need, in the order in which they are loaded."""
+    """Return modules and their dependencies, in the order of loading."""
     order: dict[str, None] = {}
 
     def visit(name: str) -> None:
-        if name in order or name not in modules:  # what is not there is built in
+        if name in order or name not in modules:  # a missing module is built in
             return
-        said = re.search(rb"(?:^|\0)depends=([^\0]*)\0", modules[name].read_bytes())
-        for needed in said[1].decode().split(",") if said and said[1] else ():
+        found = re.search(rb"(?:^|\0)depends=([^\0]*)\0", modules[name].read_bytes())
+        for needed in found[1].decode().split(",") if found and found[1] else ():
             visit(simple(needed))
         order[name] = None
 
@@ -129,7 +129,7 @@ def archive(files: Iterable[tuple[str, int, bytes]]) -> bytes:
 
 
 def initial_files() -> bytes:
-    """Return what the kernel begins with."""
+    """Return the first files of the kernel."""
     modules = {one.stem: one for one in CACHE.glob("*.ko")}
     before = with_dependencies(BEFORE, modules)
     after = [one for one in with_dependencies(["vivid"], modules) if one not in before]
@@ -155,22 +155,22 @@ def initial_files() -> bytes:
 def run(
     script: Path, arguments: Iterable[str], out: Path, *, timeout: float, counted: bool = True
 ) -> tuple[int, str]:
-    """Run a Python program there.
+    """Run a Python program in the machine.
 
     Args:
-        script: of this computer.
-        arguments: the program's.
+        script: file of this computer.
+        arguments: arguments of the program.
         out: folder that the program sees as ``/run/out``, and alone can write to.
-        timeout: seconds of ours; then the machine is switched off.
-        counted: its time goes by instructions: 2 ns each.
+        timeout: seconds of real time; then the machine is switched off.
+        counted: whether the clock counts instructions, 2 ns each.
 
     Returns:
-        The program's status, and what machine and program said.
+        The program's status, and the output of machine and program.
     """
     command = shlex.join([sys.executable, "-X", "faulthandler", str(script), *arguments])
     (out / "job").write_text(
         f"cd {shlex.quote(str(ROOT))}\n"
-        "export PYTHONPYCACHEPREFIX=/none\n"  # its time is the same, whatever is compiled here
+        "export PYTHONPYCACHEPREFIX=/none\n"  # its clock does not depend on compilation here
         f"export PYTHONPATH=$PWD PYTHONDONTWRITEBYTECODE=1 TMPDIR=/run HOME=/run\n{command}\n"
     )
     (out / "initial").write_bytes(initial_files())
@@ -189,13 +189,13 @@ def run(
     ended = subprocess.run(  # noqa: S603
         machine, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout, check=False
     )
-    said = (ended.stdout + ended.stderr).decode("utf-8", "replace").replace("\r", "")
+    output = (ended.stdout + ended.stderr).decode("utf-8", "replace").replace("\r", "")
     status = out / "status"
-    return int(status.read_text()) if status.exists() else -1, said
+    return int(status.read_text()) if status.exists() else -1, output
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the command line says."""
+    """Run the command line."""
     counted = arguments[:1] != ["clock"]
     command, *more = arguments if counted else arguments[1:]
     if command == "fetch":
@@ -206,8 +206,8 @@ def main(arguments: list[str]) -> int:
         return 1
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        status, said = run(Path(more[0]).resolve(), more[1:], out, timeout=300, counted=counted)
-        sys.stdout.write(said)
+        status, output = run(Path(more[0]).resolve(), more[1:], out, timeout=300, counted=counted)
+        sys.stdout.write(output)
         for one in out.glob("*.json"):
             shutil.copy(one, os.environ.get("OUT", "."))
     return status

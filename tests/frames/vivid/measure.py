@@ -2,8 +2,8 @@
 
     python -m tests.frames.vivid.machine run tests/frames/vivid/measure.py
 
-That counts instructions; with ``clock run`` it is the time that they took, of what a busy computer
-leaves. ``... measure.py ours`` runs without OpenCV, ``... measure.py seconds=3`` for so long each.
+That counts instructions; with ``clock run`` the figures are real time, which depends on the load.
+``... measure.py ours`` runs without OpenCV, ``... measure.py seconds=3`` for 3 s each.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ URL = "v4l2:///dev/video{}?format=YUYV&size=640x480&fps=25"
 
 
 def cost(frames: int, began: tuple[float, float]) -> tuple[int, float]:
-    """Return the frames and the percentage of a processor since a beginning."""
+    """Return the number of frames and the percentage of a processor since a start."""
     wall, cpu = time.monotonic() - began[0], time.process_time() - began[1]
     return frames, 100 * cpu / wall
 
 
 async def ours(cameras: int, seconds: float) -> tuple[int, float]:
-    """Read cameras at once, each by one reader."""
+    """Read several cameras at the same time, each by one reader."""
 
     async def read(reader: smartcam.frames.FrameReader, end: float) -> int:
         count = 0
@@ -51,7 +51,7 @@ async def ours(cameras: int, seconds: float) -> tuple[int, float]:
 
 
 async def idle(seconds: float) -> tuple[int, float]:
-    """Have four sources open, and read none."""
+    """Open four sources, and read none."""
     async with AsyncExitStack() as stack:
         for one in range(4):
             await stack.enter_async_context(smartcam.frames.open(URL.format(one)))
@@ -61,7 +61,7 @@ async def idle(seconds: float) -> tuple[int, float]:
 
 
 def opencv(raw: bool, reuse: bool, seconds: float) -> tuple[int, float]:
-    """Read with OpenCV: its defaults, or the bytes as they come."""
+    """Read with OpenCV: with its defaults, or the raw bytes."""
     import cv2
 
     capture = cv2.VideoCapture(0, cv2.CAP_V4L2)

@@ -1,4 +1,4 @@
-"""Writes the table of the fast tests anew, in the machine with video devices::
+"""Write the table of the fast tests again, in the machine with video devices::
 
 OUT=tests/frames/v4l2 python -m tests.frames.vivid.machine run tests/frames/vivid/record.py
 """
@@ -15,7 +15,7 @@ from tests.frames.v4l2.scenarios import FEW, SCENARIOS
 
 
 async def record() -> str:
-    await smartcam.frames.discover("v4l2")  # what it imports comes from the other computer
+    await smartcam.frames.discover("v4l2")  # its imports are files of the other computer
     recorder = Recorder()
     setattr(discovery, "FORMATS", FEW)  # noqa: B010 - it is constant to others
     for name in WRAPPED:

@@ -44,14 +44,14 @@ from tests.inspection.rendering import Array, disc, half_plane, photographed, pi
 WORST_OVER_BOUND, SIGMA_RANGE = 1.15, (0.9, 1.1)
 
 OFF = np.array([0.8, -0.5])
-"""Pixels from a circle's centre to where it is looked for."""
+"""Error of the given centre of a circle, pixels."""
 
 STEP = 1e-3
-"""Pixels and radians by which a drawing is moved to see how its pixels change."""
+"""Step of numerical derivatives of a drawing, pixels and radians."""
 
 
 class Light(NamedTuple):
-    """Light and photography of a scene."""
+    """Light and camera of a scene."""
 
     contrast: float = 150.0
     noise: float = 2.0
@@ -60,7 +60,7 @@ class Light(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Levels of the picture for one of 255."""
+        """Levels of the picture per level of 255."""
         return float(2**self.bits - 1) / 255
 
     @property
@@ -71,7 +71,7 @@ class Light(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Of a pixel, rounding included."""
+        """Noise of a pixel, rounding included."""
         return (self.noise * self.scale) ** 2 + 1 / 12
 
     def photograph(self, shares: Array, random: np.random.Generator) -> Any:
@@ -84,7 +84,7 @@ LIGHT = Light()
 
 
 class Trial(NamedTuple):
-    """One value, measured once."""
+    """One measurement of one value."""
 
     error: float
     sigma: float
@@ -98,7 +98,7 @@ def information(
     masks: Sequence[Array],
     light: Light,
 ) -> Array:
-    """Return the information (W, W) that pixels have of the first ``wanted`` values.
+    """Return the Fisher information (W, W) of the pixels about the first ``wanted`` values.
 
     ``draw`` gives shares (H, W) by values, of which the last one is the blur. All values but the
     wanted ones, and the levels at both sides, are unknown in each of the masks (H, W) by itself.
@@ -136,7 +136,7 @@ def masks_of(shape: tuple[int, int], strips: Strips | Sectors) -> list[Array]:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Something that is measured again and again.
+    """A feature that is measured repeatedly.
 
     Attributes:
         name: what is varied.
@@ -149,7 +149,7 @@ class Case:
     others: bool = False
 
     def trials(self, random: np.random.Generator, count: int) -> Iterator[dict[str, Trial]]:
-        """Yield the values of one drawing, made at random, in so many pictures of it."""
+        """Yield the values of one random drawing in ``pictures`` pictures."""
         raise NotImplementedError
 
 
@@ -252,7 +252,7 @@ class WidthCase(Case):
 
 @dataclass(frozen=True, kw_only=True)
 class LineCase(Case):
-    """A line, of which some strips may be dirty."""
+    """A line with dirt in some strips."""
 
     angle: float = 17.0
     off: float = 1.5  # pixels between the line and where it is looked for
@@ -347,7 +347,7 @@ def soiled(shares: Array, place: Array, normal: Array, random: np.random.Generat
 
 @dataclass(frozen=True, kw_only=True)
 class CircleCase(Case):
-    """A circle or an arc, of which some strips may be dirty."""
+    """A circle or an arc with dirt in some strips."""
 
     radius: float = 25.0
     arc: tuple[float, float] = (0.0, 360.0)
@@ -408,7 +408,7 @@ class CircleCase(Case):
 
 
 def cases() -> Iterator[Case]:
-    """Yield what the long proof measures."""
+    """Yield the cases of the long proof."""
     yield EdgeCase(name="edge", others=True)
     for contrast in (20.0, 60.0, 190.0):
         yield EdgeCase(name=f"contrast {contrast:g}", light=Light(contrast=contrast))
@@ -449,7 +449,7 @@ def cases() -> Iterator[Case]:
 
 
 class Row(NamedTuple):
-    """The figures of one value of a case."""
+    """Figures of one value of a case."""
 
     case: str
     value: str
@@ -461,7 +461,7 @@ class Row(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """True if it is as good as it has to be, within what chance does to this many trials."""
+        """True if the figures reach their goal, within the chance of this number of trials."""
         if math.isnan(self.predicted_over_observed):
             return True  # of another library
         chance = 3 / math.sqrt(2 * self.trials)
@@ -481,7 +481,7 @@ class Row(NamedTuple):
 
 
 def judged(case: Case, seed: int, drawings: int, pictures: int) -> list[Row]:
-    """Return the figures of a case, of so many drawings with so many pictures each."""
+    """Return the figures of a case over drawings with several pictures each."""
     found: dict[str, list[Trial]] = {}
     troubles: Counter[str] = Counter()
     for number in range(drawings):
@@ -513,7 +513,7 @@ def judged(case: Case, seed: int, drawings: int, pictures: int) -> list[Row]:
 
 
 def main() -> int:
-    """Print the table; return 1 where a case is missed."""
+    """Print the table; return 1 if a case misses its goal."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.inspection.proofs.calipers", description=__doc__
     )

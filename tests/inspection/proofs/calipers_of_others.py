@@ -1,4 +1,4 @@
-"""Edges, lines and circles as OpenCV and scikit-image find them, to hold smartcam's against.
+"""Find edges, lines and circles by OpenCV and scikit-image, for comparison.
 
 Each is used as its documentation and most answers on the web do it. What is not installed, or finds
 nothing, gives NaN.
@@ -25,7 +25,7 @@ NOTHING = math.nan
 
 
 def edge_by_profile(picture: Any, start: Array, end: Array, width: int) -> float:
-    """Return the steepest place from the middle of a profile, with a parabola through its top."""
+    """Return the steepest place of a profile from its middle, by a parabola through the maximum."""
     if skimage_measure is None:
         return NOTHING
     (u0, v0), (u1, v1) = start, end
@@ -60,7 +60,7 @@ def canny_points(picture: Any) -> Array:
 
 
 def near(points: Array, far: Callable[[Array], Array], reach: float) -> Array:
-    """Return the points that are no farther than ``reach`` from where the line is looked for."""
+    """Return the points within ``reach`` of the expected line."""
     return points[np.abs(far(points)) <= reach] if len(points) else points
 
 
@@ -73,7 +73,7 @@ def line_by_opencv(points: Array) -> tuple[Array, Array] | None:
 
 
 def line_by_ransac(points: Array) -> tuple[Array, Array] | None:
-    """Return the same by scikit-image's RANSAC."""
+    """Return a point and the direction of the line by scikit-image's RANSAC."""
     if skimage_measure is None or len(points) < 2:
         return None
     model, _ = skimage_measure.ransac(

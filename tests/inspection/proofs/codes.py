@@ -67,7 +67,7 @@ LOOKS = {
     "4 px, contrast 8": Look(px=4, levels=(100, 108)),
     "4 px, shade": Look(px=4, levels=(60, 110), shade=120),
 }
-"""Ways in which drawn codes are seen."""
+"""Looks of drawn codes."""
 
 PUBLIC = {
     "QRCode": [f"qrcode-{n}" for n in range(1, 7)],
@@ -90,10 +90,10 @@ PUBLIC = {
 """Folders of the public set by the kind of their codes."""
 
 MISLABELLED = {"ean13-2/23": "9784872348880", "ean13-2/28": "9784872348880"}
-"""Pictures of the public set whose file says another number than stands below the bars."""
+"""Pictures of the public set whose file gives another number than the print below the bars."""
 
 GOALS = {"QRCode": 123, "DataMatrix": 91, "EAN13": 40, "Code128": 22, "PDF417": 55, "Aztec": 45}
-"""Pictures of the public set that have to be read, by kind."""
+"""Least number of pictures of the public set that must be read, by kind."""
 
 _OPENCV_LINEAR = {"EAN13", "EAN8", "UPCA"}
 _PYZBAR = {
@@ -114,7 +114,7 @@ def tool(kind: str, seconds: float = 10.0) -> ReadTool:
 
 
 def with_ladder(kind: str, grey: NDArray[np.uint8]) -> list[ReadCode]:
-    """Return the codes that `read` reads, whatever it takes."""
+    """Return the codes that `read` finds without a time limit."""
     return tool(kind).read(grey, (0, 0))
 
 
@@ -124,7 +124,7 @@ def alone(kind: str, grey: NDArray[np.uint8]) -> list[ReadCode]:
 
 
 def by_opencv(kind: str, grey: NDArray[np.uint8]) -> list[str]:
-    """Return the texts that OpenCV reads; it knows QR and the codes of shops."""
+    """Return the texts that OpenCV reads: QR codes and retail bar codes."""
     if kind == "QRCode":
         text, _, _ = cv2.QRCodeDetector().detectAndDecode(grey)
         return [text] if text else []
@@ -145,7 +145,7 @@ def by_pyzbar(kind: str, grey: NDArray[np.uint8]) -> list[str]:
 
 
 def readers() -> dict[str, Reader]:
-    """Return the readers that are there, by name."""
+    """Return the installed readers by name."""
     found: dict[str, Reader] = {
         "zxing-cpp": lambda kind, grey: [code.text for code in alone(kind, grey)],
         "smartcam": lambda kind, grey: [code.text for code in with_ladder(kind, grey)],
@@ -162,7 +162,7 @@ def readers() -> dict[str, Reader]:
 
 
 def drawn(seeds: int, *, looks: dict[str, Look] = LOOKS) -> tuple[Counter[Any], list[str]]:
-    """Return how many each reader reads, by reader, look and kind, and what `read` reads wrong."""
+    """Return the counts of read codes by reader, look and kind, and wrong readings of `read`."""
     count: Counter[Any] = Counter()
     wrong: list[str] = []
     for (kind, text), (name, look), seed in itertools.product(
@@ -178,7 +178,7 @@ def drawn(seeds: int, *, looks: dict[str, Look] = LOOKS) -> tuple[Counter[Any], 
 
 
 def print_drawn(seeds: int) -> bool:
-    """Print the table of drawn codes; return True if all is well."""
+    """Print the table of drawn codes; return True if all goals are reached."""
     count, wrong = drawn(seeds)
     names = [*readers()]
     say(f"Read of {seeds}: {', '.join(names)}\n")
@@ -215,7 +215,7 @@ def pictures(folder: Path, kind: str) -> Iterator[tuple[str, Path, str | bytes]]
 
 
 def print_public(folder: Path) -> bool:
-    """Print the table of the public set; return True if all is well."""
+    """Print the table of the public set; return True if all goals are reached."""
     well = True
     say("\n| public pictures | of | zxing-cpp | smartcam | ms | ms | misses |")
     say("| --- | --- | --- | --- | --- | --- | --- |")
@@ -241,7 +241,7 @@ def print_public(folder: Path) -> bool:
 
 
 def _is_add_on(content: str | bytes, codes: list[ReadCode]) -> bool:
-    """Return True if the code was read, but not the small one beside it."""
+    """Return True if the code was read, but not the small code beside it."""
     return isinstance(content, str) and any(
         code.kind in {"EAN13", "UPCA", "UPCE"} and content.startswith(code.text) for code in codes
     )
@@ -251,7 +251,7 @@ def _is_add_on(content: str | bytes, codes: list[ReadCode]) -> bool:
 
 
 def print_photographs(folder: Path) -> bool:
-    """Print what is read in photographs; return True if it is nothing."""
+    """Print codes read in photographs without codes; return True if there are none."""
     every = ReadTool(tool("").settings, ToolSetup(folder=Path()))
     paths = sorted(
         one for one in folder.rglob("*") if one.suffix in {".jpg", ".jpeg", ".png", ".webp"}
@@ -268,7 +268,7 @@ def print_photographs(folder: Path) -> bool:
 
 
 def main() -> int:
-    """Judge what is asked for; return 1 where something is wrong."""
+    """Run the chosen judges; return 1 if one fails."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="drawn codes of each kind and look")
     parser.add_argument("--public", type=Path, help="test/samples of zxing-cpp")

@@ -21,7 +21,7 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 Scene = "Callable[[Array, Array], Array]"
 
 NODES = 6
-"""Points along each side of a pixel at which the blurred scene is taken."""
+"""Number of samples of the blurred scene along each side of a pixel."""
 
 
 def pixel_means(
@@ -41,7 +41,7 @@ def pixel_means(
 def half_plane(
     place: tuple[float, float], angle: float, blur: float
 ) -> Callable[[Array, Array], Array]:
-    """Return the scene that is 1 behind a straight edge through a point, seen along its normal."""
+    """Return the scene that is 1 beyond a straight edge through a point, along its normal."""
     normal = math.cos(angle), math.sin(angle)
 
     def scene(u: Array, v: Array) -> Array:
@@ -78,7 +78,7 @@ def disc(
 def photographed(
     levels: Array, noise: float, random: np.random.Generator, bits: int = 8
 ) -> NDArray[np.generic]:
-    """Return levels (H, W) with noise, rounded to the whole numbers that a camera has."""
+    """Return levels (H, W) with noise, rounded to a camera's whole levels."""
     most = 2**bits - 1
     seen = np.rint(levels + random.normal(scale=noise, size=levels.shape)).clip(0, most)
     return seen.astype(np.uint8 if bits == 8 else np.uint16)

@@ -1,4 +1,4 @@
-"""Assemble encoded frames from payloads: whole ones, or none."""
+"""Assemble complete encoded frames from the payloads of packets."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ if TYPE_CHECKING:
 
 
 START, END = 0x80, 0x40
-"""Bits of a part's head: the first part of a unit, and the last one."""
+"""Bits of a fragment's header for the first and the last fragment of a unit."""
 
 START_CODE: Final = b"\0\0\0\1"
 
 MAX_ACCESS_UNIT_BYTES: Final = 16 << 20
-"""Largest number of bytes of an access unit: one that is larger is damaged."""
+"""Largest number of bytes of an access unit; a larger unit counts as damaged."""
 
 
 class AccessUnit(NamedTuple):
-    """One encoded frame that came whole.
+    """A complete encoded frame.
 
     Attributes:
         data: bytes as in a file (annex B, or a JPEG).
         timestamp: ticks of 90 kHz.
-        lost: number of packets lost since the last whole frame.
-        damaged: number of frames since then of which only a part came.
-        arrived: time of arrival of its first packet; 0.0 where that is not known.
-        begins: whether its first packet is the first one of a stream.
+        lost: number of packets lost since the last complete frame.
+        damaged: number of incomplete frames since then.
+        arrived: time of arrival of the first packet; 0.0: unknown.
+        begins: whether the first packet is the first of a stream.
     """
 
     data: bytes
@@ -39,12 +39,12 @@ class AccessUnit(NamedTuple):
 
 
 class OpenUnit(ABC):
-    """An access unit that is still incomplete.
+    """An access unit whose packets are still coming.
 
     Attributes:
-        whole: whether nothing is missing so far.
-        has_picture: whether a part of the picture came, and not only parameters.
-        parts: bytes that came, in order.
+        whole: whether no packet is missing so far.
+        has_picture: whether picture data came, and not only parameters.
+        parts: received bytes, in order.
     """
 
     def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
@@ -54,7 +54,7 @@ class OpenUnit(ABC):
         self.has_picture = False
 
     def add(self, payload: bytes) -> None:
-        """Take a packet's payload; an invalid one makes the unit damaged."""
+        """Add a packet's payload; an invalid payload makes the unit damaged."""
         if self.whole:
             self.size += len(payload) + len(START_CODE)
             self.whole = self.size <= MAX_ACCESS_UNIT_BYTES and (
@@ -64,7 +64,7 @@ class OpenUnit(ABC):
             self.parts.clear()
 
     def ended(self) -> bool:
-        """Return True if the unit is whole and no part of it is still to come."""
+        """Return True if the unit is complete."""
         return self.whole and bool(self.parts)
 
     def data(self) -> bytes:
@@ -73,58 +73,58 @@ class OpenUnit(ABC):
 
     @abstractmethod
     def _added(self, payload: bytes) -> bool:
-        """Take a payload, which has bytes; return False if it is not valid."""
+        """Add a payload that is not empty; return False if it is not valid."""
 
 
 class UnitKind(Protocol):
-    """The kind of unit that a stream's payloads form."""
+    """The kind of access units in a stream's payloads."""
 
     def open(self, timestamp: int, whole: bool, arrived: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
     def begins(self, payload: bytes, /) -> bool:
-        """Return True if a packet is certainly the first one of a frame."""
+        """Return True if a packet is certainly the first of a frame."""
         ...
 
 
 class NalUnit(OpenUnit):
-    """An access unit like H.264's: it has units, several in a packet or one in parts."""
+    """An access unit of NAL units, several in a packet or one in fragments."""
 
     HEAD: ClassVar[int]
-    """Bytes before a unit's content."""
+    """Number of bytes of a unit's header."""
     SEVERAL: ClassVar[int]
     """Kind of a packet with several units."""
     PART: ClassVar[int]
-    """Kind of a packet with a part of a unit."""
+    """Kind of a packet with a fragment of a unit."""
 
     def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
         super().__init__(timestamp, whole, arrived)
-        self._part_of = -1  # kind of the unit whose parts are coming
+        self._part_of = -1  # kind of the current fragmented unit; -1: none
 
     @staticmethod
     @abstractmethod
     def kind_of(head: int) -> int:
-        """Return a unit's kind by its first byte; -1: there is no such unit."""
+        """Return a unit's kind by its first byte; -1: not valid."""
 
     @staticmethod
     @abstractmethod
     def is_picture(kind: int) -> bool:
-        """Return True if units of a kind are parts of the picture."""
+        """Return True if units of a kind have picture data."""
 
     @classmethod
     @abstractmethod
     def whole_head(cls, payload: bytes) -> bytes:
-        """Return the head of the unit whose part is in a packet."""
+        """Return the header of the unit whose fragment is in a packet."""
 
     @classmethod
     def leading(cls, access_unit: bytes) -> Iterator[bytes]:
-        """Yield the units before a frame's picture, without codes, and the head of the picture."""
+        """Yield the units before a frame's picture, without start codes, and its header."""
         place = access_unit.find(b"\0\0\1")
         while place >= 0:
             head = access_unit[place + 3 : place + 3 + cls.HEAD]
             kind = cls.kind_of(head[0]) if len(head) == cls.HEAD else -1
-            if cls.is_picture(kind):  # its end is far away, and nobody asks for it
+            if cls.is_picture(kind):  # the search for its end would be long and is not needed
                 yield head
                 return
             after = access_unit.find(b"\0\0\1", place + 3)
@@ -134,7 +134,7 @@ class NalUnit(OpenUnit):
             place = after
 
     def ended(self) -> bool:
-        """Return True if the unit is whole and no part of it is still to come."""
+        """Return True if the unit is complete."""
         return super().ended() and self._part_of < 0
 
     def _added(self, payload: bytes) -> bool:

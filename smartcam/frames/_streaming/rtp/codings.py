@@ -1,4 +1,4 @@
-"""Define the codings of streams: their payloads, parameters and decoders."""
+"""Define the codecs of streams: payloads, parameters and decoders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class H265Decoder(H264Decoder):
-    """One stream of H.265: like H.264, but whole pictures come only from key frames on."""
+    """Decoder of a stream of H.265, which begins at key frames only."""
 
     CODEC: ClassVar = "hevc"
     NAME: ClassVar = "H265"
@@ -28,7 +28,7 @@ class H265Decoder(H264Decoder):
 
 
 class JpegDecoder(H264Decoder):
-    """One stream of JPEGs, which do not depend on each other."""
+    """Decoder of a stream of independent JPEGs."""
 
     CODEC: ClassVar = "mjpeg"
     NAME: ClassVar = "JPEG"
@@ -38,13 +38,14 @@ class JpegDecoder(H264Decoder):
 
 
 class Coding(NamedTuple):
-    """The coding of a stream.
+    """The codec of a stream.
 
     Attributes:
         name: name of the codec.
-        format: name of its encoded frames' format.
-        kind: function that returns the kind of its payloads.
-        size_in: function that returns the size of the pictures, if an encoded frame has it.
+        format: name of the encoded frames' format.
+        kind: function that returns the kind of the payloads.
+        size_in: function that returns the size of the pictures from an encoded frame; None if it
+            lacks parameters.
         decoder: function that returns a decoder for a stream.
     """
 

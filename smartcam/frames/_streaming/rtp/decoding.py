@@ -1,4 +1,4 @@
-"""Decode the encoded frames of a stream into frames of a source; count the others."""
+"""Decode the encoded frames of a stream into frames of a source; count lost frames."""
 
 from __future__ import annotations
 
@@ -21,30 +21,28 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_FRAMES: Final = 16
-"""At most this many encoded frames wait for the decoder; further ones are dropped until a key
+"""Largest number of encoded frames that wait for the decoder; more are dropped until a key
 frame."""
 
 MAX_UNDECODABLE_FRAMES: Final = 10
-"""After this many encoded frames in a row that cannot be decoded, the stream may end with the
-reason."""
+"""Number of undecodable frames in a row after which the stream may end with an error."""
 
 FAILURE_GRACE: Final = 3.0
-"""Seconds for which such frames must come before the stream ends: the first sender may have been a
-stranger."""
+"""Seconds of undecodable frames before the stream ends: the first sender may be a wrong one."""
 
 
 DRAIN_TIMEOUT: Final = 5.0
-"""Seconds for decoding the waiting frames after a stream has ended."""
+"""Seconds for decoding queued frames after a stream's end."""
 
 DRAIN_LOOK_INTERVAL: Final = 0.005
-"""Seconds between two checks whether all frames were decoded after a stream's end."""
+"""Seconds between two checks of the queue after a stream's end."""
 
 
 class UnitSource(Protocol):
     """The part of a receiver that decoding uses."""
 
     def utc(self, timestamp: int, /) -> float | None:
-        """Return a time on the sender's wall clock, if the sender has reported it."""
+        """Return a time on the sender's wall clock; None: not reported yet."""
         ...
 
     def want_picture(self) -> None:
@@ -52,7 +50,7 @@ class UnitSource(Protocol):
         ...
 
     def shown(self) -> None:
-        """Note that a picture could be decoded."""
+        """Note that a picture was decoded."""
         ...
 
 
@@ -61,12 +59,12 @@ class DecodingPlan(NamedTuple):
 
     Attributes:
         name: name of the source.
-        coding: coding of the stream.
+        coding: codec of the stream.
         delay: longest time from exposure to arrival, seconds.
         size: size that the pictures must have; None: any.
         sets: parameters of the codec from the stream's description, as in a file.
         to: pixel format of FFmpeg that pictures are converted to; "": no conversion.
-        passed_on: whether encoded frames are passed on as they came.
+        passed_on: whether encoded frames are passed on without decoding.
     """
 
     name: str
@@ -79,7 +77,7 @@ class DecodingPlan(NamedTuple):
 
 
 class UnitDecoding:
-    """Decodes a stream while a driver streams.
+    """Decode a stream for a driver.
 
     Args:
         plan: options for decoding.
@@ -94,29 +92,29 @@ class UnitDecoding:
         self._came = asyncio.Event()
         self.overflows = 0
         self._source: UnitSource | None = None
-        self._skipped = 0  # number of units that were dropped since the last decoded one
-        self._anew = True  # whether the next unit belongs to another stream than the last one
+        self._skipped = 0  # number of units dropped since the last decoded one
+        self._anew = True  # whether the next unit begins another stream
         self._reorders = False
         self._pace = _UnitPace()
         self._missed = self._number = 0
-        self._failed = 0  # number of frames in a row that could not be decoded
+        self._failed = 0  # number of undecodable frames in a row
         self._failing_since = 0.0
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
         self._run = StreamRuns(self._codecs)
         self._decoder: H264Decoder | None = None
-        self._idle = False  # set while nothing is being decoded or waits
+        self._idle = False  # True while no frame is decoded or queued
         self._task: asyncio.Task[None] | None = None
 
     async def begin(self, source: UnitSource) -> None:
-        """Begin to decode the frames of a source."""
+        """Start decoding the frames of a source."""
         self._source = source
         await self._codecs.__aenter__()
         self._task = asyncio.create_task(self._decode(), name=f"frames of {self._name}")
 
     async def end(self) -> None:
-        """End everything; the sink gets nothing more."""
+        """Stop decoding; the sink is not called any more."""
         self._ended = True
         task, self._task = self._task, None
         if task is not None:
@@ -137,20 +135,20 @@ class UnitDecoding:
             self._sink.ended(error)
 
     async def finish(self, error: FrameSourceError) -> None:
-        """Report the end to the sink, after the waiting frames were decoded.
+        """Report the end to the sink after decoding the queued frames.
 
         The wait is bounded by :data:`DRAIN_TIMEOUT`.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DRAIN_TIMEOUT):
-                while self._units and not self._ended:  # noqa: ASYNC110 - no event says so
+                while self._units and not self._ended:  # noqa: ASYNC110 - there is no event
                     await asyncio.sleep(DRAIN_LOOK_INTERVAL)
         self.over(error)
 
     def take(self, units: list[AccessUnit]) -> None:
-        """Queue encoded frames for the decoder, all or none."""
+        """Queue encoded frames for the decoder: all, or none if there are too many."""
         source = self._source
-        assert source is not None  # noqa: S101 - nothing comes before it begins
+        assert source is not None  # noqa: S101 - set by begin
         self._units += [(one, source.utc(one.timestamp)) for one in units]
         if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
@@ -162,13 +160,13 @@ class UnitDecoding:
         if self._idle and self._units and self._run.short and not self._ended:
             try:
                 at_once(self._decode_next())
-            except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            except Exception as exc:  # noqa: BLE001 - passed on to readers
                 self._fail(exc)
         if self._units:
             self._came.set()
 
     def _fail(self, exc: Exception) -> None:
-        """Tell the sink of an error, of whatever kind."""
+        """Report an error of any kind to the sink."""
         if not isinstance(exc, FrameSourceError):
             failed = FrameSourceError(f"{self._name}: {exc!r}")
             failed.__cause__ = exc
@@ -176,7 +174,7 @@ class UnitDecoding:
         self.over(exc)
 
     async def _decode(self) -> None:
-        """Decode queued frames, which could not be decoded at once."""
+        """Decode the queued frames."""
         try:
             while not self._ended:
                 if not self._units:
@@ -186,17 +184,17 @@ class UnitDecoding:
                 self._idle = False
                 if self._units:
                     await self._decode_next()
-                    await asyncio.sleep(0)  # pictures that came together must not block the loop
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+                    await asyncio.sleep(0)  # several pictures must not block the loop
+        except Exception as exc:  # noqa: BLE001 - passed on to readers
             self._fail(exc)
 
     async def _decode_next(self) -> None:
         unit, device_time = self._units.popleft()
         begins = unit.begins or self._anew
-        behind = not begins and self._pace.goes_back(unit)
+        goes_back = not begins and self._pace.goes_back(unit)
         missing = self._pace.lost(unit) + self._skipped
         self._missed += missing
-        if behind and not self._reorders:
+        if goes_back and not self._reorders:
             self._reorders = begins = True
         if begins or self._decoder is None:
             self._decoder = self._made_decoder()
@@ -218,25 +216,25 @@ class UnitDecoding:
     async def _give(
         self, decoder: H264Decoder, unit: AccessUnit, device_time: float | None
     ) -> None:
-        """Have an encoded frame decoded, and hand its picture on."""
+        """Decode an encoded frame, and pass its picture on."""
         frame = self._frame(unit, device_time)
         if frame is not None and not self._plan.passed_on:
             frame = await self._decoded(decoder, frame)
         if frame is not None:
             self._show(frame)
-        elif not (self._reorders and decoder.whole):  # the coroutine waits there for another frame
+        elif not (self._reorders and decoder.whole):  # the decoder waits for another frame
             self._missed += 1
             if self._source is not None:
                 self._source.want_picture()
 
     def _frame(self, unit: AccessUnit, device_time: float | None) -> Frame | None:
-        """Return an encoded frame; None: its size is not known yet."""
+        """Return an encoded frame; None: the size is not known yet."""
         size = self._size = self._plan.coding.size_in(unit.data) or self._size
         if size is None:
             return None
         if self._plan.size not in (None, size):
             raise FrameFormatError(
-                f"{self._name}: expected pictures of {_shown(self._plan.size)}, as it was opened, "
+                f"{self._name}: expected {_shown(self._plan.size)}, the size at the opening, "
                 f"got {_shown(size)}: open it anew",
                 available=(_shown(size),),
             )
@@ -259,7 +257,7 @@ class UnitDecoding:
     async def _decoded(self, decoder: H264Decoder, frame: Frame) -> Frame | None:
         try:
             decoded = await decoder.decode(frame)
-        # one frame may be damaged; if all are, the cause is another
+        # a single frame may be damaged; many in a row are an error
         except FrameFormatError as exc:
             self._failed += 1
             if self._failed == 1:
@@ -282,25 +280,25 @@ class UnitDecoding:
 
 
 class _UnitPace:
-    """The pace of encoded frames, from which the number of frames in a gap follows."""
+    """The pace of encoded frames, which gives the number of frames in a gap."""
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._step = 0  # ticks between the last two frames that followed each other
+        self._step = 0  # ticks between the last two consecutive frames
 
     def goes_back(self, unit: AccessUnit) -> bool:
-        """Return True if a frame must be shown before one that came earlier."""
-        return self._last is not None and -STEP_MOST < self._since(unit) < 0
+        """Return True if a frame must be shown before an earlier received one."""
+        return self._last is not None and -MAX_STEP_TICKS < self._since(unit) < 0
 
     def lost(self, unit: AccessUnit) -> int:
-        """Return the number of frames lost before this one, as far as that can be known.
+        """Return the estimated number of frames lost before this frame.
 
-        For a gap in which whole frames vanished it is the number that fit into the time at the pace
-        of the frames before, but at most the number of missing packets.
+        For a gap with whole frames lost, the number follows from the time and the pace of earlier
+        frames, and is at most the number of missing packets.
         """
         since = 0 if self._last is None or unit.begins else self._since(unit)
         least = max(unit.damaged, 1 if unit.lost or unit.begins else 0)
-        if not least and 0 < since < STEP_MOST:
+        if not least and 0 < since < MAX_STEP_TICKS:
             self._step = since
         if self._last is None or since >= 0:
             self._last = unit.timestamp
@@ -312,8 +310,8 @@ class _UnitPace:
         return (since + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
 
 
-STEP_MOST: Final = 60 * 90_000
-"""Frames that are more ticks apart do not define a pace."""
+MAX_STEP_TICKS: Final = 60 * 90_000
+"""Largest distance of two frames, ticks, that defines a pace."""
 
 
 def _shown(size: tuple[int, int] | None) -> str:

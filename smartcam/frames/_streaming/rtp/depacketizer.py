@@ -1,4 +1,4 @@
-"""Assemble the packets of one stream into encoded frames, in order and each once."""
+"""Assemble the packets of one stream into encoded frames in order, without duplicates."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 64
-"""Largest number of packets that may wait for an earlier one that is missing."""
+"""Largest number of packets that wait for a missing earlier packet."""
 
 MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
-"""A sequence number that is further ahead, or behind, by this many packets shows a restarted
-stream, if a second one follows it."""
+"""Largest distance of a sequence number ahead or late; two consecutive numbers beyond it show a
+restarted stream."""
 
 MARKER_PROOFS: Final = 2
-"""Markers are trusted after this many frames whose marker was followed by another timestamp."""
+"""Number of frames with a right marker, after which markers are trusted."""
 
 
 class Depacketizer:
-    """Assembles whole encoded frames from one stream's packets, in order and each once.
+    """Assemble complete encoded frames from one stream's packets, in order, without duplicates.
 
-    Packets may come late, twice, or not at all. A missing packet is awaited until ``window``
-    packets came after it, or until the caller gives it up by :meth:`give_up`. Another SSRC is a new
+    Packets may come late, twice, or never. A missing packet is awaited until ``window`` packets
+    have come after it, or until the caller drops it by :meth:`give_up`. Another SSRC is a new
     stream.
 
-    A frame ends with the packet that has the marker. Some senders mark each slice or unit: a wary
-    reader waits until :data:`MARKER_PROOFS` frames have shown that markers are right, or until
-    :meth:`end_marked`; after a wrong marker frames end with the next timestamp. Parameters without
-    a picture belong to the next frame, whatever their marker and timestamp.
+    A frame ends with the packet that has the marker. Some senders mark each slice or unit: with
+    ``wary``, markers are trusted only after :data:`MARKER_PROOFS` frames with right markers, or by
+    :meth:`end_marked`; after a wrong marker, frames end at the next timestamp. Parameters without a
+    picture always belong to the next frame.
 
     Args:
         window: largest number of packets after a missing one.
@@ -43,10 +43,10 @@ class Depacketizer:
         wary: whether markers are trusted only after proofs.
 
     Attributes:
-        lost: number of packets that never came.
+        lost: number of lost packets.
         duplicates: packets that came more than once, or too late.
-        damaged: number of frames of which only a part came.
-        streams: number of times that a stream began.
+        damaged: number of incomplete frames.
+        streams: number of streams so far.
         proofs: number of frames whose marker was right; :data:`MARKER_PROOFS` are enough.
     """
 
@@ -58,25 +58,25 @@ class Depacketizer:
         self.proofs = 0 if wary else MARKER_PROOFS
         self.lost = self.duplicates = self.damaged = self.streams = 0
         self._ssrc: int | None = None
-        self._told = (0, 0)  # counts of lost and damaged in the last unit
+        self._reported = (0, 0)  # lost and damaged when the last unit was returned
         self._begin()
 
     def _begin(self) -> None:
-        self._next: int | None = None  # next expected number, with the wraps counted
+        self._next: int | None = None  # next expected sequence number with wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
         self._open: OpenUnit | None = None
-        self._sure = False  # whether the next packet is the first one of a frame
-        self._closed: int | None = None  # timestamp of the last frame that ended
-        self._begins = True  # whether no frame of the stream was whole yet
-        self._odd: int | None = None  # number that would follow a sequence number that was far off
-        # time of the open frame's marker, while the frame waits
+        self._sure = False  # whether the next packet is the first of a frame
+        self._closed: int | None = None  # timestamp of the last ended frame
+        self._begins = True  # whether the stream has had no complete frame yet
+        self._odd: int | None = None  # number after a sequence number that was far off
+        # time of the open frame's untrusted marker
         self._marked_at: float | None = None
-        self._marked = False  # whether the last frame that ended had a marker
+        self._marked = False  # whether the last ended frame had a marker
         self._marks_lie = False
-        self._parameters: OpenUnit | None = None  # parameters that came without a picture
+        self._parameters: OpenUnit | None = None  # parameters without a picture
 
     def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
-        """Take a packet, and return the frames that it completes.
+        """Add a packet, and return the frames that it completes.
 
         Args:
             packet: packet of the stream.
@@ -104,9 +104,9 @@ class Depacketizer:
         return [one & 0xFFFF for one in gone]
 
     def tail(self) -> int | None:
-        """Return the next sequence number of a frame whose end has not come yet.
+        """Return the next sequence number of the open frame.
 
-        It is None if no frame is open, or if earlier packets are missing.
+        None: no frame is open, or earlier packets are missing.
         """
         if self._open is None or not self._open.whole or self._held or self._next is None:
             return None
@@ -116,27 +116,27 @@ class Depacketizer:
 
     @property
     def marked_at(self) -> float | None:
-        """Time of a frame's marker that is not trusted yet; None if no frame waits for that."""
+        """Time of the open frame's untrusted marker; None: no such marker."""
         return None if self._held else self._marked_at
 
     def end_marked(self, before: float) -> list[AccessUnit]:
-        """Return the frame whose marker came before a moment, with no packet after it."""
+        """Return the open frame if its marker came before a moment and no packet followed."""
         marked = self.marked_at
         return list(self._end()) if marked is not None and marked < before else []
 
     def waits_since(self) -> float | None:
-        """Return the time of the first packet that waits for another one; None without one."""
+        """Return the arrival of the first packet that waits for a missing one; None: none waits."""
         return min((now for _, now in self._held.values()), default=None)
 
     def give_up(self, before: float) -> list[AccessUnit]:
-        """Give up packets overdue since a moment, and return the frames that are complete then."""
+        """Drop packets overdue since a moment, and return the frames that are complete then."""
         made: list[AccessUnit] = []
         while (since := self.waits_since()) is not None and since < before:
             made += self._ready(True)
         return made
 
     def _place(self, sequence: int) -> int | None:
-        """Return a packet's number with the wraps counted; None for a duplicate or late packet."""
+        """Return a packet's number with wraps counted; None for a duplicate or late packet."""
         if self._next is None:
             self._next = sequence
         off = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
@@ -189,7 +189,7 @@ class Depacketizer:
                 yield from self._end()
 
     def _opened(self, packet: RtpPacket, now: float) -> OpenUnit:
-        again = packet.timestamp == self._closed  # the frame was not over
+        again = packet.timestamp == self._closed  # the frame had not ended
         self.proofs += self._marked and self._sure and not again
         if again and self._sure and packet.payload:
             self._marks_lie, self.proofs = True, 0
@@ -212,8 +212,8 @@ class Depacketizer:
         if not ended.ended():
             self.damaged += 1
             return
-        lost, damaged = self._told
-        self._told = (self.lost, self.damaged)
+        lost, damaged = self._reported
+        self._reported = (self.lost, self.damaged)
         since, begins, self._begins = (
             (self.lost - lost, self.damaged - damaged),
             self._begins,

@@ -24,26 +24,24 @@ KNOWN: Final = ("delay", "from", "name", "payload", "repair", "size", "timeout")
 
 
 class RtpDriver(FrameDriver):
-    """H.264 that is sent to this machine by RTP: ``rtp://0.0.0.0:5004?size=640x480``.
+    """A stream of H.264 sent to this machine by RTP: ``rtp://0.0.0.0:5004?size=640x480``.
 
-    The address is one of this machine, or a multicast group, which is joined. RTCP is on the next
-    port.
+    The address is this machine's, or a multicast group to join. RTCP uses the next port.
 
     ============ =================================================================================
-    ``size``     of the pictures; usual: as the stream says, for which opening waits
-    ``payload``  type of the packets, usual 96; others are dropped
-    ``repair``   seconds that a missing packet is waited for while the sender is asked for it;
-                 usual 0.1, 0: not at all
-    ``timeout``  seconds without a packet after which the sender counts as gone; usual 5
-    ``delay``    longest time from exposure to arrival, seconds; usual 1
-    ``from``     host whose packets alone count; usual: anybody's, of one sender at a time
+    ``size``     of the pictures; default: from the stream, for which opening waits
+    ``payload``  type of the packets, default 96; others are dropped
+    ``repair``   seconds to wait for a missing packet, which is requested from the sender;
+                 default 0.1; 0: no repair
+    ``timeout``  seconds without a packet after which the sender counts as gone; default 5
+    ``delay``    longest time from exposure to arrival, seconds; default 1
+    ``from``     only accepted sender; default: any host, one sender at a time
     ``name``     of the camera
     ============ =================================================================================
 
-    Only whole pictures are returned. Lost packets are requested again (generic NACK), and if they
-    do not come, a key frame (PLI); a sender that supports neither is awaited until its next
-    refresh. ``frame.lost`` counts frames that are known to be missing: for a gap in which whole
-    frames vanished, one.
+    Only complete pictures are returned. Lost packets are requested again (generic NACK), and if
+    they do not come, a key frame (PLI); without support by the sender, pictures continue after its
+    next refresh. ``frame.lost`` is the estimated number of lost frames.
 
     ``captured`` is the arrival of a frame's first packet. Once the sender has reported its clock
     (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
@@ -51,17 +49,17 @@ class RtpDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        said = address.parameters(KNOWN)
+        given = address.parameters(KNOWN)
         number = address.number
-        self._wanted = address.size(said["size"]) if "size" in said else None
+        self._wanted = address.size(given["size"]) if "size" in given else None
         self._plan = _RtpPlan(
-            said.get("name") or address.shown.partition("?")[0],
-            int(number("payload", said.get("payload", "96"), 0, 127)),
-            number("repair", said.get("repair", "0.1"), 0, 1),
-            number("timeout", said.get("timeout", "5"), 0.1, 600),
-            number("delay", said.get("delay", "1"), 0, 600),
+            given.get("name") or address.shown.partition("?")[0],
+            int(number("payload", given.get("payload", "96"), 0, 127)),
+            number("repair", given.get("repair", "0.1"), 0, 1),
+            number("timeout", given.get("timeout", "5"), 0.1, 600),
+            number("delay", given.get("delay", "1"), 0, 600),
         )
-        self._from = said.get("from", "")
+        self._from = given.get("from", "")
         if not address.host or not 1 <= (address.port or 5004) < 65535:
             raise address.wrong("address", "HOST:PORT with a port below 65535", address.shown)
         self._where = (address.host, address.port or 5004)
@@ -81,8 +79,8 @@ class RtpDriver(FrameDriver):
         """Check that the port is free; without a ``size``, also wait for a first picture.
 
         Raises:
-            FrameSourceError: the port is in use, the address is not valid here, or nothing comes in
-                time.
+            FrameSourceError: the port is in use, the address is not this machine's, or no picture
+                comes in time.
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
@@ -115,7 +113,7 @@ class RtpDriver(FrameDriver):
             return SocketPair.listening(endpoint)
         except OSError as exc:
             raise FrameSourceError(
-                f"{self.name}: cannot listen there, and at the next port for RTCP: {exc}",
+                f"{self.name}: cannot listen on this port and, for RTCP, on the next: {exc}",
                 source=self.name,
             ) from exc
 
@@ -144,7 +142,7 @@ class RtpDriver(FrameDriver):
 
 
 class FirstPicture(FrameSink):
-    """A sink that takes one picture."""
+    """A sink that waits for one picture."""
 
     def __init__(self) -> None:
         self.came: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
@@ -159,25 +157,25 @@ class FirstPicture(FrameSink):
     def ended(self, error: FrameSourceError | None) -> None:
         if error is not None and not self.came.done():
             self.came.set_exception(error)
-            self.came.exception()  # the waiting task may have gone
+            self.came.exception()  # mark the error as retrieved
 
 
 class _RtpPlan(NamedTuple):
-    """The options that the URL gives."""
+    """Options from the URL."""
 
     name: str
     payload: int
     repair: float
     timeout: float
     delay: float
-    only: str = ""  # address of the sender's host; "" for any host
+    only: str = ""  # address of the only accepted host; "": any host
 
 
 class _RtpStream:
     """The tasks and sockets of a driver while it streams.
 
     Args:
-        size: size of the pictures; None: as the stream says.
+        size: size of the pictures; None: from the stream.
     """
 
     def __init__(
@@ -196,14 +194,14 @@ class _RtpStream:
         )
 
     async def begin(self) -> None:
-        """Decode what comes."""
+        """Start receiving and decoding."""
         await self._decoding.begin(self._receiver)
-        if self._watched:  # who opens it has a timeout of its own, and says more
+        if self._watched:  # open() has its own timeout with a fuller error
             name = f"silence of {self._plan.name}"
             self._watching = asyncio.create_task(self._watch(), name=name)
 
     async def end(self) -> None:
-        """End everything; the sink gets nothing more."""
+        """Stop; the sink is not called any more."""
         self._receiver.close()
         watching, self._watching = self._watching, None
         if watching is not None:
@@ -225,7 +223,7 @@ class _RtpStream:
     async def _watch(self) -> None:
         receiver, longest = self._receiver, self._plan.timeout
         loop = asyncio.get_running_loop()
-        while (left := receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+        while (left := receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(left)
         text = f"{self._plan.name}: no packet came for {self._plan.timeout:g} s"
         self._decoding.over(FrameSourceError(text))

@@ -1,4 +1,4 @@
-"""Read and write a receiver's reports: its name, its losses, its requests for packets."""
+"""Keep a sender's receivers with their reports, and packets to send again."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from smartcam.frames._streaming.rtp.parameters import CLOCK_RATE
 from smartcam.frames._streaming.rtp.reception import middle, ntp_time
 
 RECEIVER_TIMEOUT: Final = 10.0
-"""Seconds after which a receiver that no longer reports is forgotten."""
+"""Seconds without a report after which a receiver is forgotten."""
 
 MAX_RECEIVERS: Final = 64
 
 MAX_KEPT_PACKETS: Final = 1024
-"""Largest number of packets that are kept to be sent again on request."""
+"""Largest number of packets that are kept for requests to send them again."""
 
 MAX_RESEND_AGE: Final = 0.2
-"""Seconds after which a packet is not sent again: its picture would be late."""
+"""Largest age, seconds, of a packet that is sent again: its picture would be late."""
 
 MAX_RESENDS: Final = 5
-"""Largest number of times that one packet is sent again."""
+"""Largest number of repetitions of one packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +31,12 @@ class RtpReceiver:
     """The last report of a receiver.
 
     Attributes:
-        address: address that the receiver reports from, ``HOST:PORT``.
-        loss: share of the packets lost since the report before, 0 to 1.
-        lost: packets lost since the beginning, minus those that came when sent again.
+        address: address of the receiver's reports, ``HOST:PORT``.
+        loss: share of packets lost since the report before, 0 to 1.
+        lost: packets lost since the beginning, minus repaired ones.
         jitter: jitter of the arrival, seconds.
-        round_trip: round-trip time, seconds; None: not known.
-        age: seconds since the receiver was last heard.
+        round_trip: round-trip time, seconds; None: unknown.
+        age: seconds since the last report.
     """
 
     address: str
@@ -66,7 +66,7 @@ class Audience:
         self._heard: dict[int, _HeardReceiver] = {}
 
     def report(self, report: ReceiverReport, address: str) -> bool:
-        """Take a report; return True if it is the first of its receiver."""
+        """Record a report; return True if it is the first of its receiver."""
         now = time.monotonic()
         self._forget(now)
         new = report.ssrc not in self._heard
@@ -74,7 +74,7 @@ class Audience:
             return False
         known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
         block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
-        if block is not None:  # urgent requests come without it
+        if block is not None:  # urgent requests have no report block
             known = _HeardReceiver(address, block, _round_trip(block), now)
         self._heard[report.ssrc] = known._replace(at=now)
         return new
@@ -84,7 +84,7 @@ class Audience:
         self._heard.pop(ssrc, None)
 
     def receivers(self) -> tuple[RtpReceiver, ...]:
-        """Return the receivers that still report."""
+        """Return the reporting receivers."""
         now = time.monotonic()
         self._forget(now)
         return tuple(
@@ -106,11 +106,11 @@ class Audience:
 
 
 def _round_trip(block: ReportBlock) -> float | None:
-    """Return RFC 3550's round-trip time, seconds, if the block refers to a sender report."""
+    """Return RFC 3550's round-trip time, seconds; None if the block names no sender report."""
     if not block.last_report:
         return None
     ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
-    return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 if a clock was set
+    return ticks / 65536 if ticks < 1 << 31 else 0.0  # negative after a clock was set
 
 
 class _SentPacket:
@@ -121,19 +121,19 @@ class _SentPacket:
 
 
 class PacketHistory:
-    """The packets of the last moments."""
+    """Recent packets, for requests to send them again."""
 
     def __init__(self) -> None:
         self._sent: collections.OrderedDict[int, _SentPacket] = collections.OrderedDict()
 
     def sent(self, sequence: int, data: bytes) -> None:
-        """Remember a packet."""
+        """Store a packet."""
         self._sent[sequence] = _SentPacket(data)
         if len(self._sent) > MAX_KEPT_PACKETS:
             self._sent.popitem(last=False)
 
     def again(self, sequence: int) -> bytes | None:
-        """Return a packet to send again; None if it is too old, or was sent too often."""
+        """Return a packet to send again; None if it is too old or was sent too often."""
         found = self._sent.get(sequence)
         if (
             found is None

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 MTU_PAYLOAD: Final = 1380
-"""Bytes of a packet behind its header: with UDP, IP and a tunnel they fit into Ethernet's 1500."""
+"""Largest payload of a packet, bytes; with headers and a tunnel it fits into Ethernet's 1500."""
 
 SLICES, KEY, SPS, PPS, DELIMITER = range(1, 6), 5, 7, 8, 9
-"""Kinds of units (ITU-T H.264, table 7-1)."""
+"""Types of NAL units (ITU-T H.264, table 7-1)."""
 
 STAP_A, FU_A = 24, 28
-"""Kinds of payloads: several units in a packet, and a part of one."""
+"""Types of payloads: several units in a packet, and a fragment of a unit."""
 
 
 def units(access_unit: bytes) -> list[bytes]:
@@ -30,7 +30,7 @@ def units(access_unit: bytes) -> list[bytes]:
         access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: the frame begins with no start code, or has a unit of no known kind.
+        FrameFormatError: there is no start code first, or a unit has an unknown type.
     """
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")
@@ -48,7 +48,7 @@ def units(access_unit: bytes) -> list[bytes]:
 
 
 def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
-    """Return the sequence's and the picture's parameters; None if one of them is not in it.
+    """Return the sequence and picture parameter sets; None if one is missing.
 
     Raises:
         FrameFormatError: as :func:`units`.
@@ -60,20 +60,21 @@ def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
 
 
 class H264Packetizer:
-    """Makes the packets of one stream.
+    """Make the packets of one stream.
 
     Args:
-        payload_type: 0 to 127; formats without a number of their own, as H.264, take 96 to 127.
+        payload_type: payload type, 0 to 127; formats without an assigned type, such as H.264, use
+            96 to 127.
         ssrc: SSRC of the stream; None: a random one.
         sequence: number of the first packet; None: a random one.
-        mtu_payload: bytes of a packet's payload.
+        mtu_payload: largest payload of a packet, bytes.
 
     Attributes:
-        packets_made: since the beginning.
-        octets_made: bytes of the packets' payloads.
+        packets_made: number of packets so far.
+        octets_made: number of payload bytes so far.
 
     Raises:
-        ConfigurationError: a number out of its range.
+        ConfigurationError: a number is out of range.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class H264Packetizer:
 
     @property
     def sequence(self) -> int:
-        """The next packet's."""
+        """Sequence number of the next packet."""
         return self._sequence
 
     def packets(self, access_unit: bytes, timestamp: int) -> list[bytes]:
@@ -107,10 +108,10 @@ class H264Packetizer:
 
         Args:
             access_unit: one encoded frame, as in a file (annex B).
-            timestamp: timestamp of the frame, in ticks of 90 kHz; its lower 32 bits count.
+            timestamp: timestamp of the frame, ticks of 90 kHz; the lower 32 bits are used.
 
         Raises:
-            FrameFormatError: the frame is no encoded frame; no sequence number was used.
+            FrameFormatError: the frame is not valid; no sequence number was used.
         """
         payloads = [
             part for group in self._groups(units(access_unit)) for part in self._payloads(group)
@@ -126,7 +127,7 @@ class H264Packetizer:
         return made
 
     def _groups(self, found: list[bytes]) -> Iterator[list[bytes]]:
-        """Yield the units that go together: parameter sets and messages, as far as they fit."""
+        """Yield groups of units for one packet: parameter sets and messages, as far as they fit."""
         group: list[bytes] = []
         for unit in found:
             fits = 1 + sum(2 + len(one) for one in (*group, unit)) <= self._mtu
@@ -173,18 +174,18 @@ class H264Unit(NalUnit):
 
     @classmethod
     def whole_head(cls, payload: bytes) -> bytes:
-        """Return the head of the unit that a packet has a part of."""
+        """Return the header of the unit whose fragment is in a packet."""
         return bytes((payload[0] & 0xE0 | payload[1] & 0x1F,))
 
 
 class H264Units:
-    """The units of a stream of H.264, as seen in its packets."""
+    """The kind of access units of H.264."""
 
     open = H264Unit
 
     @staticmethod
     def begins(payload: bytes) -> bool:
-        """Return True if a packet begins a frame: by its kind, or as a key frame's first slice."""
+        """Return True if a packet begins a frame by its type, or as a key frame's first slice."""
         kind = payload[0] & 0x1F if payload else 0
         if kind == STAP_A and len(payload) > 3:
             payload = payload[3:]
@@ -192,7 +193,7 @@ class H264Units:
         elif kind == FU_A and len(payload) > 2 and payload[1] & START:
             payload = payload[1:]
             kind = payload[0] & 0x1F
-        if kind == KEY:  # its first macroblock's number stands first, and 0 is one bit
+        if kind == KEY:  # first_mb_in_slice is the first field; 0 is coded as one bit
             return len(payload) > 1 and bool(payload[1] & 0x80)
         return kind in (SPS, DELIMITER)
 

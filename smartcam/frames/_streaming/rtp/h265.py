@@ -1,4 +1,4 @@
-"""H.265 of RTP packets (RFC 7798), without the numbers of interleaved packets."""
+"""H.265 in RTP packets (RFC 7798), without interleaving (DON fields)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from smartcam.frames._streaming.rtp.assembling import NalUnit
 from smartcam.frames._streaming.rtp.parameters import FieldBits, checked_size
 
 VPS, SPS, PPS, DELIMITER = 32, 33, 34, 35
-"""Kinds of units (ITU-T H.265, table 7-1)."""
+"""Types of NAL units (ITU-T H.265, table 7-1)."""
 
 KEYS: Final = range(16, 24)
-"""Kinds of slices of pictures that refer to none before them."""
+"""Types of slices of key frames."""
 
 _SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
 
@@ -33,18 +33,18 @@ class H265Unit(NalUnit):
 
     @classmethod
     def whole_head(cls, payload: bytes) -> bytes:
-        """Return the head of the unit that a packet has a part of."""
+        """Return the header of the unit whose fragment is in a packet."""
         return bytes((payload[0] & 0x81 | (payload[2] & 0x3F) << 1, payload[1]))
 
 
 class H265Units:
-    """The kind of a stream of H.265."""
+    """The kind of access units of H.265."""
 
     open = H265Unit
 
     @staticmethod
     def begins(payload: bytes) -> bool:
-        """Return True if a packet has a unit that only begins frames."""
+        """Return True if a packet has a unit that can only begin a frame."""
         kind = H265Unit.kind_of(payload[0]) if payload else -1
         if kind == H265Unit.SEVERAL and len(payload) > 4:
             payload = payload[4:]
@@ -52,7 +52,7 @@ class H265Units:
         elif kind == H265Unit.PART and len(payload) > 3 and payload[2] & 0x80:
             payload = H265Unit.whole_head(payload) + payload[3:]
             kind = H265Unit.kind_of(payload[0])
-        if kind in KEYS:  # the first slice of a picture says so with its first bit
+        if kind in KEYS:  # first_slice_segment_in_pic_flag is the first bit
             return len(payload) > 2 and bool(payload[2] & 0x80)
         return kind in (VPS, SPS, DELIMITER)
 
@@ -61,7 +61,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
     """Return the width and the height of the pictures, in pixels.
 
     Args:
-        sps: the sequence's parameters, with the two bytes of their head.
+        sps: sequence parameter set, with its header of two bytes.
 
     Raises:
         FrameFormatError: the parameters are not valid.
@@ -73,9 +73,9 @@ def _size(bits: FieldBits) -> tuple[int, int]:
     bits.fixed(4)
     layers = bits.fixed(3)
     bits.fixed(1 + 96)
-    said = [(bits.fixed(1), bits.fixed(1)) for _ in range(layers)]
+    flags = [(bits.fixed(1), bits.fixed(1)) for _ in range(layers)]
     bits.fixed(2 * (8 - layers) if layers else 0)
-    for profile, level in said:
+    for profile, level in flags:
         bits.fixed(88 * profile + 8 * level)
     bits.unsigned()
     colours = bits.unsigned()
@@ -88,7 +88,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
 
 
 def size_in(access_unit: bytes) -> tuple[int, int] | None:
-    """Return the size of the pictures where an encoded frame has the parameters.
+    """Return the size of the pictures; None if an encoded frame has no parameters.
 
     Raises:
         FrameFormatError: the parameters are not valid.

@@ -7,8 +7,8 @@ from typing import Final
 
 from smartcam.frames._streaming.rtp.assembling import OpenUnit
 
-HEAD: Final = 8
-"""Number of bytes before a packet's piece of a picture."""
+HEAD_BYTES: Final = 8
+"""Number of bytes of the header of a packet's piece of a picture."""
 
 RESTARTS: Final = range(64, 128)
 """Types of pictures with restart markers."""
@@ -51,14 +51,14 @@ _HUFFMAN: Final = tuple(
         ),
     )
 )
-"""Huffman tables of every such picture (annex K.3): class and id, counts, values."""
+"""Huffman tables of all these pictures (annex K.3): class and id, counts, values."""
 
 
 class JpegUnits:
-    """The kind of a stream of JPEGs; it remembers tables that are sent once.
+    """The kind of access units of JPEGs; it stores tables that are sent once.
 
     Args:
-        size: size of the pictures, if it is above 2040 pixels and so not in the packets.
+        size: size of the pictures, for sizes above 2040 pixels, which packets do not have.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:
@@ -72,7 +72,7 @@ class JpegUnits:
     @staticmethod
     def begins(payload: bytes) -> bool:
         """Return True if a packet has the first piece of a picture."""
-        return len(payload) > HEAD and payload[1:4] == b"\0\0\0"
+        return len(payload) > HEAD_BYTES and payload[1:4] == b"\0\0\0"
 
 
 class JpegUnit(OpenUnit):
@@ -89,9 +89,9 @@ class JpegUnit(OpenUnit):
         return b"".join((*self.parts, end))
 
     def _added(self, payload: bytes) -> bool:
-        if len(payload) <= HEAD or int.from_bytes(payload[1:4], "big") != self._next:
+        if len(payload) <= HEAD_BYTES or int.from_bytes(payload[1:4], "big") != self._next:
             return False
-        place = HEAD
+        place = HEAD_BYTES
         restart = b""
         if payload[4] in RESTARTS:
             restart, place = payload[place : place + 2], place + 4
@@ -108,7 +108,7 @@ class JpegUnit(OpenUnit):
         return bool(piece)
 
     def _tables(self, payload: bytes, place: int) -> tuple[int, tuple[bytes, ...]] | None:
-        """Return the offset after the tables, and the tables; None: they are not known."""
+        """Return the offset after the tables, and the tables; None: the tables are unknown."""
         quality = payload[5]
         if quality < 128:
             return (place, scaled(quality)) if 1 <= quality < 100 else None
@@ -167,7 +167,7 @@ def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
 
 
 def size_in(picture: bytes) -> tuple[int, int] | None:
-    """Return the size in the header of a picture that was assembled here."""
+    """Return the size from the header of an assembled picture."""
     place = picture.find(b"\xff\xc0\0\x11\x08")
     if place < 0 or len(picture) < place + 9:
         return None

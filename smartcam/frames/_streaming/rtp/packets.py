@@ -1,4 +1,4 @@
-"""RTP packets, and the reports of RTCP beside them (RFC 3550, RFC 4585)."""
+"""Read and write packets of RTP and RTCP (RFC 3550, RFC 4585)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 VERSION: Final = 2
 MAX_REPORT_BLOCKS: Final = 31
-"""Report blocks in one report, and sources in one BYE: the count has five bits."""
+"""Largest number of report blocks in a report, and of sources in a BYE: five bits."""
 
 SR, RR, SDES, BYE, APP, RTPFB, PSFB = range(200, 207)
 """Types of RTCP packets."""
@@ -32,11 +32,11 @@ class RtpPacket(NamedTuple):
 
     Attributes:
         marker: True for the last packet of a picture, in video.
-        payload_type: 0 to 127.
-        sequence: 0 to 65535.
-        timestamp: 0 to 2**32 - 1; of video in ticks of 90 kHz.
-        ssrc: the stream, 0 to 2**32 - 1.
-        payload: without padding.
+        payload_type: payload type, 0 to 127.
+        sequence: sequence number, 0 to 65535.
+        timestamp: timestamp, 0 to 2**32 - 1; for video in ticks of 90 kHz.
+        ssrc: id of the stream, 0 to 2**32 - 1.
+        payload: payload without padding.
     """
 
     marker: bool
@@ -54,7 +54,7 @@ class RtpPacket(NamedTuple):
 
     @classmethod
     def parse(cls, data: bytes | memoryview) -> RtpPacket:
-        """Read a datagram; CSRC, extension and padding are taken off.
+        """Read a datagram; CSRC, extension and padding are removed.
 
         Raises:
             MessageError: the datagram is no RTP packet.
@@ -88,13 +88,13 @@ class ReportBlock(NamedTuple):
     """A receiver's report on one stream.
 
     Attributes:
-        ssrc: the stream.
-        fraction: part of its packets that was lost since the last report, in 256ths.
-        lost: packets since the beginning; below 0 where there were more duplicates.
-        highest: sequence number, with the count of its wraps above the 16 bits.
+        ssrc: id of the stream.
+        fraction: share of packets lost since the last report, in 256ths.
+        lost: packets lost since the beginning; negative with many duplicates.
+        highest: highest sequence number, with the count of wraps above the 16 bits.
         jitter: jitter of the arrival, ticks of the stream's clock.
-        last_report: the middle 32 bits of the last sender report's NTP time; 0: none came.
-        delay: since that came, in 65536ths of a second.
+        last_report: middle 32 bits of the last sender report's NTP time; 0: no report.
+        delay: time since this report, in 65536ths of a second.
     """
 
     ssrc: int
@@ -106,7 +106,7 @@ class ReportBlock(NamedTuple):
     delay: int = 0
 
     def pack(self) -> bytes:
-        """Return the block's 24 bytes; ``lost`` is held within its 24 bits."""
+        """Return the block's 24 bytes; ``lost`` is limited to 24 bits."""
         lost = max(-(1 << 23), min(self.lost, (1 << 23) - 1)) & 0xFFFFFF
         rest = (self.highest, self.jitter, self.last_report, self.delay)
         return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *rest)
@@ -123,12 +123,12 @@ class SenderReport(NamedTuple):
     """A sender's report on its stream.
 
     Attributes:
-        ssrc: the stream.
+        ssrc: id of the stream.
         ntp: wall clock of the report, seconds since 1900 in units of 2**-32.
-        timestamp: the stream's clock at the same moment.
-        packets: sent since the beginning.
-        octets: bytes of payload in these packets.
-        blocks: what it says of others' streams, at most 31.
+        timestamp: RTP timestamp of the same moment.
+        packets: number of packets sent so far.
+        octets: number of payload bytes sent so far.
+        blocks: report blocks on other streams, at most 31.
     """
 
     ssrc: int
@@ -145,7 +145,7 @@ class SenderReport(NamedTuple):
 
 
 class ReceiverReport(NamedTuple):
-    """A receiver's reports on the streams that it gets, at most 31."""
+    """A receiver's report with at most 31 blocks."""
 
     ssrc: int
     blocks: tuple[ReportBlock, ...] = ()
@@ -157,7 +157,7 @@ class ReceiverReport(NamedTuple):
 
 
 class SourceDescription(NamedTuple):
-    """The name of a participant, which stays the same when its SSRC changes."""
+    """The permanent name of a participant, independent of its SSRC."""
 
     ssrc: int
     cname: str
@@ -170,7 +170,7 @@ class SourceDescription(NamedTuple):
 
 
 class Goodbye(NamedTuple):
-    """Participants, at most 31, that send no more (BYE)."""
+    """A goodbye (BYE) of at most 31 participants."""
 
     ssrcs: tuple[int, ...]
     reason: str = ""
@@ -186,11 +186,11 @@ class Goodbye(NamedTuple):
 
 
 class PacketsMissing(NamedTuple):
-    """A receiver asks for packets again (generic NACK, RFC 4585).
+    """A receiver's request for missing packets (generic NACK, RFC 4585).
 
     Attributes:
-        ssrc: the receiver.
-        media: the stream.
+        ssrc: id of the receiver.
+        media: id of the stream.
         sequences: numbers of the missing packets.
     """
 
@@ -199,7 +199,7 @@ class PacketsMissing(NamedTuple):
     sequences: tuple[int, ...]
 
     def pack(self) -> bytes:
-        """Return the request's bytes: one entry for up to 17 packets that are near each other."""
+        """Return the request's bytes, with one entry for up to 17 neighbouring packets."""
         body = struct.pack("!II", self.ssrc, self.media)
         left = list(self.sequences)
         while left:
@@ -211,7 +211,7 @@ class PacketsMissing(NamedTuple):
 
 
 class PictureLost(NamedTuple):
-    """A receiver asks for a key frame (PLI, RFC 4585)."""
+    """A receiver's request for a key frame (PLI, RFC 4585)."""
 
     ssrc: int
     media: int
@@ -232,11 +232,10 @@ def compound(*reports: Report) -> bytes:
 
 
 def parse_rtcp(data: bytes) -> list[Report]:
-    """Read a datagram of RTCP; kinds of packets that we have no use for are left out.
+    """Read a datagram of RTCP; unsupported kinds of packets are skipped.
 
     Raises:
-        MessageError: the datagram is not valid: a length or count that does not fit, or not a
-            report at first.
+        MessageError: a length or count is wrong, or the first packet is no report.
     """
     found: list[Report] = []
     place = 0
@@ -272,7 +271,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
 
 
 def is_rtcp(data: bytes) -> bool:
-    """Return True if a datagram is RTCP rather than RTP, where both share a port (RFC 5761)."""
+    """Return True if a datagram is RTCP rather than RTP (RFC 5761)."""
     return len(data) > 1 and 192 <= data[1] <= 223
 
 
@@ -340,7 +339,7 @@ _READERS: Final[dict[int, Callable[[int, bytes], Iterable[Report]]]] = {
     RTPFB: _missing,
     PSFB: _picture_lost,
 }
-"""The reader of each type of packet, called with its count (or kind of feedback) and body."""
+"""Readers by type of packet, which get the count (or kind of feedback) and the body."""
 
 _MASKS: Final = (0xFFFFFFFF, (1 << 64) - 1, 0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF)
 

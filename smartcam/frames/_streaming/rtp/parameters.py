@@ -1,4 +1,4 @@
-"""Read a stream's parameters, for the size of its pictures, and describe it (RFC 8866)."""
+"""Read the size of pictures from H.264 parameter sets, and write SDP (RFC 8866)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_PICTURE_PIXELS: Final = 1 << 27
-"""Largest number of pixels of a picture; parameters with more count as wrong."""
+"""Largest plausible number of pixels of a picture."""
 
 CLOCK_RATE: Final = 90_000
 """Ticks per second of the clock of video streams."""
 
 _HIGH: Final = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
-"""Numbers of the profiles whose parameters have a format of colours (ITU-T H.264, 7.3.2.1.1)."""
+"""Profiles whose parameters have a chroma format (ITU-T H.264, 7.3.2.1.1)."""
 
 _SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
-"""Columns and rows that share a colour, by the format of colours: the units of cropping."""
+"""Chroma subsampling by chroma format, which is the unit of cropping."""
 
 
 class FieldBits:
-    """Reads a unit's fields, one after the other."""
+    """Reader of a unit's bit fields in order."""
 
     def __init__(self, data: bytes) -> None:
         plain = data.replace(b"\0\0\3", b"\0\0")
@@ -52,7 +52,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
     """Return the width and the height of the pictures, in pixels.
 
     Args:
-        sps: parameters of the sequence, as returned by
+        sps: sequence parameter set from
             :func:`~smartcam.frames._streaming.rtp.h264.parameter_sets`.
 
     Raises:
@@ -107,7 +107,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
 
 
 def _high(bits: FieldBits) -> int:
-    """Return the format of colours; 0 if the planes are separate."""
+    """Return the chroma format; 0 for separate planes."""
     colours = bits.unsigned()
     separate = bits.fixed(1) if colours == 3 else 0
     bits.unsigned()
@@ -129,7 +129,7 @@ def _skip_list(bits: FieldBits, count: int) -> None:
 
 
 def size_in(access_unit: bytes) -> tuple[int, int] | None:
-    """Return the size of the pictures, if an encoded frame has the parameters.
+    """Return the size of the pictures; None if an encoded frame has no parameters.
 
     Raises:
         FrameFormatError: the parameters are not valid.
@@ -150,15 +150,15 @@ def description(
     sets: tuple[bytes, bytes] | None = None,
     name: str = "smartcam",
 ) -> str:
-    """Return the SDP of one stream of H.264.
+    """Return the SDP description of a stream of H.264.
 
     Args:
-        host: address that the stream is sent to.
-        port: port that the stream is sent to.
+        host: destination address of the stream.
+        port: destination port of the stream.
         payload_type: payload type of the packets.
         session: number of the session.
-        ttl: number of networks that multicast passes; None: no multicast.
-        sets: parameters of the sequence and of the picture, if they are known.
+        ttl: time to live of multicast; None: no multicast.
+        sets: sequence and picture parameter sets; None: unknown.
         name: name of the session, one line.
     """
     return "".join(

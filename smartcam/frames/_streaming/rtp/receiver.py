@@ -1,4 +1,4 @@
-"""Receive one stream: packets in, whole encoded frames out, reports back."""
+"""Receive the packets of one stream, assemble encoded frames, and send receiver reports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 1024
-"""Largest number of packets that may wait for missing ones."""
+"""Largest number of packets that wait for missing packets."""
 
 LOOK_INTERVAL: Final = 0.005
 """Seconds between two checks for missing packets."""
@@ -30,22 +30,21 @@ LOOK_INTERVAL: Final = 0.005
 RESEND_INTERVAL: Final = 0.02
 """Seconds after which a packet is requested again."""
 
-PAUSE: Final = 0.008
-"""Seconds without a packet in the middle of a frame after which its next one counts as missing:
-otherwise that is only noticed when the next frame comes."""
+MAX_PACKET_INTERVAL: Final = 0.008
+"""Longest pause within a frame, seconds, before its next packet counts as missing: a loss at a
+frame's end would otherwise be noticed only with the next frame."""
 
 MAX_PACKETS_REQUESTED: Final = 256
-"""Largest number of packets requested at a time; if more are missing, a key frame is requested
-instead."""
+"""Largest number of packets requested at a time; beyond it a key frame is requested."""
 
 REORDER_GRACE: Final = 0.02
-"""Seconds to wait for a packet if the sender does not repeat packets."""
+"""Seconds to wait for a late packet if the sender does not repeat packets."""
 
-IN_VAIN: Final = 4
-"""After this many requests in vain, the sender counts as one that does not repeat packets."""
+MAX_UNANSWERED_REQUESTS: Final = 4
+"""Number of unanswered requests after which the sender counts as unable to repeat packets."""
 
 MARKER_GRACE: Final = 0.05
-"""Seconds for which the rest of a frame may follow a marker that is not trusted yet."""
+"""Seconds for which the rest of a frame may follow an untrusted marker."""
 
 REPORT_INTERVAL: Final = 1.0
 """Seconds between two receiver reports."""
@@ -58,7 +57,7 @@ NEW_STREAM_DELAY: Final = 1.0
 from any host after packets without a decodable picture."""
 
 NEW_HOST_DELAY: Final = 5.0
-"""Seconds of silence after which the stream of another host is accepted."""
+"""Seconds of silence after which a stream from another host is accepted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +65,13 @@ class RtpStatistics:
     """Counts of a receiver of RTP since it last began to stream.
 
     Attributes:
-        packets: number of packets that came, duplicates included.
+        packets: number of received packets, duplicates included.
         lost: packets that never came.
-        repaired: packets that came after a request.
-        duplicates: packets that came twice, or too late.
-        damaged: encoded frames that did not come whole.
-        overflows: number of times that decoding was too slow and frames were dropped.
-        strange: datagrams that do not belong to the stream: from other senders, or no RTP.
+        repaired: packets received after a request.
+        duplicates: packets that came twice or too late.
+        damaged: incomplete encoded frames.
+        overflows: number of times that frames were dropped because decoding was too slow.
+        strange: datagrams from other senders or without RTP.
         jitter: jitter of the arrival, seconds.
     """
 
@@ -86,8 +85,8 @@ class RtpStatistics:
     jitter: float = 0.0
 
 
-class PacketWays(Protocol):
-    """The two channels of a stream, such as a pair of sockets: one for packets, one for reports."""
+class PacketChannels(Protocol):
+    """Two channels of a stream, such as sockets: one for packets, one for reports."""
 
     def read(
         self,
@@ -96,7 +95,7 @@ class PacketWays(Protocol):
         read: Callable[[], None],
         /,
     ) -> None:
-        """Call functions for each packet and report, with its sender, and after each batch."""
+        """Call ``rtp`` and ``rtcp`` for each packet and report, and ``read`` after each batch."""
         ...
 
     def report(self, data: bytes, to: tuple[Any, ...], /) -> None:
@@ -104,24 +103,24 @@ class PacketWays(Protocol):
         ...
 
     def close(self) -> None:
-        """Stop calling."""
+        """Stop calling the functions."""
         ...
 
 
 class StreamReceiver:
-    """One stream from a pair of channels, until :meth:`close`, which closes them.
+    """Receiver of a stream from a pair of channels, which :meth:`close` closes.
 
     Args:
-        pair: channels, not read yet.
+        pair: unused channels.
         payload_type: payload type of the stream's packets.
-        repair: seconds to wait for a missing packet, which is requested again.
-        done: function that takes the whole encoded frames.
+        repair: seconds to wait for a missing packet after a request.
+        done: function that is called with complete encoded frames.
         gone: function that is called when the sender says goodbye.
-        only: addresses of the hosts whose packets count; none: any.
+        only: addresses of accepted hosts; empty: any host.
         kind: kind of the payloads; None: H.264.
-        agreed: whether the stream was negotiated: then another one from the same host replaces it
-            at once, and missing packets are awaited without requests.
-        proofs: number of the sender's frames whose marker was right before.
+        agreed: whether the stream was negotiated: then a new stream of the same host replaces it at
+            once, and missing packets are not requested.
+        proofs: number of earlier frames of the sender with a right marker.
 
     Attributes:
         heard: time of the stream's last packet, on the loop's clock.
@@ -129,7 +128,7 @@ class StreamReceiver:
 
     def __init__(
         self,
-        pair: PacketWays,
+        pair: PacketChannels,
         payload_type: int,
         repair: float,
         done: Callable[[list[AccessUnit]], None],
@@ -160,7 +159,7 @@ class StreamReceiver:
         self._next_report: asyncio.TimerHandle | None = None
         self._picture_asked = float("-inf")
         self._began = self._shown_at = float("-inf")
-        self.heard = self._loop.time()
+        self.last_packet_at = self._loop.time()
         pair.read(self._packet, self._report_came, self._read)
 
     def close(self) -> None:
@@ -169,7 +168,7 @@ class StreamReceiver:
             if timer is not None:
                 timer.cancel()
         if self._reception is not None:
-            self._say(wire.Goodbye((self._ssrc,)))
+            self._send_report(wire.Goodbye((self._ssrc,)))
             self._reception = None
         self._pair.close()
 
@@ -189,25 +188,25 @@ class StreamReceiver:
 
     @property
     def proofs(self) -> int:
-        """Number of the sender's frames whose marker was right."""
+        """Number of the sender's frames with a right marker."""
         return self._depacketizer.proofs
 
     def utc(self, timestamp: int) -> float | None:
-        """Return a time on the sender's wall clock, if the sender has reported it."""
+        """Return a time on the sender's wall clock; None: not reported yet."""
         return None if self._reception is None else self._reception.utc(timestamp)
 
     def want_picture(self) -> None:
-        """Request a key frame, unless that was just done."""
+        """Request a key frame, unless one was requested recently."""
         now = self._loop.time()
         if self._reception is not None and now - self._picture_asked >= KEY_FRAME_REQUEST_INTERVAL:
             self._picture_asked = now
-            self._say(wire.PictureLost(self._ssrc, self._reception.ssrc))
+            self._send_report(wire.PictureLost(self._ssrc, self._reception.ssrc))
 
     def shown(self) -> None:
-        """Note that a picture of the stream could be decoded."""
+        """Note that a picture of the stream was decoded."""
         self._shown_at = self._loop.time()
 
-    # what comes
+    # received data
 
     def _packet(self, data: bytes, sender: tuple[Any, ...]) -> None:
         try:
@@ -219,7 +218,7 @@ class StreamReceiver:
         if ours is None:
             self._strange += 1
             return
-        self.heard = now = self._loop.time()
+        self.last_packet_at = now = self._loop.time()
         self._packets += 1
         ours.packet(packet, now)
         if self._asked.pop(packet.sequence, None) is not None:
@@ -228,7 +227,7 @@ class StreamReceiver:
         self._made += self._depacketizer.take(packet, now)
 
     def _stream_of(self, packet: RtpPacket, sender: tuple[Any, ...]) -> Reception | None:
-        """Return the stream of a packet: the first stream is accepted until it is silent."""
+        """Return the stream of a packet; the first stream is used until it is silent."""
         if packet.payload_type != self._payload_type or not self._may_speak(sender):
             return None
         now = self._loop.time()
@@ -252,18 +251,18 @@ class StreamReceiver:
         return ours
 
     def _holds_against(self, sender: tuple[Any, ...], now: float) -> bool:
-        """Return True if the stream stays although another sender sends packets.
+        """Return True if the stream is kept although another sender sends packets.
 
-        A stream without a decoded picture may be replaced, since anybody can send packets.
+        A stream without a decoded picture may be replaced, since any host can send packets.
         """
         if self._agreed:
             return (
                 now - self._began < NEW_STREAM_DELAY
-                and now - self.heard < KEY_FRAME_REQUEST_INTERVAL
+                and now - self.last_packet_at < KEY_FRAME_REQUEST_INTERVAL
             )
         if now - self._shown_at >= NEW_HOST_DELAY:
             return now - self._began < NEW_STREAM_DELAY
-        return now - self.heard < (
+        return now - self.last_packet_at < (
             NEW_STREAM_DELAY if sender[0] == self._sender[0] else NEW_HOST_DELAY
         )
 
@@ -271,7 +270,7 @@ class StreamReceiver:
         return not self._only or str(sender[0]).partition("%")[0] in self._only
 
     def _read(self) -> None:
-        """Pass on whole frames, and check again later if packets are missing."""
+        """Pass on complete frames, and check again later if packets are missing."""
         made, self._made = self._made, []
         taken = self._depacketizer
         waits = taken.waits_since() is not None or taken.marked_at is not None
@@ -293,7 +292,11 @@ class StreamReceiver:
             self.want_picture()
         elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
             tail = self._depacketizer.tail()
-            if tail is not None and self._tail_due() and now - self.heard >= PAUSE:
+            if (
+                tail is not None
+                and self._tail_due()
+                and now - self.last_packet_at >= MAX_PACKET_INTERVAL
+            ):
                 missing = [tail]
             self._ask(missing, now)
         self._read()
@@ -301,11 +304,12 @@ class StreamReceiver:
     def _patience(self) -> float:
         if self._agreed:
             return REORDER_GRACE
-        return self._repair if self._vain < IN_VAIN else min(self._repair, REORDER_GRACE)
+        repeats = self._vain < MAX_UNANSWERED_REQUESTS
+        return self._repair if repeats else min(self._repair, REORDER_GRACE)
 
     def _tail_due(self) -> bool:
         """Return True if the rest of a frame is missing and the sender repairs such losses."""
-        if not self._repaired or self._loop.time() - self.heard > self._repair:
+        if not self._repaired or self._loop.time() - self.last_packet_at > self._repair:
             return False
         return self._depacketizer.tail() is not None
 
@@ -314,13 +318,13 @@ class StreamReceiver:
         due = [one for one in missing if now - asked.get(one, float("-inf")) >= RESEND_INTERVAL]
         if due and self._reception is not None:
             self._asked = {one: asked.get(one, now) for one in missing} | dict.fromkeys(due, now)
-            self._say(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
+            self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
     def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
         if not self._may_speak(sender):
             self._strange += 1
             return
-        with contextlib.suppress(MessageError):  # anybody may send anything
+        with contextlib.suppress(MessageError):  # other hosts may send invalid data
             for report in wire.parse_rtcp(data):
                 self._take(report, sender)
 
@@ -333,18 +337,18 @@ class StreamReceiver:
             return
         if isinstance(report, wire.SenderReport) and report.ssrc == ours.ssrc:
             self._reports_to = sender
-            if report.ntp >> 32:  # a sender without a clock says 0
+            if report.ntp >> 32:  # a sender without a clock sends 0
                 ours.sender(report, self._loop.time())
         elif isinstance(report, wire.Goodbye) and ours.ssrc in report.ssrcs:
             self._gone(report.reason)
 
     def _report(self) -> None:
-        self._say()
+        self._send_report()
         if self._next_report is not None:
             self._next_report.cancel()
         self._next_report = self._loop.call_later(REPORT_INTERVAL, self._report)
 
-    def _say(self, *more: wire.Report) -> None:
+    def _send_report(self, *more: wire.Report) -> None:
         """Send a compound report: reception, name, and further requests."""
         if self._reception is None:
             return

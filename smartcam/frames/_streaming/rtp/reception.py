@@ -1,4 +1,4 @@
-"""Keep a receiver's counts of a stream: its losses, its jitter, and the sender's clock."""
+"""Count a stream's losses, and measure its jitter and the sender's clock."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtp.packets import RtpPacket, SenderReport
 
 SECONDS_FROM_1900_TO_1970: Final = 2_208_988_800
-"""Seconds from 1900, where the time of NTP begins, to 1970."""
+"""Offset from NTP's epoch, 1900, to 1970, seconds."""
 
 
 def ntp_time(utc: float) -> int:
-    """Convert seconds since 1970 to RTCP's form."""
+    """Convert seconds since 1970 to an NTP time of 64 bits."""
     return int((utc + SECONDS_FROM_1900_TO_1970) * (1 << 32)) & 0xFFFF_FFFF_FFFF_FFFF
 
 
 def middle(ntp: int) -> int:
-    """Return the 32 bits of an NTP time that reports refer to."""
+    """Return the middle 32 bits of an NTP time, which reports use."""
     return ntp >> 16 & 0xFFFF_FFFF
 
 
@@ -31,10 +31,10 @@ class Reception:
         self.ssrc = ssrc
         self.packets = 0
         self._first: int | None = None
-        self._highest = 0  # with the wraps counted
+        self._highest = 0  # highest sequence number with wraps counted
         self._transit: int | None = None
         self._jitter = 0.0
-        self._before = (0, 0)  # expected and received, as the last report had them
+        self._before = (0, 0)  # expected and received packets at the last report
         self._heard: tuple[SenderReport, float] | None = None
 
     @property
@@ -49,7 +49,7 @@ class Reception:
             self._first = self._highest = packet.sequence
         ahead = (packet.sequence - self._highest + 0x8000 & 0xFFFF) - 0x8000
         if ahead < 0 or (ahead == 0 and self.packets > 1):
-            return  # late or sent again, so its delay says nothing
+            return  # a late or repeated packet has no useful delay
         self._highest += ahead
         transit = int(now * CLOCK_RATE) - packet.timestamp
         if self._transit is not None:
@@ -58,11 +58,11 @@ class Reception:
         self._transit = transit
 
     def sender(self, report: SenderReport, now: float) -> None:
-        """Take a sender report that came at a moment."""
+        """Record a sender report that came at a moment."""
         self._heard = (report, now)
 
     def block(self, now: float) -> ReportBlock:
-        """Return the block of a report; the next report counts from here."""
+        """Return a report block for the time since the last report."""
         expected = 0 if self._first is None else self._highest - self._first + 1
         expected_now, received_now = expected - self._before[0], self.packets - self._before[1]
         self._before = (expected, self.packets)
@@ -85,7 +85,7 @@ class Reception:
     def utc(self, timestamp: int) -> float | None:
         """Return a packet's time on the sender's wall clock, seconds since 1970.
 
-        It is None if the sender has not reported its clock yet.
+        None: the sender has not reported its clock yet.
         """
         if self._heard is None:
             return None

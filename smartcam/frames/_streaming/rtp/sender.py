@@ -42,13 +42,13 @@ REPORT_INTERVAL: Final = 2.0
 """Seconds between two sender reports."""
 
 MIN_KEY_FRAME_INTERVAL: Final = 0.2
-"""Seconds between two key frames made on request, since key frames are large."""
+"""Least time between two requested key frames, seconds, since they are large."""
 
-BEGINS_SPS: Final = b"\0\0\1\x67"
-"""Start code and head of a sequence's parameters, as x264 writes them."""
+SPS_START: Final = b"\0\0\1\x67"
+"""Start code and header of a sequence parameter set, as x264 writes them."""
 
 FULL_SOCKET_TIMEOUT: Final = 1.0
-"""Seconds to wait for a full socket before the next frame is tried nevertheless."""
+"""Longest wait for a full socket, seconds, before the next frame is sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +56,12 @@ class RtpSenderStatistics:
     """Counts of a sender since it began.
 
     Attributes:
-        frames: frames that were sent whole.
+        frames: completely sent frames.
         packets: packets sent for the first time.
         bytes: bytes of these packets, with the headers of RTP.
-        cut: frames whose rest was dropped, since the socket was full.
-        resent: packets that were sent again to a receiver that missed them.
-        anew: key frames made for a receiver that joined or lost packets, or after a cut frame.
+        cut: incompletely sent frames, since the socket was full.
+        resent: packets sent again on request.
+        anew: key frames for receivers that joined or lost packets, or after a cut frame.
         receivers: last reports of the receivers.
     """
 
@@ -75,24 +75,23 @@ class RtpSenderStatistics:
 
 
 class _RtpOutlet(NamedTuple):
-    """The sockets that the sender uses, and the address that it sends to."""
+    """The sender's sockets, and the destination."""
 
     pair: SocketPair
     to: Endpoint
 
 
 class RtpSender:
-    """Sends a source's pictures as H.264 over RTP (RFC 6184), inside of ``async with``.
+    """Send a source's pictures as H.264 over RTP (RFC 6184), inside of ``async with``.
 
     ::
 
         async with smartcam.frames.RtpSender(source, "192.168.0.20:5004", crf=20) as sender:
             await sender.wait()
 
-    It is a reader like any other: the newest frame is encoded and sent at once, and frames that
-    come meanwhile are skipped. RTCP goes to the next port. Packets that a receiver asks for
-    (generic NACK, RFC 4585) are sent again; one that joins, or asks for a picture (PLI), is sent a
-    key frame.
+    The newest frame is encoded and sent at once; frames that come meanwhile are skipped. RTCP goes
+    to the next port. Requested packets (generic NACK, RFC 4585) are sent again; a receiver that
+    joins or requests a picture (PLI) gets a key frame.
 
     Args:
         source: open source of frames.
@@ -101,8 +100,8 @@ class RtpSender:
         crf: quality, 0 (best) to 51.
         bitrate: bits per second to keep to, instead of a quality.
         keyint: number of frames within which every part of the picture is refreshed.
-        payload_type: 96 to 127.
-        ttl: networks that multicast passes.
+        payload_type: payload type, 96 to 127.
+        ttl: time to live of multicast.
 
     Raises:
         ConfigurationError: a number is out of range, or ``to`` is no address.
@@ -131,7 +130,7 @@ class RtpSender:
         self._codecs = Codecs(threads=1)
         self._encoder = self._made_encoder(fps or 30.0)
         self._packetizer = H264Packetizer(payload_type)
-        self._first = secrets.randbits(32)  # RTP timestamp at the clock's 0
+        self._first = secrets.randbits(32)  # RTP timestamp at 0 of the clock
         self._ticks = 0
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
         self._history = PacketHistory()
@@ -151,9 +150,9 @@ class RtpSender:
 
     @property
     def sdp(self) -> str:
-        """The stream's description for ``ffplay``, VLC and others, who save it as a file.
+        """Description of the stream as a file for ``ffplay``, VLC and others.
 
-        It has the parameter sets from the first frame on; they are in the stream, too.
+        After the first frame it has the parameter sets, which are also in the stream.
 
         Raises:
             LocalProtocolError: the sender was not entered.
@@ -183,13 +182,13 @@ class RtpSender:
         )
 
     async def __aenter__(self) -> Self:
-        """Begin to send.
+        """Start sending.
 
         Raises:
             FrameSourceError: there is no such host, or no port is free.
             LocalProtocolError: the sender was entered before, or the source is not open.
 
-        Cancellation: nothing is sent or stays open.
+        Cancellation: the sender stays closed.
         """
         if self._entered:
             raise LocalProtocolError("RtpSender: entered before; make a new one")
@@ -223,7 +222,7 @@ class RtpSender:
     async def close(self) -> None:
         """Say goodbye and stop sending. Idempotent.
 
-        Cancellation: it ends nevertheless; a picture that is being encoded is thrown away.
+        Cancellation: the sender ends nevertheless; a picture that is being encoded is dropped.
         """
         link, self._link = self._link, None
         if link is None:
@@ -240,13 +239,13 @@ class RtpSender:
             await self._codecs.close()
 
     async def wait(self) -> None:
-        """Return when the source ended, or the sender was closed.
+        """Wait until the source ends or the sender is closed.
 
         Raises:
             FrameSourceError: the source ended with this error, or its frames cannot be encoded.
             LocalProtocolError: the sender was not entered.
 
-        Cancellation: safe; it goes on sending.
+        Cancellation: safe; the sender goes on.
         """
         if not self._tasks:
             raise LocalProtocolError("RtpSender: not open: use `async with`")
@@ -278,7 +277,7 @@ class RtpSender:
             _log.exception("! RTP to %s", link.to)
             raise
         finally:
-            self._say(link, wire.Goodbye((self._packetizer.ssrc,)))
+            self._send_report(link, wire.Goodbye((self._packetizer.ssrc,)))
 
     def _begin_anew(self) -> None:
         self._wanted, self._made_anew = False, time.monotonic()
@@ -286,9 +285,9 @@ class RtpSender:
         self._encoder.begin_anew()
 
     def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
-        """Send a frame's packets; return whether the socket took them all."""
+        """Send a frame's packets; return whether the socket accepted all."""
         data = bytes(encoded.data)
-        if BEGINS_SPS in data:
+        if SPS_START in data:
             self._sets = parameter_sets(data) or self._sets
         self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
         sequence = self._packetizer.sequence
@@ -296,7 +295,7 @@ class RtpSender:
         for packet in self._packetizer.packets(data, self._first + self._ticks):
             try:
                 link.pair.rtp.sendto(packet, to)
-            except OSError:  # the socket is full, or there is no route at present
+            except OSError:  # the socket is full, or there is no route now
                 return False
             self._history.sent(sequence, packet)
             sequence = sequence + 1 & 0xFFFF
@@ -308,10 +307,10 @@ class RtpSender:
 
     async def _report(self, link: _RtpOutlet) -> None:
         while True:
-            self._say(link)
+            self._send_report(link)
             await asyncio.sleep(REPORT_INTERVAL)
 
-    def _say(self, link: _RtpOutlet, *more: wire.Report) -> None:
+    def _send_report(self, link: _RtpOutlet, *more: wire.Report) -> None:
         now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
         report = wire.SenderReport(
             self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
@@ -324,7 +323,7 @@ class RtpSender:
     def _reported(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
         if not link.to.multicast and sender[0] != link.to.host:
             return
-        with contextlib.suppress(MessageError):  # packets may come from anybody
+        with contextlib.suppress(MessageError):  # other hosts may send invalid data
             for report in wire.parse_rtcp(data):
                 self._take(link, report, f"{sender[0]}:{sender[1]}")
 
@@ -339,7 +338,7 @@ class RtpSender:
                 self._audience.left(ssrc)
         elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
             self._wanted = True
-            self._say(link)  # the receiver needs the sender's clock
+            self._send_report(link)  # the receiver needs the sender's clock
 
     def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:

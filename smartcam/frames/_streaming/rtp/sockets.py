@@ -1,4 +1,4 @@
-"""Open two sockets on neighbouring ports: RTP, and RTCP on the next one."""
+"""Open a pair of sockets: RTP, and RTCP on the next port."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 
 MAX_DATAGRAMS_PER_TURN: Final = 64
-"""Largest number of datagrams that are read before other tasks of the event loop have a turn."""
+"""Largest number of datagrams that are read before the event loop continues."""
 
-RECEIVE_BUFFER: Final = 4 << 20
-SEND_BUFFER: Final = 128 << 10
-"""Number of bytes that may wait in the system: a twentieth of a second on a link of 20 Mbit/s."""
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
+SEND_BUFFER_BYTES: Final = 128 << 10
+"""Size of the system's send buffer: 50 ms on a link of 20 Mbit/s."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
 """Socket option from asm-generic/socket.h that exceeds rmem_max, for processes that may administer
 the network."""
 
 MAX_TRIES: Final = 32
-"""Largest number of tries to find two free ports side by side."""
+"""Largest number of tries to find two free consecutive ports."""
 
 
 class Endpoint(NamedTuple):
@@ -37,7 +37,7 @@ class Endpoint(NamedTuple):
     Attributes:
         family: family of the sockets.
         host: numeric address.
-        port: port of RTP; RTCP has the next one.
+        port: port of RTP; RTCP uses the next port.
     """
 
     family: socket.AddressFamily
@@ -46,7 +46,7 @@ class Endpoint(NamedTuple):
 
     @property
     def multicast(self) -> bool:
-        """True if the address is a multicast group's."""
+        """True for a multicast group."""
         return ipaddress.ip_address(self.host.partition("%")[0]).is_multicast
 
     @property
@@ -80,7 +80,7 @@ def host_and_port(text: str) -> tuple[str, int]:
     """Read ``HOST:PORT`` or ``[HOST]:PORT``.
 
     Raises:
-        ConfigurationError: the text is something else.
+        ConfigurationError: the text has another form.
     """
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -125,7 +125,7 @@ class SocketPair:
 
     @classmethod
     def waiting(cls, at: Endpoint) -> SocketPair:
-        """Return sockets that can be sent to: on an even port of an address, and the next one.
+        """Return sockets for receiving on an even port of an address, and the next port.
 
         Raises:
             OSError: no ports are free.
@@ -159,7 +159,7 @@ class SocketPair:
                     if not left:
                         raise
                     continue
-                rtp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+                rtp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
                 for one in (rtp, rtcp):
                     if to.multicast:
                         _hops(one, to.family, ttl)
@@ -173,11 +173,11 @@ class SocketPair:
         rtcp: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call functions for each datagram, with its sender, until :meth:`close`.
+        """Call a function for each datagram with its sender, until :meth:`close`.
 
         Args:
-            rtp: receiver of the stream's packets; None: they are not read.
-            rtcp: receiver of reports.
+            rtp: function for the stream's packets; None: do not read them.
+            rtcp: function for reports.
             read: function that is called after each batch.
         """
         for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
@@ -197,19 +197,19 @@ class SocketPair:
                 data, sender = one.recvfrom(65536)
             except BlockingIOError:
                 break
-            except OSError:  # an error of an earlier datagram that was sent; the next ones come
+            except OSError:  # an error of an earlier sent datagram; reading goes on
                 continue
             take(data, sender)
         if not self._closed:
             read()
 
     def report(self, data: bytes, to: tuple[Any, ...]) -> None:
-        """Send RTCP, or drop it if the system does not take it, since the next one comes soon."""
+        """Send RTCP; drop it if the system does not accept it, since reports are repeated."""
         with contextlib.suppress(OSError):
             self.rtcp.sendto(data, to)
 
     async def writable(self, within: float) -> None:
-        """Wait until the stream's socket takes more, or a time is over."""
+        """Wait until the stream's socket accepts data, or until a time limit."""
         free = asyncio.Event()
         self._loop.add_writer(self.rtp, free.set)
         try:
@@ -241,7 +241,7 @@ def _socket(family: socket.AddressFamily) -> socket.socket:
 def _grown(one: socket.socket) -> None:
     for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
         with contextlib.suppress(OSError):  # the second option is for privileged processes
-            one.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
+            one.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
 
 
 def _join(one: socket.socket, group: Endpoint) -> None:

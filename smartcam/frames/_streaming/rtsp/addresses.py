@@ -1,4 +1,4 @@
-"""Parse URLs, transports and ports in requests of RTSP clients."""
+"""Parse URLs and transports in requests of RTSP clients."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ TRACK: Final = "track1"
 """Name of the only track of each stream."""
 
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
-"""The names that a stream may have, which need no escapes in a URL."""
+"""Allowed names of streams, which need no escapes in a URL."""
 
 
 class RtspTarget(NamedTuple):
     """The target of a request.
 
     Attributes:
-        base: the stream's URL as its client writes it, without the slash at its end.
+        base: the stream's URL as the client writes it, without a slash at the end.
         name: name of the stream.
-        track: whether its track is meant, and not the stream as a whole.
+        track: whether the URL names the stream's track, and not the whole stream.
     """
 
     base: str
@@ -33,7 +33,7 @@ def target_of(url: str) -> RtspTarget:
     """Read a request's URL.
 
     Raises:
-        RtspError: the URL is not one of RTSP.
+        RtspError: the URL is no RTSP URL.
     """
     try:
         parts = urlsplit(url)
@@ -52,12 +52,12 @@ def target_of(url: str) -> RtspTarget:
 
 
 class TransportWish(NamedTuple):
-    """A transport that the server offers: channels of the connection, or pairs of ports.
+    """A transport requested by a client: channels of the connection, or a pair of ports.
 
     Attributes:
         tcp: True for channels of the connection, False for ports.
-        rtp: channel or port of the client; None: a channel that the server chooses.
-        rtcp: channel or port of the client.
+        rtp: channel or port of the client for RTP; None: the server chooses a channel.
+        rtcp: channel or port of the client for RTCP.
     """
 
     tcp: bool
@@ -66,17 +66,17 @@ class TransportWish(NamedTuple):
 
 
 def wish_of(header: str, client: str) -> TransportWish:
-    """Return the first transport in a client's list that the server offers.
+    """Return the first supported transport in a client's list.
 
     Args:
         header: value of the header ``Transport``.
-        client: address of the client, the only one that packets go to.
+        client: address of the client, the only allowed destination.
 
     Raises:
-        RtspError: the list has no transport that the server offers.
+        RtspError: the list has no supported transport.
     """
-    for said in header.split(","):
-        wish = _read(said, client)
+    for text in header.split(","):
+        wish = _read(text, client)
         if wish is not None:
             return wish
     raise RtspError(
@@ -86,8 +86,8 @@ def wish_of(header: str, client: str) -> TransportWish:
     )
 
 
-def _read(said: str, client: str) -> TransportWish | None:
-    protocol, *rest = (part.strip() for part in said.split(";"))
+def _read(text: str, client: str) -> TransportWish | None:
+    protocol, *rest = (part.strip() for part in text.split(";"))
     options = {key.lower(): value for key, _, value in (one.partition("=") for one in rest)}
     tcp = protocol.upper() == "RTP/AVP/TCP"
     if not tcp and protocol.upper() not in ("RTP/AVP", "RTP/AVP/UDP"):

@@ -1,4 +1,4 @@
-"""Decide who may look: Digest and Basic authentication (RFC 2617)."""
+"""Authenticate viewers: Digest and Basic (RFC 2617)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 REALM: Final = "smartcam"
 
 MAX_WRONG_ANSWERS: Final = 10
-"""Wrong answers that a connection may give."""
+"""Largest number of wrong passwords of a connection."""
 
 _PART: Final = re.compile(r'([A-Za-z]{1,32})=(?:"([^"\\]*)"|([^\s",=]+))\s*(?:,\s*|$)')
 
 
 class Authentication:
-    """The user and the password that a server demands.
+    """A server's user and password.
 
     Args:
-        user: None: everybody may.
+        user: name of the user; None: no password is needed.
         password: password of the user.
-        basic: whether the password may come as it is, for clients that know no Digest.
+        basic: whether to accept Basic, for clients without Digest.
 
     Raises:
-        ConfigurationError: only one of the two is given, or has characters that cannot be sent.
+        ConfigurationError: user or password is missing, or has characters that cannot be sent.
     """
 
     def __init__(self, user: str | None, password: str | None, *, basic: bool = False) -> None:
@@ -50,34 +50,34 @@ class Authentication:
         self._hashed = _md5(self._user, REALM.encode(), self._secret)
 
     def accepts(self, request: RtspRequest, nonce: str) -> bool:
-        """Return True if a request proves the user's password, by the nonce of its connection."""
-        scheme, _, said = request.headers.get("authorization", "").partition(" ")
+        """Return True if a request proves the user's password for the connection's nonce."""
+        scheme, _, header = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "digest":
-            return self._accepts_digest(request, nonce, said)
-        return scheme.lower() == "basic" and self.basic and self._accepts_basic(said)
+            return self._accepts_digest(request, nonce, header)
+        return scheme.lower() == "basic" and self.basic and self._accepts_basic(header)
 
-    def _accepts_digest(self, request: RtspRequest, nonce: str, said: str) -> bool:
-        parts = _parts(said)
+    def _accepts_digest(self, request: RtspRequest, nonce: str, header: str) -> bool:
+        parts = _parts(header)
         expected = {"username": self._user.decode(), "realm": REALM, "nonce": nonce}
         same = [_same(parts.get(name, ""), value) for name, value in expected.items()]
         if parts.get("algorithm", "MD5").upper() != "MD5" or "qop" in parts:
             return False
         uri = parts.get("uri", "")
         if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
-            return False  # live555 always says the stream, also where it asks for its track
+            return False  # live555 names the stream also in requests for its track
         asked = _md5(request.method.encode(), uri.encode())
         response = _md5(self._hashed.encode(), nonce.encode(), asked.encode())
         return _same(parts.get("response", "").lower(), response) and all(same)
 
-    def _accepts_basic(self, said: str) -> bool:
+    def _accepts_basic(self, header: str) -> bool:
         try:
-            given = base64.b64decode(said.strip().encode("latin-1"), validate=True)
+            given = base64.b64decode(header.strip().encode("latin-1"), validate=True)
         except binascii.Error:
             return False
         return hmac.compare_digest(given, self._user + b":" + self._secret)
 
     def challenge(self, nonce: str) -> tuple[tuple[str, str], ...]:
-        """Return the headers that ask for an authorization."""
+        """Return the headers that request authorization."""
         digest = f'Digest realm="{REALM}", nonce="{nonce}", algorithm="MD5"'
         asked = (("WWW-Authenticate", digest),)
         basic = (("WWW-Authenticate", f'Basic realm="{REALM}"'),)
@@ -85,7 +85,7 @@ class Authentication:
 
 
 class PasswordGate:
-    """The check of one connection: a nonce of its own, and a bounded number of tries."""
+    """The password check of one connection, with a nonce and a limited number of tries."""
 
     def __init__(self, authentication: Authentication) -> None:
         self._authentication = authentication
@@ -93,16 +93,16 @@ class PasswordGate:
         self._wrong = 0
 
     def check(self, request: RtspRequest) -> None:
-        """Let a request pass.
+        """Check a request's authorization.
 
         Raises:
-            RtspError: the user may not look; the last error is fatal.
+            RtspError: authorization is missing or wrong; after too many tries the error is fatal.
         """
         if not self._authentication.wanted or self._authentication.accepts(request, self._nonce):
             return
         given = "authorization" in request.headers
         self._wrong += given
-        text = "wrong user or password" if given else "a password is wanted"
+        text = "wrong user or password" if given else "a password is required"
         raise RtspError(
             401,
             text,
@@ -111,13 +111,13 @@ class PasswordGate:
         )
 
 
-def _parts(said: str) -> dict[str, str]:
-    """Return the parts of a Digest; none where they are not written as they should be."""
+def _parts(header: str) -> dict[str, str]:
+    """Return the parts of a Digest; empty if it is malformed."""
     parts: dict[str, str] = {}
     place = 0
-    said = said.strip()
-    while place < len(said):
-        found = _PART.match(said, place)
+    header = header.strip()
+    while place < len(header):
+        found = _PART.match(header, place)
         if found is None or found[1].lower() in parts:
             return {}
         parts[found[1].lower()] = found[2] if found[2] is not None else found[3]

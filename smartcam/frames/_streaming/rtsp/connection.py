@@ -1,4 +1,4 @@
-"""One client's connection: its requests, one after the other, and its sessions."""
+"""A client's connection: its requests in order, and its sessions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ import socket
 from typing import TYPE_CHECKING, Final, Protocol
 
 from smartcam.frames._streaming.rtsp.authentication import PasswordGate
-from smartcam.frames._streaming.rtsp.delivery import MAX_WAITING_BYTES, SEND_BUFFER, ChannelDelivery
+from smartcam.frames._streaming.rtsp.delivery import (
+    MAX_WAITING_BYTES,
+    SEND_BUFFER_BYTES,
+    ChannelDelivery,
+)
 from smartcam.frames._streaming.rtsp.messages import (
-    ROOM,
+    MAX_MESSAGE_BYTES,
     ChannelData,
     RequestParser,
     RtspError,
@@ -32,29 +36,29 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 REQUEST_TIMEOUT: Final = 10.0
-"""Seconds for a request that has begun."""
+"""Seconds for receiving a request that has begun."""
 
 IDLE_TIMEOUT: Final = 60.0
-"""Seconds that a connection may be without a session, whatever it asks meanwhile."""
+"""Seconds that a connection may be without a session, even with requests."""
 
 MAX_STRAY_PACKETS: Final = 64
-"""Largest number of packets accepted without a session, such as RTCP behind a TEARDOWN."""
+"""Largest number of packets accepted without a session, such as RTCP after a TEARDOWN."""
 
 CLOSE_TIMEOUT: Final = 1.0
-"""Seconds for the last bytes to be taken; then a connection is cut off."""
+"""Seconds for sending the last bytes before a connection is aborted."""
 
 MAX_ANSWER_BYTES, MAX_PLAYING_BYTES = 64 << 10, 4 * MAX_WAITING_BYTES
-"""Bytes that may wait for a client: one that does not play, and one that does."""
+"""Largest number of bytes that wait for a client: before and while it plays."""
 
 
 class ConnectionOwner(Protocol):
-    """The server, as its connections see it."""
+    """The server's interface for its connections."""
 
     authentication: Authentication
     number: int
 
     def enter(self, connection: RtspConnection, peer: object) -> str:
-        """Take a new connection; return "", or why there is no room for it."""
+        """Register a new connection; return the reason if there are too many, else ""."""
         ...
 
     def leave(self, connection: RtspConnection) -> None:
@@ -62,31 +66,30 @@ class ConnectionOwner(Protocol):
         ...
 
     def served(self, connection: RtspConnection) -> None:
-        """Note that one was served: it is the last that makes room."""
+        """Mark a connection as the most recently served, the last to be closed for room."""
         ...
 
     def unseated(self, connection: RtspConnection) -> None:
-        """Note that one has no session any more."""
+        """Note that a connection has no session any more."""
         ...
 
     def stream(self, name: str) -> RtspStream:
-        """Return a stream, or refuse."""
+        """Return a stream, or raise RtspError."""
         ...
 
     def admit(self, session: RtspSession, peer: str) -> None:
-        """Count a viewer, or refuse it."""
+        """Count a viewer, or raise RtspError."""
         ...
 
     def dismiss(self, session: RtspSession, peer: str) -> None:
-        """Count a viewer no longer."""
+        """Remove a viewer from the count."""
         ...
 
 
 class RtspConnection(asyncio.Protocol):
-    """Reads requests, answers them, and ends its sessions when it ends.
+    """Read requests, answer them, and end the sessions at the end.
 
-    A task takes the requests one at a time; meanwhile no more is read than one message has room
-    for.
+    A task answers one request at a time; meanwhile at most the bytes of one message are read.
     """
 
     transport: asyncio.Transport
@@ -99,7 +102,7 @@ class RtspConnection(asyncio.Protocol):
         self.peer: tuple[str | int, ...] = ()
         self._parser = RequestParser()
         self._came, self._lost = asyncio.Event(), asyncio.Event()
-        self._serving = False  # a request that only who may look can make is under way
+        self._serving = False  # an authorized request is being answered
         self._strays = 0
         self._closing = False
         self._reading = True
@@ -109,14 +112,14 @@ class RtspConnection(asyncio.Protocol):
     # asyncio
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin, or say that there are too many."""
+        """Start the connection, or refuse it."""
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - of a socket
         self.transport = transport
         peer, address = (transport.get_extra_info(name) for name in ("peername", "sockname"))
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        refusal = self.owner.enter(self, peer) if peer and address else "its address is not known"
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        refusal = self.owner.enter(self, peer) if peer and address else "its address is unknown"
         if refusal:
             _log.info("= %s: connection closed: %s", peer, refusal)
             transport.write(answer(503, "", (), b"too many connections\n"))
@@ -127,24 +130,24 @@ class RtspConnection(asyncio.Protocol):
         self.task.add_done_callback(self._task_ended)
 
     def _task_ended(self, _: asyncio.Task[None]) -> None:
-        self.close()  # the task may never have begun
+        self.close()  # the task may not have started
         self.owner.leave(self)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; no more where the task is behind."""
+        """Store bytes; pause reading if the task is too slow."""
         if self._closing:
             return
         self._parser.feed(data)
         self._came.set()
-        if self._reading and self._parser.waiting > ROOM:
+        if self._reading and self._parser.waiting > MAX_MESSAGE_BYTES:
             self._reading = False
             self.transport.pause_reading()
 
     def eof_received(self) -> None:
-        """Have asyncio close it: nobody would keep a session alive."""
+        """Let asyncio close the connection, since the client cannot keep a session alive."""
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End what it has."""
+        """End the task and the sessions."""
         self._closing = True
         self._lost.set()
         self._end_sessions("")
@@ -153,10 +156,10 @@ class RtspConnection(asyncio.Protocol):
         if self.task is not None:
             self.task.cancel()
 
-    # what others ask of it
+    # called by the server
 
     def close(self, why: str = "") -> None:
-        """End the connection when all written bytes are taken, or shortly after. Idempotent."""
+        """Close the connection when all bytes are sent, or after a short time. Idempotent."""
         self._end_sessions(why)
         if self._closing:
             return
@@ -166,7 +169,7 @@ class RtspConnection(asyncio.Protocol):
         self._cut = loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
     def abort(self) -> None:
-        """End the connection at once."""
+        """Abort the connection."""
         self._closing = True
         self.transport.abort()
 
@@ -176,13 +179,13 @@ class RtspConnection(asyncio.Protocol):
         return bool(self.sessions) or self._serving
 
     def turn_away(self, why: str) -> None:
-        """End the connection at once, to make room or since it has no session in time."""
+        """Abort the connection to make room, or since it has no session in time."""
         _log.info("= %s: connection closed: %s", self.peer, why)
         self.abort()
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Mark a viewer's request as being answered, as long as the block runs."""
+        """Mark an authorized request as being answered during the block."""
         self._serving = True
         try:
             yield
@@ -191,9 +194,9 @@ class RtspConnection(asyncio.Protocol):
             self.owner.served(self)
 
     def session_ended(self, session: RtspSession, why: str) -> None:
-        """Forget a session that has ended by itself, and end with the last one.
+        """Remove an ended session, and close the connection with the last session.
 
-        Where the client takes nothing, nothing can be said to it: that is the end of all.
+        If the client accepts no data, the connection is aborted.
         """
         self.forget(session)
         if not why:
@@ -202,14 +205,14 @@ class RtspConnection(asyncio.Protocol):
             self.close()
 
     def forget(self, session: RtspSession) -> None:
-        """Have a session no longer that is closed."""
+        """Remove a closed session."""
         if self.sessions.pop(session.id, None) is not None:
             self.owner.dismiss(session, str(self.peer[0]))
             if not self.sessions:
                 self.owner.unseated(self)
 
     def channels(self) -> Iterator[int]:
-        """Yield the channels that are in use."""
+        """Yield the channels in use."""
         for session in self.sessions.values():
             if isinstance(session.delivery, ChannelDelivery):
                 yield from session.delivery.channels
@@ -229,7 +232,7 @@ class RtspConnection(asyncio.Protocol):
                     await self._answer(message)
                 elif not self._take(message):
                     break
-                await asyncio.sleep(0)  # others have their turn, however many there are
+                await asyncio.sleep(0)  # let other tasks run
         except RtspError as refusal:
             self._refuse(refusal, "")
         except Exception:  # noqa: BLE001 - one connection only
@@ -242,7 +245,7 @@ class RtspConnection(asyncio.Protocol):
         """Return the next message.
 
         Raises:
-            RtspError: no request came, or half of one.
+            RtspError: no complete request came in time.
         """
         now = asyncio.get_running_loop().time
         half_since: float | None = None
@@ -270,7 +273,7 @@ class RtspConnection(asyncio.Protocol):
         return True
 
     def _take(self, packet: ChannelData) -> bool:
-        """Take RTCP; return whether there were not too many without a session."""
+        """Process RTCP; return False after too many packets without a session."""
         for session in self.sessions.values():
             delivery = session.delivery
             if isinstance(delivery, ChannelDelivery) and packet.channel == delivery.channels[1]:

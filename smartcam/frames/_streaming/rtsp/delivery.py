@@ -1,4 +1,4 @@
-"""Deliver packets to a client: over its connection's channels, or as datagrams."""
+"""Deliver packets to a client over its connection's channels or as datagrams."""
 
 from __future__ import annotations
 
@@ -11,46 +11,45 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 CATCH_UP_TIME: Final = 0.5
-"""Seconds for which frames may wait after a key frame, which is large. At other times a frame is
-skipped while part of an earlier one waits."""
+"""Seconds after a key frame, which is large, during which frames may wait. At other times a frame
+is skipped while a part of an earlier one waits."""
 
 MAX_WAITING_BYTES: Final = 4 << 20
-"""Largest number of bytes that may wait after a key frame."""
+"""Largest number of bytes that wait after a key frame."""
 
 STALL_TIMEOUT: Final = 10.0
-"""A connection is cut off if the client takes nothing for this many seconds."""
+"""Seconds without progress of the client after which its connection is aborted."""
 
-SEND_BUFFER: Final = 64 << 10
-"""Number of bytes of a connection that may wait in the system, where frames can no longer be
-skipped."""
+SEND_BUFFER_BYTES: Final = 64 << 10
+"""Size of a connection's send buffer in the system; frames in it cannot be skipped."""
 
-DATAGRAMS: Final = 1 << 20
-"""Number of bytes of datagrams that the system may hold: enough for a whole key frame."""
+DATAGRAM_BUFFER_BYTES: Final = 1 << 20
+"""Size of the system's send buffer for datagrams, which has room for a key frame."""
 
 MAX_TRIES: Final = 32
-"""Largest number of tries to find two ports, an even one and the next."""
+"""Largest number of tries to find a free even port with a free next port."""
 
 
 class PacketDelivery(Protocol):
-    """The channel for one viewer's packets."""
+    """The transport of one viewer's packets."""
 
     transport: str
-    """The header Transport in the answer to SETUP."""
+    """Header Transport of the answer to SETUP."""
 
     def ready(self, now: float) -> bool:
         """Return True if a frame's packets would be sent without waiting."""
         ...
 
     def send(self, packets: list[bytes], key: bool, now: float) -> bool:
-        """Send a frame; return whether all of it was sent."""
+        """Send a frame; return whether it was sent completely."""
         ...
 
     def report(self, data: bytes) -> None:
-        """Send RTCP, if that is possible at once."""
+        """Send RTCP, if possible without waiting."""
         ...
 
     def alive(self, now: float) -> bool | None:
-        """Return True if the client takes the data; None if this is unknown."""
+        """Return True if the client accepts data; None: unknown."""
         ...
 
     def close(self) -> None:
@@ -59,15 +58,15 @@ class PacketDelivery(Protocol):
 
 
 class ChannelDelivery:
-    """Over the RTSP connection itself (section 10.12); only whole frames."""
+    """Delivery over the RTSP connection (section 10.12), in complete frames."""
 
     def __init__(self, connection: asyncio.Transport, rtp: int, rtcp: int) -> None:
         self.transport = f"RTP/AVP/TCP;unicast;interleaved={rtp}-{rtcp}"
         self.channels = (rtp, rtcp)
         self._connection = connection
         self._patient_until = -1.0
-        self._waited = 0  # bytes at the last look
-        self._progress: float | None = None  # time at which the client last took bytes
+        self._waited = 0  # waiting bytes at the last check
+        self._progress: float | None = None  # time at which the client last accepted bytes
 
     def ready(self, now: float) -> bool:
         waiting = self._connection.get_write_buffer_size()
@@ -100,13 +99,13 @@ class ChannelDelivery:
 
 
 class DatagramDelivery:
-    """Sends packets from two own ports to two of the client; drops those that would wait.
+    """Delivery from two ports to two of the client's; packets that would wait are dropped.
 
     Args:
         sockets: bound sockets for RTP and RTCP.
         client: address of the client, from the RTSP connection.
         ports: ports of the client for RTP and RTCP.
-        heard: function that is called with the RTCP from the client.
+        heard: function that is called with RTCP from the client.
     """
 
     def __init__(
@@ -114,7 +113,7 @@ class DatagramDelivery:
         sockets: tuple[socket.socket, socket.socket],
         client: tuple[str | int, ...],
         ports: tuple[int, int],
-        heard: Callable[[bytes], None],
+        on_rtcp: Callable[[bytes], None],
     ) -> None:
         self._socket, control = sockets
         ours = f"{self._socket.getsockname()[1]}-{control.getsockname()[1]}"
@@ -122,17 +121,17 @@ class DatagramDelivery:
         self._to, self._control_to = ((client[0], port, *client[2:]) for port in ports)
         self._control_socket = control
         self._control: asyncio.DatagramTransport | None = None
-        self._heard = heard
+        self._on_rtcp = on_rtcp
 
     async def open(self) -> None:
-        """Receive the client's reports.
+        """Start receiving the client's reports.
 
         Cancellation: closes it.
         """
         loop = asyncio.get_running_loop()
         try:
             self._control, _ = await loop.create_datagram_endpoint(
-                lambda: _ControlPort(str(self._to[0]), self._heard), sock=self._control_socket
+                lambda: _ControlPort(str(self._to[0]), self._on_rtcp), sock=self._control_socket
             )
         except BaseException:
             self.close()
@@ -145,7 +144,7 @@ class DatagramDelivery:
         try:
             for one in packets:
                 self._socket.sendto(one, self._to)
-        except OSError:  # the socket is full, or there is no route at present
+        except OSError:  # the socket is full, or there is no route now
             return False
         return True
 
@@ -165,21 +164,21 @@ class DatagramDelivery:
 
 
 class _ControlPort(asyncio.DatagramProtocol):
-    """Passes on the datagrams of one host."""
+    """Pass on the datagrams of one host."""
 
-    def __init__(self, host: str, heard: Callable[[bytes], None]) -> None:
-        self._host, self._heard = host, heard
+    def __init__(self, host: str, on_rtcp: Callable[[bytes], None]) -> None:
+        self._host, self._on_rtcp = host, on_rtcp
 
     def datagram_received(self, data: bytes, addr: tuple[str | int, ...]) -> None:
         if addr[0] == self._host:
-            self._heard(data)
+            self._on_rtcp(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore ICMP errors, which anybody can send."""
+        """Ignore ICMP errors, which any host can send."""
 
 
 def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, socket.socket]:
-    """Return two sockets on an even port and the next one.
+    """Return two sockets on an even port and the next.
 
     Raises:
         OSError: there is no pair of free ports.
@@ -197,7 +196,7 @@ def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, s
             raise
         with contextlib.suppress(OSError):
             (second if port & 1 else first).setsockopt(
-                socket.SOL_SOCKET, socket.SO_SNDBUF, DATAGRAMS
+                socket.SOL_SOCKET, socket.SO_SNDBUF, DATAGRAM_BUFFER_BYTES
             )
         return (second, first) if port & 1 else (first, second)
     raise OSError(f"{host}: no two ports next to each other are free")

@@ -1,4 +1,4 @@
-"""RTSP's messages: requests cut from bytes, and answers made (RFC 2326)."""
+"""Parse requests of RTSP, and write answers (RFC 2326)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_LINE_BYTES: Final = 4096
 MAX_HEADERS: Final = 64
 
 MAX_BODY_BYTES: Final = 8192
-"""Largest number of bytes of a request's body; none of the requests served needs a body."""
+"""Largest number of bytes of a request's body; no supported request needs a body."""
 
 MAX_DIGITS: Final = 9
 """Largest number of digits of CSeq and Content-Length."""
@@ -34,7 +34,7 @@ _WORDS: Final[Mapping[int, str]] = {
     505: "RTSP Version Not Supported",
     551: "Option Not Supported",
 }
-"""Statuses that HTTP has not, or has other words for."""
+"""Reasons of statuses that HTTP lacks or names differently."""
 
 
 class RtspError(Exception):
@@ -42,9 +42,9 @@ class RtspError(Exception):
 
     Args:
         status: status of RFC 2326, section 7.1.1.
-        text: why, for people; the body of the answer.
+        text: reason, which is the body of the answer.
         headers: headers of the answer.
-        fatal: nothing more can be cut from these bytes.
+        fatal: whether the connection must be closed.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class ChannelData(NamedTuple):
 def answer(
     status: int, cseq: str, headers: tuple[tuple[str, str], ...] = (), body: bytes = b""
 ) -> bytes:
-    """Return an answer's bytes; without a CSeq where none was understood."""
+    """Return an answer's bytes; without CSeq if the request's was not readable."""
     lines = [f"RTSP/1.0 {status} {_WORDS.get(status) or HTTPStatus(status).phrase}"]
     if cseq:
         lines.append(f"CSeq: {cseq}")
@@ -89,36 +89,36 @@ def answer(
 
 
 class RequestParser:
-    """Cuts requests and packets from bytes that come in any pieces.
+    """Cut requests and packets from a stream of bytes.
 
-    It holds at most :data:`ROOM` bytes and those that were fed since the last call of next.
+    The parser keeps at most :data:`MAX_MESSAGE_BYTES`, and bytes fed since the last :meth:`next`.
     """
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # bytes in which there is no end of a line
+        self._seen = 0  # number of searched bytes without an end of line
         self._start: tuple[str, str] | None = None  # method and URL
         self._headers: dict[str, str] = {}
 
     def feed(self, data: bytes) -> None:
-        """Take bytes."""
+        """Add bytes."""
         self._data += data
 
     @property
     def waiting(self) -> int:
-        """Bytes that were not taken yet."""
+        """Number of unparsed bytes."""
         return len(self._data)
 
     @property
     def in_midst(self) -> bool:
-        """True while a message has begun and is not whole."""
+        """True while a message is incomplete."""
         return self._start is not None or bool(self._data)
 
     def next(self) -> RtspRequest | ChannelData | None:
-        """Return the next whole message; None if it is not complete yet.
+        """Return the next complete message; None if it is incomplete.
 
         Raises:
-            RtspError: the bytes can be no request; the error is fatal.
+            RtspError: the bytes are no request; the error is fatal.
         """
         while self._start is None:
             if self._data[:1] == b"$":
@@ -154,7 +154,7 @@ class RequestParser:
         return packet
 
     def _line(self, body: int = 0) -> bytes | None:
-        """Take a line; the last one of a head only where its body is there, too."""
+        """Return the next line, the last of a header only with its complete body; else None."""
         end = self._data.find(b"\n", self._seen)
         if end < 0 or end > MAX_LINE_BYTES:
             self._seen = len(self._data)
@@ -188,8 +188,8 @@ class RequestParser:
         return int(self._headers.get("content-length", "0"))
 
 
-ROOM: Final = 4 + 0xFFFF
-"""Bytes of the largest message that a buffer has to hold: of a channel."""
+MAX_MESSAGE_BYTES: Final = 4 + 0xFFFF
+"""Size of the largest message, a packet of a channel, bytes."""
 
 
 def _start_line(line: bytes) -> tuple[str, str]:
@@ -206,10 +206,10 @@ def _is_number(text: str) -> bool:
 
 
 def cseq_of(request: RtspRequest) -> str:
-    """Return the number of a request, which its answer repeats.
+    """Return the CSeq of a request, which its answer repeats.
 
     Raises:
-        RtspError: the request has none.
+        RtspError: the request has no CSeq.
     """
     cseq = request.headers.get("cseq", "")
     if not _is_number(cseq):

@@ -1,6 +1,6 @@
-"""Packets for many viewers: a frame is cut once, and each viewer's packets get heads of their own.
+"""Packetize a frame once for all viewers, and write each viewer's packet headers.
 
-To cut it for each would hold up the event loop: 0.5 ms for 100 kB.
+Packetizing for each viewer would block the event loop: 0.5 ms for 100 kB.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _HEAD: Final = struct.Struct("!BBHII")
 
 
 class UnitCutter:
-    """Cuts the encoded frames of one stream; the last one's pieces are kept."""
+    """Packetize the encoded frames of one stream; the last frame's payloads are kept."""
 
     def __init__(self) -> None:
         self._packetizer = H264Packetizer(PAYLOAD_TYPE, 0, 0)
@@ -29,10 +29,10 @@ class UnitCutter:
         self._pieces: list[tuple[int, bytes]] = []
 
     def pieces(self, unit: Frame) -> list[tuple[int, bytes]]:
-        """Return a frame's packets: the second byte of the head of each, and its payload.
+        """Return a frame's packets as the second byte of each header, and the payload.
 
         Raises:
-            FrameFormatError: the frame is no encoded frame.
+            FrameFormatError: the frame is not valid.
         """
         if unit is not self._unit:
             packets = self._packetizer.packets(bytes(unit.data), 0)
@@ -41,13 +41,13 @@ class UnitCutter:
 
 
 class PacketNumbers:
-    """Numbers of one viewer's packets.
+    """Numbering of one viewer's packets.
 
     Attributes:
-        ssrc: SSRC of the stream, as the viewer has it.
+        ssrc: SSRC of the viewer's stream.
         sequence: number of the next packet.
-        packets: made since the beginning.
-        octets: bytes of the packets' payloads.
+        packets: number of packets so far.
+        octets: number of payload bytes so far.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Carry out the requests to the server (RFC 2326, section 10)."""
+"""Answer the requests to the server (RFC 2326, section 10)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from smartcam.frames._streaming.rtsp.delivery import ChannelDelivery, DatagramDe
 from smartcam.frames._streaming.rtsp.messages import RtspError
 from smartcam.frames._streaming.rtsp.packing import PAYLOAD_TYPE
 from smartcam.frames._streaming.rtsp.sdp import describe
-from smartcam.frames._streaming.rtsp.session import TIMEOUT, RtspSession
+from smartcam.frames._streaming.rtsp.session import SESSION_TIMEOUT, RtspSession
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -27,29 +27,29 @@ MAX_SESSIONS: Final = 8
 """Largest number of sessions of one connection."""
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
-"""Seconds to wait for the frame from which a description is made; FFmpeg waits longer."""
+"""Seconds to wait for a first frame for the description; FFmpeg waits longer."""
 
-ELSEWHERE: Final = ("ANNOUNCE", "RECORD", "REDIRECT")
-"""Methods of RTSP that this server does not have."""
+UNSUPPORTED_METHODS: Final = ("ANNOUNCE", "RECORD", "REDIRECT")
+"""RTSP methods that this server does not support."""
 
 
 class RtspAnswer(NamedTuple):
-    """The answer to a request that is not refused."""
+    """The answer to a successful request."""
 
     headers: tuple[tuple[str, str], ...] = ()
     body: bytes = b""
 
 
 async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
-    """Carry out a request.
+    """Execute a request, and return its answer.
 
     Raises:
         RtspError: the request is answered with this error.
     """
     method = request.method
     if method not in METHODS:
-        allowed = ((("Allow", PUBLIC),)) if method in ELSEWHERE else (("Public", PUBLIC),)
-        status = 405 if method in ELSEWHERE else 501
+        allowed = ((("Allow", PUBLIC),)) if method in UNSUPPORTED_METHODS else (("Public", PUBLIC),)
+        status = 405 if method in UNSUPPORTED_METHODS else 501
         raise RtspError(status, f"expected one of {PUBLIC}, got {method}", allowed)
     if "require" in request.headers:
         wanted = request.headers["require"]
@@ -60,7 +60,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
         return await _options(connection, request)
     connection.gate.check(request)
     for session in connection.sessions.values():
-        session.heard()
+        session.keep_alive()
     with connection.serving():
         return await METHODS[method](connection, request)
 
@@ -97,7 +97,7 @@ async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer
     if "session" in request.headers:
         session = _session(connection, request)
         if session.playing or session.stream is stream:
-            raise RtspError(455, f"{stream.name}: it is set up already")
+            raise RtspError(455, f"{stream.name}: the session is set up already")
         raise RtspError(459, "each stream has a session of its own")
     wish = wish_of(request.headers.get("transport", ""), str(connection.peer[0]))
     if len(connection.sessions) >= MAX_SESSIONS:
@@ -157,7 +157,7 @@ async def _play(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
 async def _pause(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     _, session = _aimed(connection, request)
     if not session.playing:
-        raise RtspError(455, "it does not play")
+        raise RtspError(455, "the session does not play")
     session.pause()
     return RtspAnswer((_session_header(session),))
 
@@ -170,7 +170,7 @@ async def _teardown(connection: RtspConnection, request: RtspRequest) -> RtspAns
 
 
 async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
-    """Note that the client is alive, the purpose of this request: there are no parameters."""
+    """Note that the client is alive, which is the purpose of this request without parameters."""
     if request.url != "*":
         target_of(request.url)
     headers: tuple[tuple[str, str], ...] = ()
@@ -182,10 +182,10 @@ async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAn
 
 
 def _session(connection: RtspConnection, request: RtspRequest) -> RtspSession:
-    said = request.headers.get("session", "").partition(";")[0].strip()
-    if said not in connection.sessions:
-        raise RtspError(454, f"Session: expected one of this connection's, got {said[:40]!r}")
-    return connection.sessions[said]
+    given = request.headers.get("session", "").partition(";")[0].strip()
+    if given not in connection.sessions:
+        raise RtspError(454, f"Session: expected one of this connection's, got {given[:40]!r}")
+    return connection.sessions[given]
 
 
 def _aimed(connection: RtspConnection, request: RtspRequest) -> tuple[RtspTarget, RtspSession]:
@@ -201,7 +201,7 @@ def _aimed(connection: RtspConnection, request: RtspRequest) -> tuple[RtspTarget
 
 
 def _session_header(session: RtspSession) -> tuple[str, str]:
-    return "Session", f"{session.id};timeout={TIMEOUT}"
+    return "Session", f"{session.id};timeout={SESSION_TIMEOUT}"
 
 
 METHODS: Final[dict[str, Callable[[RtspConnection, RtspRequest], Awaitable[RtspAnswer]]]] = {

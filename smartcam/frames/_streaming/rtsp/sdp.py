@@ -1,4 +1,4 @@
-"""Describe a stream to a client before it asks for it (SDP, RFC 4566 and RFC 6184)."""
+"""Write the description of a stream for clients (SDP, RFC 4566 and RFC 6184)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def describe(
     Args:
         name: name of the stream.
         host: the server's own address.
-        session: a number, another one for another description.
-        sets: the sequence's and the picture's parameters.
-        payload_type: payload type of its packets.
+        session: number of the description; changes with its content.
+        sets: sequence and picture parameter sets.
+        payload_type: payload type of the packets.
         rate: frames per second.
     """
     kind = "IP6" if ":" in host else "IP4"

@@ -33,41 +33,41 @@ _ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
 
 class RtspServer(Server):
-    """Serves sources by RTSP, as H.264 over UDP or over the connection (RFC 2326, RFC 6184).
+    """Serve sources by RTSP, as H.264 over UDP or over the connection (RFC 2326, RFC 6184).
 
     ::
 
         async with RtspServer({"left": source}) as server:
             print(server.url("left"))
 
-    A source is encoded once, however many look at it, and streams while somebody looks, and for two
-    seconds after. A viewer that is too slow gets only whole frames, misses those in between, and
-    goes on with a key frame; one that takes nothing for 10 s is cut off, and so is one over UDP
-    that sends no report for 60 s. Datagrams go to the address that the connection comes from, and
-    nowhere else. When a source ends, its viewers are informed and their connections closed; a later
-    request is answered 503 with the reason, and the source is tried again.
+    A source is encoded once for all viewers, and streams while there are viewers, and for two
+    seconds after. A slow viewer gets only complete frames, skips others, and continues with a key
+    frame. A viewer that accepts no data for 10 s, or sends no report over UDP for 60 s, is
+    disconnected. Datagrams go only to the connection's address. When a source ends, its viewers'
+    connections are closed; a later request is answered 503 with the reason, and restarts the
+    source.
 
-    Everybody who reaches the port may view, unless there is a password. Neither it nor the pictures
-    are encrypted: with Digest the password itself does not go over the network.
+    Without a password, every client that reaches the port may view. Pictures are not encrypted;
+    with Digest the password itself is not sent.
 
     Args:
-        sources: sources by name; a request for one that is not open is answered 503. A name has 1
+        sources: sources by name; a request for an unopened source is answered 503. A name has 1
             to 64 letters, digits and ``. _ ~ -``, the first a letter or digit.
         host: address to listen on.
         port: port to listen on; 0: any.
-        user: name of the user who may view; None: everybody may.
+        user: name of the user; None: no password is needed.
         password: password of the user.
         basic: also accept the bare password, from clients that do not know Digest.
-        bitrate: bits per second that an encoder keeps to instead of a quality.
+        bitrate: bits per second of an encoder, instead of a quality.
         crf: quality, 0 (best) to 51.
-        fps: frames per second, for the bit rate; None: as each source says, else 30.
+        fps: frames per second, for the bit rate; None: each source's, else 30.
         keyint: number of frames within which every part of the picture is refreshed.
         max_connections: largest number of connections at a time.
         max_viewers: largest number of sessions of all connections at a time.
 
     Raises:
-        ConfigurationError: no sources, a name that is not valid, user without password, or a number
-            is out of range.
+        ConfigurationError: no sources, an invalid name, a user without a password, or a number out
+            of range.
     """
 
     def __init__(
@@ -117,13 +117,13 @@ class RtspServer(Server):
 
     @property
     def port(self) -> int:
-        """The port that the server listens on; the given one until it is started."""
+        """Port of the server; the given port until it is started."""
         return self._port
 
     def url(self, name: str) -> str:
         """Return a stream's URL, without the password.
 
-        It has this machine's name if the server listens on all addresses.
+        The URL has this machine's name if the server listens on all addresses.
 
         Raises:
             ConfigurationError: there is no such stream.
@@ -141,10 +141,10 @@ class RtspServer(Server):
         return {name: stream.statistics() for name, stream in self._streams.items()}
 
     async def start(self) -> None:
-        """Open the port; does nothing if it is started already.
+        """Open the port; does nothing if the server is started.
 
         Raises:
-            ConfigurationError: the server cannot listen there, or a number is out of range.
+            ConfigurationError: the server cannot listen on the port, or a number is out of range.
             MissingExtraError: the extra ``video`` is not installed.
 
         Cancellation: leaves it stopped.
@@ -167,7 +167,7 @@ class RtspServer(Server):
         self._serving.open(listener)
 
     async def stop(self) -> None:
-        """Say goodbye to the viewers and close everything; does nothing if stopped.
+        """Disconnect the viewers and close the port; does nothing if stopped.
 
         Cancellation: takes effect once everything is closed, within two seconds.
         """
@@ -177,7 +177,7 @@ class RtspServer(Server):
         await finish(serving.close)
 
     def _made(self, codecs: Codecs) -> dict[str, RtspStream]:
-        """Return the streams; two names of a source share one encoder."""
+        """Return the streams; a source with two names has one encoder."""
         shared: dict[int, tuple[SharedH264, float]] = {}
         for source in self._sources.values():
             if id(source) in shared:
@@ -190,7 +190,7 @@ class RtspServer(Server):
 
 
 def _rate(source: FrameSource) -> float:
-    """Return a source's frames per second, or the default if it is not open yet."""
+    """Return a source's frame rate, or the default if the source is not open."""
     try:
         rates = source.format.rates
     except LocalProtocolError:

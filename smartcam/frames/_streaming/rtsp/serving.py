@@ -1,4 +1,4 @@
-"""The parts of a server while it is started: its port, connections and streams."""
+"""The port, connections and streams of a started server."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _log = logging.getLogger(__name__)
 
 
 class RtspServing:
-    """Takes connections, and counts them and their viewers.
+    """Accept connections, and count connections and viewers.
 
     Args:
         streams: streams by their names.
         codecs: open codecs, which are closed with this object.
-        authentication: user who may look, and the password.
-        max_connections: connections at a time.
-        max_viewers: sessions at a time.
+        authentication: user and password.
+        max_connections: largest number of connections.
+        max_viewers: largest number of sessions.
     """
 
     def __init__(
@@ -44,10 +44,10 @@ class RtspServing:
         max_viewers: int,
     ) -> None:
         self.authentication = authentication
-        self.number: int = secrets.randbits(31)  # session number of its descriptions
+        self.number: int = secrets.randbits(31)  # session number of descriptions
         self._streams, self._codecs = streams, codecs
         self._max_viewers = max_viewers
-        self._viewers: list[str] = []  # the addresses of those who look
+        self._viewers: list[str] = []  # addresses of the viewers
         self._listener: socket.socket | None = None
         self.places: Places[RtspConnection] = Places(max_connections, within=IDLE_TIMEOUT)
         self._acceptor = Acceptor(
@@ -55,12 +55,12 @@ class RtspServing:
         )
 
     def open(self, listener: socket.socket) -> None:
-        """Take connections from now on; the socket is closed with it."""
+        """Accept connections on a socket, which is closed with this object."""
         self._listener = listener
         self._acceptor.open(listener)
 
     async def close(self) -> None:
-        """Say goodbye, and close everything."""
+        """Close all connections, streams and codecs."""
         listener, self._listener = self._listener, None
         self._acceptor.close()
         if listener is not None:
@@ -76,20 +76,20 @@ class RtspServing:
             await shared.close()
         await self._codecs.close()
 
-    # what its connections ask
+    # called by the connections
 
     def enter(self, connection: RtspConnection, peer: object) -> str:
-        """Take a new connection; return "", or why there is no room for it."""
+        """Register a new connection; return the reason if there are too many, else ""."""
         if self._listener is None:
             return "the server is stopped"
         return self._acceptor.enter(connection, peer)
 
     def leave(self, connection: RtspConnection) -> None:
-        """Forget a connection that is closed."""
+        """Remove a closed connection."""
         self._acceptor.leave(connection)
 
     def served(self, connection: RtspConnection) -> None:
-        """Note that a connection was served: it is the last that makes room."""
+        """Mark a connection as the most recently served, the last to be closed for room."""
         self._acceptor.move_back(connection)
 
     def unseated(self, connection: RtspConnection) -> None:
@@ -108,20 +108,20 @@ class RtspServing:
         return self._streams[name]
 
     def admit(self, session: RtspSession, peer: str) -> None:
-        """Count a viewer, who comes from an address.
+        """Count a viewer from an address.
 
         Raises:
-            RtspError: there are too many, or too many of that address.
+            RtspError: there are too many viewers, or too many from the address.
         """
         if len(self._viewers) >= self._max_viewers:
-            raise RtspError(453, f"{self._max_viewers} others look already")
+            raise RtspError(453, f"there are {self._max_viewers} viewers already")
         share = share_of(self._max_viewers)
         if not is_loopback(peer) and self._viewers.count(peer) >= share:
-            raise RtspError(453, f"{share} others of {peer} look already")
+            raise RtspError(453, f"there are {share} viewers from {peer} already")
         self._viewers.append(peer)
         session.stream.viewers += 1
 
     def dismiss(self, session: RtspSession, peer: str) -> None:
-        """Count a viewer no longer."""
+        """Remove a viewer from the count."""
         self._viewers.remove(peer)
         session.stream.viewers -= 1

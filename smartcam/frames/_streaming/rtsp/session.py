@@ -1,4 +1,4 @@
-"""One viewer: what it gets, and whether it is still there."""
+"""A viewer's session: deliver frames, and detect a lost client."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtsp.streams import RtspStream
 
 
-TIMEOUT: Final = 60
-"""Seconds in which a client has to say something; it is told so."""
+SESSION_TIMEOUT: Final = 60
+"""Seconds within which a client must send a request or report; announced to the client."""
 
 REPORT_INTERVAL: Final = 5.0
-"""Seconds between two sender's reports."""
+"""Seconds between two sender reports."""
 
-LOOK_INTERVAL: Final = 1.0
-"""Seconds between two looks whether the client is still there."""
+CHECK_INTERVAL: Final = 1.0
+"""Seconds between two checks of the client."""
 
 CLOCK: Final = 90_000
 
 
 class RtspSession:
-    """A session, which SETUP begins and TEARDOWN ends.
+    """A session from SETUP to TEARDOWN.
 
-    It plays from a key frame on. A frame that would have to wait is skipped, and with it those that
-    follow until there is a key frame again, for which it asks.
+    Playing begins at a key frame. A frame that would have to wait is skipped; then a key frame is
+    requested, and all frames before it are skipped.
 
     Args:
-        stream: stream that the client watches.
+        stream: stream to deliver.
         ended: function that is called once when the session ends by itself, with the session and
             the reason; "": the client takes nothing.
     """
@@ -61,7 +61,7 @@ class RtspSession:
         self._loop = asyncio.get_running_loop()
         self._numbering = PacketNumbers()
         self._offset = secrets.randbits(32)
-        self._last = -1  # the last timestamp, before the offset
+        self._last = -1  # last timestamp without the offset
         self._wants_key, self._skips = True, False
         self._told_at = -REPORT_INTERVAL
         self._heard_at = self._loop.time()
@@ -73,12 +73,12 @@ class RtspSession:
         return self._numbering.ssrc
 
     def start(self, delivery: PacketDelivery) -> None:
-        """Have a way to the client; it is closed with the session."""
+        """Set the delivery to the client, which is closed with the session."""
         self.delivery = delivery
-        self._timer = self._loop.call_later(LOOK_INTERVAL, self._look)
+        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check)
 
     def play(self) -> str:
-        """Send what comes; return where that begins, for RTP-Info."""
+        """Start sending frames; return the RTP-Info of the first packet."""
         if not self.playing:
             self.playing, self._wants_key, self._skips = True, True, False
             self.stream.shared.join(self)
@@ -86,7 +86,7 @@ class RtspSession:
         return f"seq={self._numbering.sequence};rtptime={now}"
 
     def pause(self) -> None:
-        """Send no more, until it plays again."""
+        """Stop sending frames until :meth:`play`."""
         self.playing = False
         self.stream.shared.leave(self)
 
@@ -94,7 +94,7 @@ class RtspSession:
         """Release everything. Idempotent.
 
         Args:
-            why: the client is told so; "": it knows.
+            why: reason that is sent to the client; "": no message.
         """
         self.pause()
         if self._timer is not None:
@@ -106,22 +106,22 @@ class RtspSession:
                 delivery.report(compound(*self._report(), Goodbye((self.ssrc,), why)))
             delivery.close()
 
-    def heard(self) -> None:
-        """Note that the client is there."""
+    def keep_alive(self) -> None:
+        """Note that the client is alive."""
         self._heard_at = self._loop.time()
 
     def take_rtcp(self, data: bytes) -> None:
-        """Hear what the client reports; other bytes are ignored."""
+        """Process a report of the client; invalid bytes are ignored."""
         try:
             reports = parse_rtcp(data)
         except MessageError:
             return
         if any(isinstance(one, ReceiverReport | SenderReport) for one in reports):
-            self.heard()
+            self.keep_alive()
         if any(isinstance(one, PictureLost) and one.media == self.ssrc for one in reports):
             self.stream.shared.key_frame()
 
-    # what the stream says
+    # called by the stream
 
     def take(self, unit: Frame, key: bool) -> None:
         """Send an encoded frame, or skip it."""
@@ -143,7 +143,7 @@ class RtspSession:
         self.stream.sent += 1
 
     def ended(self, error: FrameSourceError) -> None:
-        """Hear that the source has ended."""
+        """End the session, since the source has ended."""
         self.playing = False
         self._end(str(error))
 
@@ -153,7 +153,7 @@ class RtspSession:
         pieces = self.stream.cutter.pieces(unit)
         packets = self._numbering.numbered(pieces, self._timestamp(ticks))
         if now - self._told_at >= REPORT_INTERVAL:
-            self._tell(now)
+            self._send_report(now)
         return delivery.send(packets, key, now)
 
     def _ticks(self, moment: float) -> int:
@@ -169,28 +169,28 @@ class RtspSession:
         report = SenderReport(self.ssrc, ntp, stamp, made.packets, made.octets)
         return report, SourceDescription(self.ssrc, "smartcam")
 
-    def _tell(self, now: float) -> None:
+    def _send_report(self, now: float) -> None:
         self._told_at = now
         if self.delivery is not None:
             self.delivery.report(compound(*self._report()))
 
-    def _look(self) -> None:
-        """See whether the client is still there."""
+    def _check(self) -> None:
+        """End the session if the client is lost."""
         if self.delivery is None:
             return
         now = self._loop.time()
-        self._timer = self._loop.call_later(LOOK_INTERVAL, self._look)
+        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check)
         alive = self.delivery.alive(now) if self.playing else None
         if alive:
-            self.heard()
+            self.keep_alive()
         if alive is False:
             self.stream.stalled += 1
             self._end("")
-        elif now - self._heard_at >= TIMEOUT:
+        elif now - self._heard_at >= SESSION_TIMEOUT:
             self.stream.silent += 1
-            self._end(f"nothing was heard for {TIMEOUT} s")
+            self._end(f"no request or report came for {SESSION_TIMEOUT} s")
         elif self.playing and now - self._told_at >= REPORT_INTERVAL:
-            self._tell(now)
+            self._send_report(now)
 
     def _end(self, why: str) -> None:
         self.close(why)

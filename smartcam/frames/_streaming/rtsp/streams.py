@@ -1,4 +1,4 @@
-"""The streams that a server offers, and its counts."""
+"""The streams of a server, with their counts."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class RtspStatistics:
 
     Attributes:
         viewers: number of present viewers.
-        encoded: frames encoded, each once for all viewers; a source with two names has one count.
-        keys: key frames among the frames encoded.
-        failed: frames that could not be encoded.
-        sent: frames sent to all viewers together.
-        skipped: frames that a viewer was too slow for, all viewers together.
-        stalled: viewers that were cut off since they took nothing.
-        silent: viewers that were cut off since nothing was heard of them.
+        encoded: encoded frames, once for all viewers; a source with two names has one count.
+        keys: key frames among the encoded frames.
+        failed: frames that failed to encode.
+        sent: frames sent, summed over all viewers.
+        skipped: frames skipped for slow viewers, summed over all viewers.
+        stalled: viewers disconnected since they accepted no data.
+        silent: viewers disconnected since they sent no request or report.
     """
 
     viewers: int
@@ -38,7 +38,7 @@ class RtspStatistics:
 
 @dataclass(slots=True, eq=False)
 class RtspStream:
-    """One name of a server's."""
+    """A named stream of a server."""
 
     name: str
     shared: SharedH264

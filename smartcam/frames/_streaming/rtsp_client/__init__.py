@@ -1,1 +1,1 @@
-"""An RTSP client (RFC 2326) of cameras: their answers, their descriptions, and their packets."""
+"""An RTSP client (RFC 2326) for cameras: requests, descriptions, and packets."""

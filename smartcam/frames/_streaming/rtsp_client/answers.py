@@ -1,4 +1,4 @@
-"""Cut what a server sends on an RTSP connection into answers, requests and packets."""
+"""Parse the bytes of an RTSP server into answers, requests and packets."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Largest number of bytes of an answer's lines."""
+"""Largest number of bytes of an answer's header."""
 
 MAX_BODY_BYTES: Final = 64 << 10
 """Largest number of bytes of an answer's body, such as a description's."""
 
 MAX_STRAY_BYTES: Final = 256 << 10
-"""Bytes in a row that belong to no message, after which the connection is given up."""
+"""Number of bytes in a row outside of messages after which the connection fails."""
 
-ROOM: Final = 4 + 0xFFFF + MAX_HEAD_BYTES + MAX_BODY_BYTES
-"""Bytes that a message and what comes behind it may take."""
+MAX_HELD_BYTES: Final = 4 + 0xFFFF + MAX_HEAD_BYTES + MAX_BODY_BYTES
+"""Largest number of bytes that the parser keeps."""
 
 _ANSWER: Final = re.compile(rb"RTSP/\d\.\d[ \t]+(\d{3})(?:[ \t]+([^\r\n]{0,200}))?")
 _REQUEST: Final = re.compile(rb"([A-Z_]{3,32})[ \t]+([^ \r\n]{1,2048})[ \t]+RTSP/\d\.\d[ \t]*")
@@ -31,14 +31,14 @@ _BEGINS: Final = re.compile(
 )
 
 MAX_BEGIN_BYTES: Final = 16
-"""Largest number of bytes by which it is known that a message begins."""
+"""Number of bytes that suffice to recognize a message."""
 
 USUAL_CHANNELS: Final = range(4)
-"""Channels that packets are believed to be of when they follow bytes that belong to no packet."""
+"""Channels that are accepted directly after bytes outside of messages."""
 
 
 class ServerAnswer(NamedTuple):
-    """An answer; the names of its headers are in lower case, with all values of each."""
+    """An answer; header names are in lower case, with all values of each."""
 
     status: int
     reason: str
@@ -51,20 +51,20 @@ class ServerAnswer(NamedTuple):
 
     @property
     def cseq(self) -> int | None:
-        """The number of the request that it answers; None: it does not say."""
-        said = self.header("cseq").strip()
-        return int(said) if re.fullmatch(r"[0-9]{1,9}", said) else None
+        """CSeq of the answered request; None: missing."""
+        given = self.header("cseq").strip()
+        return int(given) if re.fullmatch(r"[0-9]{1,9}", given) else None
 
 
 class ServerRequest(NamedTuple):
-    """A request of the server's."""
+    """A request of the server."""
 
     method: str
     headers: Mapping[str, Sequence[str]]
 
 
 class ChannelPacket(NamedTuple):
-    """A packet of a channel, between the answers (section 10.12)."""
+    """A packet of a channel, between the answers (RFC 2326, section 10.12)."""
 
     channel: int
     data: bytes
@@ -74,29 +74,29 @@ Received: TypeAlias = ServerAnswer | ServerRequest | ChannelPacket
 
 
 class AnswerParser:
-    """Cuts messages from bytes that come in any pieces.
+    """Cut messages from a stream of bytes.
 
-    Bytes that belong to none are skipped until a message begins. What is held is bounded by
-    :data:`ROOM` and by what one feeds before one takes.
+    Bytes outside of messages are skipped. The parser keeps at most :data:`MAX_HELD_BYTES`, and
+    bytes fed since the last :meth:`next`.
     """
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # bytes in which a head does not end
+        self._seen = 0  # number of searched bytes without the end of a header
         self._strays = 0
         self._channels = set(USUAL_CHANNELS)
         self._head: ServerAnswer | ServerRequest | None = None
-        self._body = 0  # bytes that its body has
+        self._body = 0  # size of the current body
 
     def feed(self, data: bytes) -> None:
-        """Take bytes."""
+        """Add bytes."""
         self._data += data
 
     def next(self) -> Received | None:
-        """Return the next whole message; None if it is not complete yet.
+        """Return the next complete message; None if it is incomplete.
 
         Raises:
-            MessageError: too many bytes that belong to no message, or more than there is room for.
+            MessageError: too many bytes outside of messages, or a message is too large.
         """
         while self._head is None:
             if not self._skip_strays():
@@ -113,7 +113,7 @@ class AnswerParser:
         return head._replace(body=body) if isinstance(head, ServerAnswer) else head
 
     def _skip_strays(self) -> bool:
-        """Throw away what begins no message; return True if one begins."""
+        """Skip bytes outside of messages; return True if a message begins."""
         while (begins := self._begins()) is None:
             if self._strays > MAX_STRAY_BYTES:
                 break
@@ -122,7 +122,7 @@ class AnswerParser:
         return bool(begins)
 
     def _begins(self) -> bool | None:
-        """Return True if a message begins; None: bytes that looked like one were thrown away."""
+        """Return True if a message begins; None: bytes that resembled a message were skipped."""
         found = _BEGINS.search(self._data)
         gone = found.start() if found else max(0, len(self._data) - MAX_BEGIN_BYTES)
         if gone:
@@ -131,7 +131,7 @@ class AnswerParser:
             self._seen = 0
         if found is None or not self._strays or self._data[:1] != b"$":
             return found is not None
-        if len(self._data) <= 4:  # behind strays any byte may be a dollar
+        if len(self._data) <= 4:  # after skipped bytes, a dollar may be data
             return False
         if self._data[4] >> 6 == 2 and self._data[1] in self._channels:
             return True
@@ -152,7 +152,7 @@ class AnswerParser:
         return packet
 
     def _read_head(self) -> bool:
-        """Take the lines of a message; return False where they are not there yet.
+        """Read the header of a message; return False if it is incomplete.
 
         Lines may end by either character, or by both.
         """
@@ -176,7 +176,7 @@ class AnswerParser:
 def _message(
     line: bytes, headers: Mapping[str, Sequence[str]]
 ) -> ServerAnswer | ServerRequest | None:
-    """Return the message that a first line begins; None: the line begins no message."""
+    """Return the message for its first line; None: the line is no beginning of a message."""
     if (found := _ANSWER.match(line)) is not None:
         reason = (found[2] or b"").decode("latin-1").strip()
         return ServerAnswer(int(found[1]), reason, headers)
@@ -189,7 +189,7 @@ def _headers(lines: list[bytes]) -> dict[str, list[str]]:
     last: list[str] = []
     for line in lines:
         text = line.decode("latin-1")
-        if text[:1] in (" ", "\t") and last and text.strip():  # goes on with the line before
+        if text[:1] in (" ", "\t") and last and text.strip():  # continuation of the line before
             last[-1] = f"{last[-1]} {text.strip()}"
             continue
         name, colon, value = text.partition(":")
@@ -200,11 +200,11 @@ def _headers(lines: list[bytes]) -> dict[str, list[str]]:
 
 
 def _length(headers: Mapping[str, Sequence[str]]) -> int:
-    said = next(iter(headers.get("content-length", ())), "0")
-    if not re.fullmatch(r"[0-9]{1,20}", said):
+    given = next(iter(headers.get("content-length", ())), "0")
+    if not re.fullmatch(r"[0-9]{1,20}", given):
         return 0
-    if int(said) > MAX_BODY_BYTES:
+    if int(given) > MAX_BODY_BYTES:
         raise MessageError(
-            f"RTSP: an answer: expected a body of {MAX_BODY_BYTES} bytes at most, got {said}"
+            f"RTSP: an answer: expected a body of {MAX_BODY_BYTES} bytes at most, got {given}"
         )
-    return int(said)
+    return int(given)

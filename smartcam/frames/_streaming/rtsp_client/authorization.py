@@ -1,4 +1,4 @@
-"""Answer a server that asks for a password: Basic (RFC 7617) and Digest (RFC 7616)."""
+"""Answer a server's challenge for a password: Basic (RFC 7617) and Digest (RFC 7616)."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
 
 
 MAX_CHALLENGES: Final = 8
-"""Largest number of challenges of one answer that are looked at."""
+"""Largest number of challenges of one answer that are read."""
 
 _HASHES: Final = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
-"""Hashes by the names that challenges have for them; the last one is the best."""
+"""Hash functions by their names in challenges; the last one is preferred."""
 
 _PART: Final = re.compile(r'\s*([A-Za-z0-9_-]{1,32})\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s",]*))\s*,?')
 
 
 class Challenge(NamedTuple):
-    """The way in which a server wants the password.
+    """A server's challenge for a password.
 
     Attributes:
         scheme: name in lower case.
-        parts: what it says, by names in lower case.
+        parts: parameters by names in lower case.
     """
 
     scheme: str
@@ -34,12 +34,12 @@ class Challenge(NamedTuple):
 
     @property
     def algorithm(self) -> str:
-        """Name of the hash of Digest, without its mode of use."""
+        """Name of Digest's hash function, without ``-sess``."""
         return self.parts.get("algorithm", "MD5").upper().removesuffix("-SESS")
 
     @property
     def rank(self) -> int:
-        """Rank of the challenge; 0: it cannot be answered."""
+        """Preference of the challenge; 0: not supported."""
         if self.scheme == "basic":
             return 1
         qop = re.split(r"[\s,]+", self.parts.get("qop", "auth").lower())
@@ -48,17 +48,17 @@ class Challenge(NamedTuple):
 
 
 def challenge_of(headers: Sequence[str]) -> Challenge | None:
-    """Return the best challenge of an answer that can be answered; None: there is none."""
+    """Return the preferred supported challenge of an answer; None: there is none."""
     read = [_read(one) for one in headers[:MAX_CHALLENGES]]
     best = max(read, key=lambda one: one.rank, default=None)
     return best if best is not None and best.rank else None
 
 
 def _read(header: str) -> Challenge:
-    scheme, _, said = header.strip().partition(" ")
+    scheme, _, given = header.strip().partition(" ")
     parts: dict[str, str] = {}
     place = 0
-    while (found := _PART.match(said, place)) is not None:
+    while (found := _PART.match(given, place)) is not None:
         value = found[3] if found[2] is None else re.sub(r"\\(.)", r"\1", found[2])
         parts.setdefault(found[1].lower(), value)
         place = found.end()
@@ -66,17 +66,17 @@ def _read(header: str) -> Challenge:
 
 
 class Credentials:
-    """A user with a password, and what the server last asked for.
+    """A user with a password, and the server's last challenge.
 
     Args:
-        user: "": none.
+        user: name of the user; "": no user.
         password: password of the user.
     """
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
         self._challenge: Challenge | None = None
-        self._count = 0  # requests with the challenge's nonce
+        self._count = 0  # number of requests with the challenge's nonce
 
     @property
     def known(self) -> bool:
@@ -84,7 +84,7 @@ class Credentials:
         return bool(self._user)
 
     def challenged(self, headers: Sequence[str]) -> bool:
-        """Take a refusal; return whether a request with what it asks for may do better."""
+        """Store a refusal's challenge; return whether another request may succeed."""
         found = challenge_of(headers)
         if not self.known or found is None:
             return False
@@ -94,7 +94,7 @@ class Credentials:
         return before is None or stale or found.parts != before.parts
 
     def header(self, method: str, uri: str) -> str:
-        """Return the value of ``Authorization``; "" if nobody asked for one."""
+        """Return the value of ``Authorization``; "" without a challenge."""
         challenge = self._challenge
         if challenge is None:
             return ""
@@ -105,22 +105,22 @@ class Credentials:
         return self._digest(challenge, method, uri)
 
     def _digest(self, challenge: Challenge, method: str, uri: str) -> str:
-        said, hashed = challenge.parts, _hash(challenge.algorithm)
-        realm, nonce = said.get("realm", ""), said["nonce"]
+        given, hashed = challenge.parts, _hash(challenge.algorithm)
+        realm, nonce = given.get("realm", ""), given["nonce"]
         secret = hashed(f"{self._user}:{realm}:{self._password}")
         count, mine = f"{self._count:08x}", secrets.token_hex(8)
-        session = said.get("algorithm", "").upper().endswith("-SESS")
+        session = given.get("algorithm", "").upper().endswith("-SESS")
         if session:
             secret = hashed(f"{secret}:{nonce}:{mine}")
-        asked, quality = hashed(f"{method}:{uri}"), "qop" in said
+        asked, quality = hashed(f"{method}:{uri}"), "qop" in given
         middle = f"{nonce}:{count}:{mine}:auth" if quality else nonce
         parts = {"username": self._user, "realm": realm, "nonce": nonce, "uri": uri}
         parts["response"] = hashed(f"{secret}:{middle}:{asked}")
         shown = [f"{name}={_quoted(value)}" for name, value in parts.items()]
-        if "algorithm" in said:
-            shown.append(f"algorithm={said['algorithm']}")
-        if "opaque" in said:
-            shown.append(f"opaque={_quoted(said['opaque'])}")
+        if "algorithm" in given:
+            shown.append(f"algorithm={given['algorithm']}")
+        if "opaque" in given:
+            shown.append(f"opaque={_quoted(given['opaque'])}")
         if quality or session:
             shown.append(f'cnonce="{mine}"')
         if quality:

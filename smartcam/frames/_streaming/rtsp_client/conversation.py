@@ -1,4 +1,4 @@
-"""Speak to a camera until it plays, meanwhile, and at the end (RFC 2326)."""
+"""Run a session with a camera: set up, play, keep alive, end (RFC 2326)."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeout
 from smartcam.frames._streaming.rtp.packets import ReceiverReport, RtpPacket
 from smartcam.frames._streaming.rtp.sockets import Endpoint, SocketPair
 from smartcam.frames._streaming.rtsp_client.authorization import Credentials
+from smartcam.frames._streaming.rtsp_client.channels import InterleavedChannels, options_of, pair_of
 from smartcam.frames._streaming.rtsp_client.description import VideoTrack, described, url_of
 from smartcam.frames._streaming.rtsp_client.link import RtspLink
-from smartcam.frames._streaming.rtsp_client.ways import ChannelWays, options_of, pair_of
 from smartcam.frames._video.redirects import MAX_REDIRECTS, REDIRECTS, followed, why
 
 if TYPE_CHECKING:
     import ssl
 
-    from smartcam.frames._streaming.rtp.receiver import PacketWays
+    from smartcam.frames._streaming.rtp.receiver import PacketChannels
     from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
 
 
 PORTS: Final = {"rtsp": 554, "rtsps": 322}
 
 CLOSE_TIMEOUT: Final = 0.5
-"""Seconds for a server to answer that it ended the session; then the connection is closed."""
+"""Seconds for the answer to TEARDOWN before the connection is closed."""
 
 SESSION_TIMEOUT: Final = 60.0
-"""Seconds after which a session without a request ends, unless the server says otherwise."""
+"""Session timeout, seconds, unless the server announces another one."""
 
 MIN_SESSION_TIMEOUT: Final = 1.0
-"""Seconds: where a server says less, it is asked as often as if it had said so."""
+"""Least session timeout, seconds, which replaces a shorter one of the server."""
 
 GONE_SESSION: Final = 454
 NOT_IN_THIS_STATE: Final = 455
@@ -43,19 +43,19 @@ INVALID_RANGE: Final = 457
 
 
 class OtherEncodingError(FrameFormatError):
-    """A stream that is encoded in a way that we do not receive."""
+    """Error for a stream with an unsupported codec."""
 
 
 class ConversationPlan(NamedTuple):
-    """Whom to ask, and for what.
+    """Options of a session.
 
     Attributes:
         name: name of the source, for errors.
         url: URL with user and password.
-        timeout: seconds until it plays, and for each answer after that.
-        transports: ``tcp`` and ``udp``, in the order in which they are tried.
-        elsewhere: whether a redirect to another host or port is followed.
-        tls: how a server shows who it is, where it is asked by TLS.
+        timeout: seconds until the stream plays, and for each answer after that.
+        transports: ``tcp`` and ``udp``, in the order of the attempts.
+        elsewhere: whether redirects to other hosts or ports are followed.
+        tls: TLS context that checks the server's certificate; None: the default.
     """
 
     name: str
@@ -66,7 +66,7 @@ class ConversationPlan(NamedTuple):
     tls: ssl.SSLContext | None = None
 
     def wrong(self, text: str) -> FrameSourceError:
-        """Return an error."""
+        """Return an error with the source's name."""
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 
 
@@ -74,12 +74,12 @@ class RtspConversation:
     """One session with a server.
 
     Attributes:
-        track: the stream that it asked for, once that is known.
-        ways: how its packets come.
+        track: the requested stream, after the setup.
+        channels: channels of the packets.
     """
 
     track: VideoTrack
-    ways: PacketWays
+    channels: PacketChannels
 
     def __init__(self, plan: ConversationPlan) -> None:
         self._plan, self._url = plan, plan.url
@@ -87,36 +87,36 @@ class RtspConversation:
         self._base = self._aggregate = ""
         self._session = ""
         self._timeout = SESSION_TIMEOUT
-        self._parameters = False  # whether the server takes GET_PARAMETER
+        self._parameters = False  # whether the server supports GET_PARAMETER
         self._doing = "the connection"
         self._sockets: SocketPair | None = None
-        self._source = ""  # another host that sends the packets, as the server says
+        self._source = ""  # other host that sends the packets, from the server's answer
         self._alive: asyncio.Task[None] | None = None
 
     @property
     def link(self) -> RtspLink:
         """The connection."""
         if self._link is None:
-            raise self._plan.wrong("it is not connected")
+            raise self._plan.wrong("not connected")
         return self._link
 
     @property
     def senders(self) -> tuple[str, ...]:
-        """Addresses that packets may come from: the server's, and the one that it says.
+        """Allowed senders of packets: the server, and the source that it announces.
 
-        Behind a recorder the camera itself may send, and behind a router the address that a camera
-        says of itself means nothing here.
+        A recorder may announce the camera as the sender. The address that a camera behind a router
+        announces is not usable.
         """
         peer = str(self.link.peer[0]).partition("%")[0]
         return (peer, self._source) if self._source else (peer,)
 
     async def set_up(self) -> None:
-        """Ask for the stream, and have its packets come to us once it plays.
+        """Set up the stream and the channels of its packets.
 
         Raises:
-            FrameSourceError: there is no such server or stream, or it refuses, or it is silent.
+            FrameSourceError: there is no such server or stream, or it refuses or does not answer.
 
-        Cancellation: :meth:`close` ends what has begun.
+        Cancellation: :meth:`close` cleans up.
         """
         plan = self._plan
         try:
@@ -131,10 +131,10 @@ class RtspConversation:
             raise plan.wrong(f"cannot be read: {why(exc)}") from None
 
     async def parameter(self, method: str, body: bytes) -> ServerAnswer:
-        """Read or set a parameter, in the session or, where nothing plays, without one.
+        """Read or set a parameter, within the session if it plays.
 
         Raises:
-            FrameSourceError: there is no such server, or it is silent.
+            FrameSourceError: there is no such server, or it does not answer.
         """
         plan = self._plan
         try:
@@ -157,7 +157,7 @@ class RtspConversation:
             raise plan.wrong(f"cannot be asked: {why(exc)}") from None
 
     async def _introduced(self, method: str, body: bytes) -> ServerAnswer:
-        """Connect, and ask without a session."""
+        """Connect, and send a request without a session."""
         for _ in range(MAX_REDIRECTS):
             await self._connect()
             answer = await self._parameter(method, body, self._plain())
@@ -172,10 +172,10 @@ class RtspConversation:
         return await self.link.ask(method, url, kind | self._headers(), body)
 
     async def play(self) -> None:
-        """Have the camera play, and keep the session alive until :meth:`close`.
+        """Start playing, and keep the session alive until :meth:`close`.
 
         Raises:
-            FrameSourceError: the camera refuses, or is silent.
+            FrameSourceError: the camera refuses or does not answer.
         """
         try:
             async with asyncio.timeout(self._plan.timeout):
@@ -250,7 +250,7 @@ class RtspConversation:
         link.abort()
 
     def _elsewhere(self, location: str) -> str:
-        """Return the URL that a redirect leads to; another host gets no password."""
+        """Return the URL of a redirect; another host gets no password."""
         try:
             to = urlsplit(urljoin(self._url, location))
             if to.scheme not in PORTS or not to.hostname or to.port == 0:
@@ -302,10 +302,10 @@ class RtspConversation:
         asked = "RTP/AVP/TCP;unicast;interleaved=0-1"
         answer = await self._set_up_track(asked)
         if answer.status == 200:
-            said = options_of(answer.header("transport") or asked)
-            self._check_transport(said, "RTP/AVP/TCP")
-            channels = pair_of(said.get("interleaved", ""), 255) or (0, 1)
-            self.ways = ChannelWays(self.link, channels, self.track.payload_type)
+            given = options_of(answer.header("transport") or asked)
+            self._check_transport(given, "RTP/AVP/TCP")
+            channels = pair_of(given.get("interleaved", ""), 255) or (0, 1)
+            self.channels = InterleavedChannels(self.link, channels, self.track.payload_type)
         return answer
 
     async def _by_ports(self) -> ServerAnswer:
@@ -314,11 +314,11 @@ class RtspConversation:
         port = pair.rtp.getsockname()[1]
         answer = await self._set_up_track(f"RTP/AVP;unicast;client_port={port}-{port + 1}")
         if answer.status == 200:
-            said = options_of(answer.header("transport"))
-            self._check_transport(said, "RTP/AVP")
-            self.ways = pair
-            self._source = _address(said.get("source", ""))
-            ports = pair_of(said.get("server_port", ""), 65535)
+            given = options_of(answer.header("transport"))
+            self._check_transport(given, "RTP/AVP")
+            self.channels = pair
+            self._source = _address(given.get("source", ""))
+            ports = pair_of(given.get("server_port", ""), 65535)
             if ports is not None:
                 _open_firewall(pair, str(link.peer[0]), ports)
         return answer
@@ -330,10 +330,10 @@ class RtspConversation:
             self._sockets = SocketPair.waiting(Endpoint(family, host, 0))
         return self._sockets
 
-    def _check_transport(self, said: dict[str, str], asked: str) -> None:
-        got = said[""].removesuffix("/UDP") or asked
-        if got != asked or "multicast" in said:
-            shown = f"{got}{';multicast' * ('multicast' in said)}"
+    def _check_transport(self, given: dict[str, str], asked: str) -> None:
+        got = given[""].removesuffix("/UDP") or asked
+        if got != asked or "multicast" in given:
+            shown = f"{got}{';multicast' * ('multicast' in given)}"
             raise self._plan.wrong(
                 f"SETUP: expected {asked};unicast, as it was asked for, got {shown[:80]!r}"
             )
@@ -368,7 +368,7 @@ class RtspConversation:
         self._expect_ok("PLAY", answer)
 
     async def _keep_alive(self) -> None:
-        """Say something now and then: in half of the time that the server waits."""
+        """Send a request twice per session timeout."""
         while True:
             await asyncio.sleep(self._timeout / 2)
             method = "GET_PARAMETER" if self._parameters else "OPTIONS"
@@ -376,7 +376,7 @@ class RtspConversation:
                 async with asyncio.timeout(min(self._plan.timeout, self._timeout)):
                     answer = await self.link.ask(method, self._aggregate, self._headers())
             except TimeoutError:
-                continue  # some do not answer while they play; packets show a dead one
+                continue  # some cameras do not answer while they play
             except FrameSourceError as error:
                 self.link.fail(str(error).removeprefix(f"{self._plan.name}: "))
                 return
@@ -402,7 +402,7 @@ class RtspConversation:
 
 
 def _address(text: str) -> str:
-    """Return the address of one host, or "" if the text is not such an address."""
+    """Return the text if it is the unicast address of a host, else ""."""
     try:
         found = ipaddress.ip_address(text)
     except ValueError:
@@ -411,7 +411,7 @@ def _address(text: str) -> str:
 
 
 def _open_firewall(pair: SocketPair, host: str, ports: tuple[int, int]) -> None:
-    """Send something to where the packets come from: what lies between then lets them in."""
+    """Send datagrams to the sender of the packets, so that firewalls let the packets in."""
     with contextlib.suppress(OSError):
         pair.rtp.sendto(RtpPacket(False, 0, 0, 0, 0, b"").pack(), (host, ports[0]))
         pair.rtcp.sendto(ReceiverReport(0).pack(), (host, ports[1]))

@@ -1,4 +1,4 @@
-"""Read a server's description of its streams (SDP, RFC 8866) for the first video."""
+"""Read a server's description of its streams (SDP, RFC 8866)."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ MAX_LINES: Final = 1000
 """Largest number of lines of a description that are read."""
 
 CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
-"""The encodings that can be received, by their names."""
+"""Supported codecs by their names."""
 
 STATIC: Final = {26: "JPEG", 28: "NV", 31: "H261", 32: "MPV", 33: "MP2T", 34: "H263"}
-"""Encodings by payload types that need no name (RFC 3551)."""
+"""Codecs by static payload types (RFC 3551)."""
 
 
 class VideoTrack(NamedTuple):
     """A stream of video.
 
     Attributes:
-        payload_type: payload type of its packets.
-        encoding: name of the encoding, in capital letters; "": none.
-        control: where to ask for it, as it stands there; "": where one asked for the description.
-        parameters: parameters of its encoding (fmtp), by names in lower case.
-        size: size of the pictures where the description says so; None: it does not.
-        secure: whether its packets are encrypted (SRTP).
+        payload_type: payload type of the packets.
+        encoding: name of the codec, in capital letters; "": unknown.
+        control: URL of the stream in the description, perhaps relative; "": the description's URL.
+        parameters: parameters of the codec (fmtp), by names in lower case.
+        size: size of the pictures; None: not in the description.
+        secure: whether the packets are encrypted (SRTP).
     """
 
     payload_type: int
@@ -46,22 +46,22 @@ class VideoTrack(NamedTuple):
 
     @property
     def coding(self) -> Coding | None:
-        """Coding of the stream; None for one that we do not receive."""
+        """Codec of the stream; None: not supported."""
         return CODINGS.get(self.encoding)
 
     @property
     def sets(self) -> bytes:
-        """The parameters that a decoder needs, as in a file; b"" if the description has none."""
+        """Parameter sets for the decoder, as in a file; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
         units = [one for name in names for one in self.parameters.get(name, "").split(",")]
         return b"".join(START_CODE + unit for one in units if (unit := _decoded(one)))
 
 
 class StreamDescription(NamedTuple):
-    """The stream that a server offers.
+    """A server's description of its streams.
 
     Attributes:
-        control: where to ask for all streams together, as it stands there; "": nowhere.
+        control: URL of all streams together, perhaps relative; "": not given.
         tracks: tracks of video.
         others: kinds of the other streams, such as audio.
     """
@@ -71,13 +71,13 @@ class StreamDescription(NamedTuple):
     others: tuple[str, ...]
 
     def chosen(self) -> VideoTrack | None:
-        """Return the first stream of video that we can receive; None: there is none."""
+        """Return the first supported stream of video; None: there is none."""
         ours = (one for one in self.tracks if one.coding is not None and not one.secure)
         return next(ours, None)
 
 
 def described(body: bytes) -> StreamDescription:
-    """Read a description; what cannot be understood is left out."""
+    """Parse a description; unreadable lines are skipped."""
     lines = body.decode("utf-8", "replace").replace("\r", "\n").split("\n")[:MAX_LINES]
     sections: list[list[str]] = [[]]
     for line in map(str.strip, lines):
@@ -108,8 +108,8 @@ def _track(kind: list[str], lines: list[str]) -> VideoTrack:
 
 
 def _encoding(number: int, lines: list[str]) -> str:
-    said = _of_type(lines, "rtpmap", number)
-    return said.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
+    text = _of_type(lines, "rtpmap", number)
+    return text.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
 
 
 def _attribute(lines: list[str], name: str) -> str:
@@ -119,9 +119,9 @@ def _attribute(lines: list[str], name: str) -> str:
 
 
 def _of_type(lines: list[str], name: str, number: int) -> str:
-    """Return the text of an attribute about a payload type; of several ones all of them."""
-    said = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
-    return ";".join(one[2] for one in said if one is not None and int(one[1]) == number)
+    """Return the texts of an attribute for a payload type, joined."""
+    matches = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
+    return ";".join(one[2] for one in matches if one is not None and int(one[1]) == number)
 
 
 def _parameters(text: str) -> dict[str, str]:
@@ -130,7 +130,7 @@ def _parameters(text: str) -> dict[str, str]:
 
 
 def _size(lines: list[str]) -> tuple[int, int] | None:
-    """Return the size that some senders of large JPEGs tell."""
+    """Return the size of the pictures, which some senders of large JPEGs describe."""
     for name, between in (("x-dimensions", ","), ("framesize", "-")):
         found = re.search(rf"([0-9]{{1,5}})\s*{between}\s*([0-9]{{1,5}})", _attribute(lines, name))
         if found is not None and int(found[1]) and int(found[2]):
@@ -147,9 +147,9 @@ def _decoded(text: str) -> bytes:
 
 
 def url_of(control: str, base: str) -> str:
-    """Return the URL of a stream: as it stands there, or behind the URL of them all.
+    """Return the absolute URL of a stream, relative to the URL of all streams.
 
-    It is only said to the server that sent it; nobody connects there.
+    The URL is only used in requests to the same server.
     """
     if not control or control == "*":
         return base

@@ -36,16 +36,16 @@ KNOWN: Final = ("delay", "elsewhere", "format", "name", "timeout", "transport")
 class RtspDriver(FrameDriver):
     """A camera with RTSP: ``rtsp://admin:PASSWORD@camera/stream?channel=1``.
 
-    It reads H.264, H.265 and JPEG; other codings are left to FFmpeg. The query belongs to the
+    The driver reads H.264, H.265 and JPEG; FFmpeg reads other codecs. The query belongs to the
     camera, so smartcam's parameters follow ``#``: ``...#transport=udp&timeout=3``.
 
     ================= =============================================================================
     ``transport``     ``tcp``, over the connection, or ``udp``; usual: over the connection, or by
-                      UDP where the camera refuses that
-    ``timeout``       seconds until it plays, for a first picture, and without a packet before it
-                      counts as gone; usual 5
-    ``format``        pixels are converted to ``RGB8``, ``BGR8`` or ``Mono8``; ``MJPEG`` or ``H264``
-                      hands the bytes on that came, where it is that; usual: as the decoder has them
+                      UDP if the camera refuses that
+    ``timeout``       seconds until PLAY, until the first picture, and without a packet until the
+                      camera counts as lost; usual 5
+    ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
+                      passes such bytes on unchanged; usual: the decoder's format
     ``delay``         longest time from exposure to arrival, seconds; usual 1
     ``verify``        of TLS (``rtsps:``): ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
@@ -53,14 +53,14 @@ class RtspDriver(FrameDriver):
     ``name``          of the camera
     ================= =============================================================================
 
-    Only whole pictures come, each with its last packet. After a loss no picture comes until one is
-    whole again: with the next key frame, which is requested, or at the end of a refresh.
-    ``frame.lost`` counts the frames that were lost or left out.
+    Only complete pictures are returned, each with its last packet. After a loss, pictures continue
+    at the next key frame, which is requested, or at the end of a refresh. ``frame.lost`` counts
+    lost frames.
 
     ``captured`` is the arrival of a frame's first packet. Once the camera has reported its clock
     (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
 
-    Its features are parameters of RTSP, by their names in its maker's documents.
+    The features are parameters of RTSP, by their names in the maker's documents.
     """
 
     lists_features = False
@@ -68,20 +68,20 @@ class RtspDriver(FrameDriver):
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         secure = address.scheme == "rtsps"
-        said = address.parameters(
+        given = address.parameters(
             sorted((*KNOWN, "ca", "verify")) if secure else KNOWN, address.fragment
         )
         number = address.number
-        self._name = said.get("name") or address.shown.partition("#")[0].partition("?")[0]
-        self._delay = number("delay", said.get("delay", "1"), 0, 600)
-        wanted = wanted_format(address, said.get("format"))
+        self._name = given.get("name") or address.shown.partition("#")[0].partition("?")[0]
+        self._delay = number("delay", given.get("delay", "1"), 0, 600)
+        wanted = wanted_format(address, given.get("format"))
         self._format = "" if wanted is None else wanted.name
-        transport = one_of(address, "transport", said, ("tcp", "udp"))
-        transports = (transport,) if "transport" in said else ("tcp", "udp")
-        elsewhere = one_of(address, "elsewhere", said, ("no", "yes")) == "yes"
-        timeout = number("timeout", said.get("timeout", "5"), 0.1, 600)
+        transport = one_of(address, "transport", given, ("tcp", "udp"))
+        transports = (transport,) if "transport" in given else ("tcp", "udp")
+        elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
+        timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
         url = address.url.partition("#")[0]
-        tls = tls_of(address, said)
+        tls = tls_of(address, given)
         if not address.host:
             raise address.wrong("address", "rtsp://HOST/PATH", address.shown)
         self._plan = ConversationPlan(self._name, url, timeout, transports, elsewhere, tls)
@@ -97,15 +97,13 @@ class RtspDriver(FrameDriver):
 
     @property
     def features(self) -> DeviceFeatures:
-        """The parameters of the camera, which RTSP reads and sets by name, and does not list."""
+        """Parameters of the camera, which RTSP can read and set by name, but not list."""
         return RtspParameters(self._name, self._ask)
 
     async def _ask(self, method: str, body: bytes) -> ServerAnswer:
-        """Send a request on the playing connection, or on one for this request."""
+        """Send a request on the playing connection, or on a new connection."""
         if self._other is not None:
-            raise UnsupportedError(
-                f"{self._name}: FFmpeg reads this stream, and asks for no parameters"
-            )
+            raise UnsupportedError(f"{self._name}: FFmpeg reads this stream, without parameters")
         if self._playing is not None:
             return await self._playing.conversation.parameter(method, body)
         conversation = RtspConversation(self._plan)
@@ -119,11 +117,11 @@ class RtspDriver(FrameDriver):
         return RtpStatistics() if self._playing is None else self._playing.statistics()
 
     async def open(self) -> StreamFormat:
-        """Wait for a picture, and disconnect from the camera again.
+        """Wait for a picture, then disconnect from the camera.
 
         Raises:
             FrameFormatError: there is no video.
-            FrameSourceError: the camera is not there, refuses, or is silent.
+            FrameSourceError: the camera is missing, refuses, or does not answer.
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
@@ -146,10 +144,10 @@ class RtspDriver(FrameDriver):
         return StreamFormat(frame.format, *self._size)
 
     async def start(self, sink: FrameSink) -> None:
-        """Connect anew and play.
+        """Connect and play.
 
         Raises:
-            FrameSourceError: the camera is gone, refuses, or is silent.
+            FrameSourceError: the camera is gone, refuses, or does not answer.
         """
         if self._other is not None:
             await self._other.start(sink)
@@ -201,8 +199,8 @@ class _Playing:
     """The tasks and the connection of a driver while a camera plays.
 
     Args:
-        watched: whether silence ends it; ``open`` has its own timeout with a fuller error.
-        proofs: number of the camera's frames whose marker was right before.
+        watched: whether silence is an error; ``open`` has its own timeout with a fuller error.
+        proofs: number of earlier frames of the camera with a right marker.
     """
 
     def __init__(
@@ -222,7 +220,13 @@ class _Playing:
         self._decoding = UnitDecoding(decoding, sink)
         self._watching: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
-            *(conversation.ways, track.payload_type, 0.0, self._decoding.take, self._said_goodbye),
+            *(
+                conversation.channels,
+                track.payload_type,
+                0.0,
+                self._decoding.take,
+                self._said_goodbye,
+            ),
             only=conversation.senders,
             kind=kind,
             agreed=True,
@@ -239,7 +243,7 @@ class _Playing:
             self._watching = asyncio.create_task(watching, name=f"silence of {self._plan.name}")
 
     async def end(self) -> None:
-        """End everything; the sink gets nothing more."""
+        """Stop; the sink is not called any more."""
         watching, self._watching = self._watching, None
         if watching is not None:
             watching.cancel()
@@ -254,7 +258,7 @@ class _Playing:
 
     @property
     def proofs(self) -> int:
-        """Number of the camera's frames whose marker was right."""
+        """Number of the camera's frames with a right marker."""
         return self._receiver.proofs
 
     def statistics(self) -> RtpStatistics:
@@ -269,6 +273,6 @@ class _Playing:
 
     async def _watch(self) -> None:
         loop, longest = asyncio.get_running_loop(), self._plan.timeout
-        while (left := self._receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+        while (left := self._receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(left)
         self._over(f"no packet came for {longest:g} s")

@@ -1,4 +1,4 @@
-"""One RTSP connection: requests and their answers, and the packets between them."""
+"""An RTSP connection: requests, answers, and packets between them."""
 
 from __future__ import annotations
 
@@ -24,31 +24,29 @@ if TYPE_CHECKING:
 
 
 MAX_UNSENT_BYTES: Final = 64 << 10
-"""Largest number of bytes that may wait for a server; what would come on top, such as a report, is
-left out."""
+"""Largest number of bytes that wait for a server; more, such as reports, are dropped."""
 
 MAX_REFUSALS: Final = 3
-"""Largest number of refusals of one request for its password, such as by a nonce that is too
-old."""
+"""Largest number of refusals of one request's authorization, such as for an old nonce."""
 
 MAX_UNANSWERED: Final = 32
-"""Unanswered requests that are remembered, since their answers may come late."""
+"""Largest number of unanswered requests that are kept, since answers may be late."""
 
 _ALLOWED: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
 _ENDING: Final = ("REDIRECT", "TEARDOWN")
 
 
 class RtspLink(asyncio.Protocol):
-    """A connection to a server; one task asks, and packets are handed on as they come.
+    """A connection to a server; one task sends requests, and packets are passed on.
 
     Args:
         name: name of the source, for errors.
-        credentials: name and password, for a server that asks for them.
+        credentials: user and password.
 
     Attributes:
-        on_packet: function that takes a channel and a packet.
-        on_read: function that is called after the packets that came together.
-        on_end: function that takes why the server ended it, once.
+        on_packet: function that is called with a channel and a packet.
+        on_read: function that is called after each batch of packets.
+        on_end: function that is called once with the reason of the end.
     """
 
     def __init__(self, name: str, credentials: Credentials) -> None:
@@ -56,7 +54,7 @@ class RtspLink(asyncio.Protocol):
         self.on_packet: Callable[[int, bytes], None] = _ignore
         self.on_read: Callable[[], None] = _ignore
         self.on_end: Callable[[str], None] = _ignore
-        self.ended = ""  # why it did
+        self.ended = ""  # reason of the end
         self._parser = AnswerParser()
         self._transport: asyncio.Transport | None = None
         self._cseq = 0
@@ -89,16 +87,16 @@ class RtspLink(asyncio.Protocol):
 
     @property
     def address(self) -> tuple[Any, ...]:
-        """Our own address."""
+        """The local address."""
         return tuple(self._of_socket("sockname"))
 
     @property
     def family(self) -> socket.AddressFamily:
-        """The kind of the addresses."""
+        """The family of the addresses."""
         return socket.AF_INET6 if ":" in str(self.peer[0]) else socket.AF_INET
 
     def fail(self, why: str) -> None:
-        """End the link for a reason that :attr:`on_end` is told."""
+        """End the link with a reason for :attr:`on_end`."""
         self._end(why)
 
     def _of_socket(self, what: str) -> Any:
@@ -110,10 +108,10 @@ class RtspLink(asyncio.Protocol):
     async def ask(
         self, method: str, url: str, headers: dict[str, str] | None = None, body: bytes = b""
     ) -> ServerAnswer:
-        """Send a request, and return its answer; a password is shown where it is asked for.
+        """Send a request, and return its answer; answer challenges for a password.
 
         Raises:
-            FrameSourceError: the connection ended, or the password is wanted and not known.
+            FrameSourceError: the connection ended, or the password is wrong or missing.
         """
         async with self._turn:
             for refusals in range(1, MAX_REFUSALS + 1):
@@ -147,7 +145,7 @@ class RtspLink(asyncio.Protocol):
         self._waiting = (self._cseq, answered)
         try:
             if not self.write("\r\n".join((*lines, "", "")).encode() + body):
-                raise self._error(self.ended or "it takes nothing any more")
+                raise self._error(self.ended or "the server accepts no more data")
             return await answered
         finally:
             if self._waiting is not None and not answered.done():
@@ -155,7 +153,7 @@ class RtspLink(asyncio.Protocol):
             self._waiting = None
 
     def write(self, data: bytes) -> bool:
-        """Send bytes; return False where too many wait already, or it has ended."""
+        """Send bytes; return False if too many wait, or the link has ended."""
         transport = self._transport
         if transport is None or transport.is_closing():
             return False
@@ -165,12 +163,12 @@ class RtspLink(asyncio.Protocol):
         return True
 
     def close(self) -> None:
-        """End the link when all written bytes are taken; nothing is handed on now. Idempotent."""
+        """End the link after the written bytes are sent; stop passing on packets. Idempotent."""
         self.on_packet, self.on_read, self.on_end = _ignore, _ignore, _ignore
         self._end("it was closed")
 
     def abort(self) -> None:
-        """End the link at once. Idempotent."""
+        """Abort the link. Idempotent."""
         self.close()
         if self._transport is not None:
             self._transport.abort()
@@ -178,12 +176,12 @@ class RtspLink(asyncio.Protocol):
     # asyncio
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin."""
+        """Store the transport."""
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - of a socket
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
+        """Parse bytes, and process complete messages."""
         if self.ended:
             return
         self._parser.feed(data)
@@ -199,7 +197,7 @@ class RtspLink(asyncio.Protocol):
         why = getattr(exc, "strerror", None) if exc is not None else None
         self._end(f"the connection is lost: {why}" if why else "the server closed the connection")
 
-    # what comes
+    # received messages
 
     def _take(self, came: ServerAnswer | ServerRequest | ChannelPacket) -> None:
         if isinstance(came, ChannelPacket):
@@ -210,7 +208,7 @@ class RtspLink(asyncio.Protocol):
             self._requested(came)
 
     def _answered(self, answer: ServerAnswer) -> None:
-        """Hand an answer on; some servers say another number, or none."""
+        """Pass an answer on; some servers send a wrong CSeq, or none."""
         cseq = answer.cseq
         if cseq in self._unanswered:
             self._unanswered.remove(cseq)
@@ -218,11 +216,11 @@ class RtspLink(asyncio.Protocol):
             self._waiting[1].set_result(answer)
 
     def _requested(self, request: ServerRequest) -> None:
-        """Answer a server's request; some ask whether the client is still there."""
+        """Answer a server's request, such as a check of the client."""
         known = request.method in (*_ALLOWED, *_ENDING)
         cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
-        said = "200 OK" if known else "501 Not Implemented"
-        self.write(f"RTSP/1.0 {said}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
+        status = "200 OK" if known else "501 Not Implemented"
+        self.write(f"RTSP/1.0 {status}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
         if request.method in _ENDING:
             self._end(f"the server ended the session ({request.method})")
 
@@ -232,9 +230,9 @@ class RtspLink(asyncio.Protocol):
         self.ended = why
         if self._waiting is not None and not self._waiting[1].done():
             self._waiting[1].set_exception(self._error(why))
-            self._waiting[1].exception()  # nobody may wait for it any longer
-        told, self.on_end = self.on_end, _ignore
-        told(why)
+            self._waiting[1].exception()  # mark the error as retrieved
+        on_end, self.on_end = self.on_end, _ignore
+        on_end(why)
         if self._transport is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._transport.close()

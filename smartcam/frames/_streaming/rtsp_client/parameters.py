@@ -1,7 +1,7 @@
 """Read and set parameters of an RTSP camera as features (RFC 2326, sections 10.8 and 10.9).
 
-The protocol reads and sets a parameter by its name, as text. It has no list of them, no kinds,
-ranges or units, and no commands; many cameras know no parameter at all.
+The protocol reads and sets a parameter by its name, as text. There are no lists, kinds, ranges,
+units or commands; many cameras have no parameters.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ READ_ONLY: Final = 458
 INVALID: Final = 457
 
 WITHOUT_METHOD: Final = (405, 501, 551)
-"""Status codes of a camera that does not read or set parameters."""
+"""Status codes of a camera that does not support parameters."""
 
 MAX_SHOWN_CHARACTERS: Final = 80
 """Largest number of characters of a name, value or answer in an error's text."""
@@ -34,7 +34,7 @@ MAX_SHOWN_CHARACTERS: Final = 80
 class RtspParameters(DeviceFeatures):
     """The parameters of a camera, by their names in its maker's documents.
 
-    A name is sent unchanged, since there is no list in which another spelling could be found.
+    A name is sent unchanged, since there is no list of names for other spellings.
 
     Args:
         name: name of the source, for errors.
@@ -46,10 +46,10 @@ class RtspParameters(DeviceFeatures):
 
     async def names(self) -> list[str]:
         """Raise: RTSP has no list of parameters."""
-        self._cannot("list its parameters: read one by the name that its maker tells")
+        self._cannot("list its parameters: read one by its name in the maker's documents")
 
     async def describe(self, name: str) -> Feature:
-        """Return a parameter with its value; it is a text, and the camera reports no range."""
+        """Return a parameter with its value as text, without a range."""
         return Feature(name, "string", "rw", value=await self.get(name))
 
     async def get(self, name: str) -> FeatureValue:
@@ -63,16 +63,14 @@ class RtspParameters(DeviceFeatures):
         got = (
             f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
             if body.strip()
-            else (
-                "got none: it takes the request for a sign that somebody is there, and nothing else"
-            )
+            else ("got none: the camera only takes the request for a sign of life")
         )
         raise self._wrong(name, f"expected its value from {READ}, {got}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a parameter; return the camera's new value, or the given one if it reports none.
+        """Set a parameter; return the camera's new value, or the given value if it reports none.
 
-        A value of more than one line is refused.
+        The value must be one line.
         """
         text = as_text(value)
         if re.search(r"[\r\n\0]", text):
@@ -95,15 +93,15 @@ class RtspParameters(DeviceFeatures):
         answer = await self._ask(method, body.encode())
         if answer.status == 200:
             return answer
-        said = f"{method}: {answer.status} {answer.reason}".rstrip()
+        status = f"{method}: {answer.status} {answer.reason}".rstrip()
         if answer.status in WITHOUT_METHOD:
-            raise UnsupportedError(f"{self._name}: it has no such request: {said}")
+            raise UnsupportedError(f"{self._name}: it has no such request: {status}")
         why = {
-            NOT_UNDERSTOOD: "it has no such parameter",
+            NOT_UNDERSTOOD: "there is no such parameter",
             READ_ONLY: "it can only be read",
-            INVALID: "it does not take that value",
+            INVALID: "the camera does not accept the value",
         }.get(answer.status, "it refuses that")
-        raise self._wrong(name, f"{why}: {said}")
+        raise self._wrong(name, f"{why}: {status}")
 
     def _cannot(self, what: str) -> NoReturn:
         raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {what}")

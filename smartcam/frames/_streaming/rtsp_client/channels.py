@@ -1,4 +1,4 @@
-"""Receive a stream's packets between the answers of a connection, or by UDP."""
+"""Receive a stream's packets interleaved with the answers of a connection."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def options_of(transport: str) -> dict[str, str]:
-    """Return the options of the first transport of a header, by names in lower case."""
+    """Return the options of a header's first transport, by names in lower case."""
     protocol, *rest = transport.partition(",")[0].split(";")
     parts = (one.strip().partition("=") for one in rest)
     options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
@@ -22,7 +22,7 @@ def options_of(transport: str) -> dict[str, str]:
 
 
 def pair_of(text: str, most: int) -> tuple[int, int] | None:
-    """Return a pair of channels or ports; the second one is the next where it does not exist."""
+    """Parse a pair of channels or ports; a missing second number is the first plus one."""
     found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
     if found is None:
         return None
@@ -31,15 +31,15 @@ def pair_of(text: str, most: int) -> tuple[int, int] | None:
     return (first, second) if max(first, second) <= most and first != second else None
 
 
-class ChannelWays:
-    """Packets on two channels of a connection.
+class InterleavedChannels:
+    """Two channels of a connection.
 
-    Some servers use other channels than they announce: as long as no packet came on these, a packet
-    of the stream's type on another channel shows the right one.
+    Some servers use other channels than announced: until a packet comes on the announced channels,
+    a packet of the stream's payload type shows the right channel.
 
     Args:
         link: the connection.
-        channels: channels of packets and of reports.
+        channels: channel of packets, and channel of reports.
         payload_type: payload type of the stream's packets.
     """
 
@@ -56,7 +56,7 @@ class ChannelWays:
         rtcp: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None],
     ) -> None:
-        """Call for each packet and report, until :meth:`close`."""
+        """Call ``rtp`` and ``rtcp`` for each packet and report, until :meth:`close`."""
         self._rtp, self._rtcp = rtp, rtcp
         self._link.on_packet, self._link.on_read = self._packet, read
 
@@ -74,10 +74,10 @@ class ChannelWays:
             take(data, self._from)
 
     def report(self, data: bytes, _: tuple[Any, ...]) -> None:
-        """Send a report, or leave it out if too much waits already, since the next comes soon."""
+        """Send a report; drop it if too much data waits, since reports are repeated."""
         head = bytes((0x24, self._channels[1])) + len(data).to_bytes(2, "big")
         self._link.write(head + data)
 
     def close(self) -> None:
-        """Call no more."""
+        """Stop calling the functions."""
         self._rtp = self._rtcp = None

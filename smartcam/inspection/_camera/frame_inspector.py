@@ -31,30 +31,30 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
-"""Seconds to wait for the first frame; then the camera starts without one."""
+"""Seconds to wait for the first frame; afterwards the camera starts without a frame."""
 
 FRAME_WAIT: Final = 10.0
-"""Seconds that a trigger waits for a frame that was exposed after it."""
+"""Longest time, seconds, between a trigger and a frame exposed after it."""
 
 TOOLS_TIMEOUT: Final = 60.0
-"""Seconds that the tools of a program may take; then the result is not ok, with this reason."""
+"""Longest time, seconds, of a program's tools; a longer run gives a result that is not ok."""
 
 MAX_HUNG_THREADS: Final = 4
-"""Largest number of threads with tools that do not end; with so many, the last one is awaited."""
+"""Largest number of threads with hanging tools; at this number, new runs wait for the last."""
 
 THREAD_GRACE: Final = 1.0
-"""Seconds that a tool gets to finish when the camera is closed."""
+"""Longest time, seconds, that closing the camera waits for a running tool."""
 
 RETRY: Final = Backoff(initial=0.1, maximum=5.0)
-"""Delays before a lost source of frames is tried again."""
+"""Delays before a lost source of frames is opened again."""
 
 
 class Judged(NamedTuple):
-    """A picture that was judged, and the findings about it.
+    """An inspected picture with its findings.
 
     Attributes:
         number: sequence number of the run.
-        frame: the frame that was judged.
+        frame: the inspected frame.
         inspection: inspection by the program; None if it failed.
         application: id of the program.
     """
@@ -74,39 +74,39 @@ class Judged(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _OrderedRun:
-    """A run that waits for its frame, or for its tools."""
+    """A run that waits for its frame or its tools."""
 
     order: InspectionOrder
     seen: Callable[[], None]
     done: Callable[[Values | None], None]
-    moment: float  # time.monotonic(); the frame is exposed after it
+    moment: float  # earliest start of the frame's exposure, time.monotonic()
     deadline: asyncio.TimerHandle
     frame: Frame | None = None
     work: Future[Inspection] | None = None
 
 
-class Eyes(Inspector):
-    """Inspects the first frame that is exposed after a run has begun.
+class FrameInspector(Inspector):
+    """Inspect the first frame that is exposed after a run has begun.
 
-    One thread of its own runs the tools, one picture at a time. If a run is given up while a tool
-    is at work, that thread stays with the tool, and a new one takes the next picture.
+    A thread runs the tools, one picture at a time. If a run is cancelled while a tool works, the
+    thread finishes this tool, and a new thread inspects the next picture.
 
     Args:
         name: name of the camera, for logs.
-        make: function that returns the source of its frames, not open yet.
-        programs: the programs, by their ids.
-        recorded: whether the source is a recording: then each run takes its next picture, and the
-            first one again after the last.
-        grey: whether the thread makes the grey levels of each picture, for later use.
-        on_sight: function that is called when frames are lost, with the reason, and with "" when
+        make: function that returns the unopened source of frames.
+        programs: programs by the ids of their applications.
+        recorded: whether the source is a recording: each run gets its next picture, and after the
+            last picture the first again.
+        grey: whether the thread computes the grey levels of each picture for later use.
+        on_trouble: function that is called with the reason when frames are lost, and with "" when
             they come again.
 
     Attributes:
         name: name of the camera.
-        judged: the last picture that was judged; None before the first.
-        viewers: functions that get each judged picture.
+        judged: the last inspected picture; None before the first.
+        viewers: functions that are called with each inspected picture.
         format: format of the source's frames; None before it was opened.
-        trouble: reason why there are no frames; "" if there are.
+        trouble: reason why there are no frames; "" if they come.
     """
 
     def __init__(
@@ -117,22 +117,22 @@ class Eyes(Inspector):
         *,
         recorded: bool = False,
         grey: bool = False,
-        on_sight: Callable[[str], None] = lambda _: None,
+        on_trouble: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.judged: Judged | None = None
-        self.trouble: str = "it was not opened yet"
-        self.on_sight = on_sight
+        self.trouble: str = "the source was not opened yet"
+        self.on_trouble = on_trouble
         self.format: StreamFormat | None = None
         self.viewers: set[Callable[[Judged], None]] = set()
         self.name = name
         self._make, self._programs = make, programs
         self._recorded, self._grey = recorded, grey
         self._order: _OrderedRun | None = None
-        self._wanted = asyncio.Event()  # set while a run waits for a frame
-        self._sighted = asyncio.Event()  # the first frame came, or cannot come
+        self._frame_wanted = asyncio.Event()  # set while a run waits for a frame
+        self._first_frame_done = asyncio.Event()  # set when the first frame came or cannot come
         self._task: asyncio.Task[None] | None = None
         self._thread: ToolThread | None = None
-        self._hung: list[ToolThread] = []  # threads that were given up, and still run
+        self._hung_threads: list[ToolThread] = []  # abandoned threads that still run
 
     def _new_thread(self) -> ToolThread:
         return ToolThread(f"smartcam.inspection {self.name}")
@@ -140,20 +140,20 @@ class Eyes(Inspector):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open the source, and wait for a first frame; if none comes, call ``on_sight``.
+        """Open the source, and wait for the first frame; without one, call ``on_trouble``.
 
         Cancellation: leaves it stopped.
         """
         if self._task is not None:
             return
-        self._sighted.clear()
+        self._first_frame_done.clear()
         self._thread = self._new_thread()
-        self._task = asyncio.create_task(self._watch(), name=f"eyes of {self.name}")
+        self._task = asyncio.create_task(self._watch(), name=f"inspector of {self.name}")
         try:
             async with asyncio.timeout(FIRST_FRAME_TIMEOUT):
-                await self._sighted.wait()
+                await self._first_frame_done.wait()
         except TimeoutError:
-            self._lose(f"no frame came within {FIRST_FRAME_TIMEOUT:g} s")
+            self._frames_lost(f"no frame came within {FIRST_FRAME_TIMEOUT:g} s")
         except BaseException:
             await self.stop()
             raise
@@ -183,19 +183,19 @@ class Eyes(Inspector):
         seen: Callable[[], None],
         done: Callable[[Values | None], None],
     ) -> None:
-        """Begin an inspection of the first frame that is exposed from now on."""
+        """Start a run, which inspects the first frame exposed from now on."""
         self.cancel()
         loop = asyncio.get_running_loop()
         deadline = loop.call_later(FRAME_WAIT, self._give_up)
         self._order = _OrderedRun(order, seen, done, time.monotonic(), deadline)
-        self._wanted.set()
-        if self.trouble:  # a restart of the device has dropped it
-            loop.call_soon(self._tell, self.trouble)
+        self._frame_wanted.set()
+        if self.trouble:  # a restart of the device has cleared it there
+            loop.call_soon(self._report, self.trouble)
 
     def cancel(self) -> None:
-        """Give up the running inspection; a later one does not wait for its thread."""
+        """Cancel the run; the next run does not wait for its thread."""
         order, self._order = self._order, None
-        self._wanted.clear()
+        self._frame_wanted.clear()
         if order is not None:
             order.deadline.cancel()
             if order.work is not None:
@@ -211,67 +211,70 @@ class Eyes(Inspector):
                 async with self._make() as source:
                     self.format = source.format
                     if self._recorded:
-                        self._regain()
+                        self._frames_back()
                     while True:
                         if await self._follow(source):
                             delays = RETRY.delays()
                         if not self._recorded:
-                            raise FrameSourceError(f"{source.name}: it ended", source=source.name)
+                            raise FrameSourceError(
+                                f"{source.name}: no more frames", source=source.name
+                            )
             except (SmartCamError, OSError) as exc:
-                self._lose(str(exc))
-            except Exception as exc:  # noqa: BLE001 - a driver may be anybody's
+                self._frames_lost(str(exc))
+            except Exception as exc:  # noqa: BLE001 - a driver may be a plug-in
                 _log.exception("%s ! the source of its frames failed", self.name)
-                self._lose(repr(exc))
+                self._frames_lost(repr(exc))
             await asyncio.sleep(next(delays))
 
     async def _follow(self, source: FrameSource) -> bool:
-        """Give frames to the runs that wait for them; return whether any came before the end."""
+        """Pass frames to waiting runs until the source ends; return whether any frame came."""
         came = False
-        held: Frame | None = None  # frame of a recording, whose run was given up
+        held: Frame | None = None  # frame of a recording, whose run was cancelled
         async with source.reader(timeout=None) as reader:
             while True:
                 if self._recorded:
-                    await self._wanted.wait()
+                    await self._frame_wanted.wait()
                 try:
                     frame: Frame = await anext(reader) if held is None else held
                 except StopAsyncIteration:
                     return came
                 came, held = True, None
-                if self._recorded and frame.lost:  # a damaged picture is a run's, and no result
+                if self._recorded and frame.lost:  # a run with a damaged picture has no result
                     held = dataclasses.replace(frame, lost=0)
-                    self._lose(f"{frame.lost} damaged pictures before picture {frame.sequence}")
+                    why = f"{frame.lost} damaged pictures before picture {frame.sequence}"
+                    self._frames_lost(why)
                     await asyncio.sleep(RETRY.initial)
-                    self._regain()
+                    self._frames_back()
                     continue
-                self._regain()
+                self._frames_back()
                 order = self._order
                 if order is None or order.frame is not None:
                     held = frame if self._recorded else None
                 elif self._recorded or frame.began >= order.moment:
                     self._inspect(order, frame)
 
-    def _regain(self) -> None:
+    def _frames_back(self) -> None:
         """Note that frames come again."""
         if self.trouble:
-            _log.info("%s = sees again", self.name)
-            self._tell("")
-        self._sighted.set()
+            _log.info("%s = frames come again", self.name)
+            self._report("")
+        self._first_frame_done.set()
 
-    def _lose(self, why: str) -> None:
-        """Note that no frames come; the running inspection is void."""
+    def _frames_lost(self, why: str) -> None:
+        """Note that no frames come, which cancels the run."""
         if why != self.trouble:
-            _log.warning("%s ! sees nothing: %s", self.name, why)
-        self._tell(why)
-        self._sighted.set()
+            _log.warning("%s ! no frames: %s", self.name, why)
+        self._report(why)
+        self._first_frame_done.set()
 
-    def _tell(self, trouble: str) -> None:
+    def _report(self, trouble: str) -> None:
         self.trouble = trouble
-        self.on_sight(trouble)
+        self.on_trouble(trouble)
 
     def _give_up(self) -> None:
-        """End a run that got no frame in time."""
+        """End the run without a result, since no frame came in time."""
         order, self._order = self._order, None
-        self._wanted.clear()
+        self._frame_wanted.clear()
         if order is not None:
             _log.warning(
                 "%s ! no frame was exposed within %g s after the trigger: no result",
@@ -283,7 +286,7 @@ class Eyes(Inspector):
     # ------------------------------------------------------------------ tools
 
     def _inspect(self, order: _OrderedRun, frame: Frame) -> None:
-        """Run the tools on a frame, in the thread."""
+        """Run the tools on a frame in the thread."""
         thread = self._free_thread()
         if thread is None:
             return
@@ -291,7 +294,7 @@ class Eyes(Inspector):
         order.deadline.cancel()
         order.deadline = loop.call_later(TOOLS_TIMEOUT, self._give_up_tools, order, frame)
         order.frame = frame
-        self._wanted.clear()
+        self._frame_wanted.clear()
         program = self._programs[order.order.application]
         work = thread.submit(partial(_inspected, program, frame, order.order.input, self._grey))
         order.work = work
@@ -304,18 +307,18 @@ class Eyes(Inspector):
         order.seen()
 
     def _free_thread(self) -> ToolThread | None:
-        """Return a thread for tools: a new one if the old is busy with a run that was given up."""
+        """Return the thread for tools, or a new thread if it is busy with a cancelled run."""
         thread = self._thread
         if thread is not None and thread.at_work:
-            self._hung = [one for one in self._hung if one.at_work]
-            if len(self._hung) < MAX_HUNG_THREADS:
-                self._hung.append(thread)
+            self._hung_threads = [one for one in self._hung_threads if one.at_work]
+            if len(self._hung_threads) < MAX_HUNG_THREADS:
+                self._hung_threads.append(thread)
                 thread.close()
                 thread = self._thread = self._new_thread()
         return thread
 
     def _give_up_tools(self, order: _OrderedRun, frame: Frame) -> None:
-        """End a run whose tools do not end; another thread takes the next one."""
+        """End a run whose tools take too long; another thread will run the next."""
         if order is not self._order:
             return
         if order.work is not None:
@@ -324,7 +327,7 @@ class Eyes(Inspector):
         self._end(order, frame, None, TimeoutError(text))
 
     def _finish(self, order: _OrderedRun, frame: Frame, work: Future[Inspection]) -> None:
-        """Take the tools' findings on a run's frame, unless the run is void."""
+        """Report the tools' findings, unless the run was cancelled."""
         if order is not self._order:
             return
         error = work.exception()
@@ -360,12 +363,12 @@ def _inspected(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspe
     inspection = program.inspect(frame, input=data)
     inspection.payload()
     if grey:
-        _ = inspection.picture.grey  # which would block the loop for too long
+        _ = inspection.picture.grey  # computed here, since it would block the event loop
     return inspection
 
 
 def failed_values(program: Program, reason: str) -> dict[str, Any]:
-    """Return the values of a failed program: not ok, with the reason, and all others empty."""
+    """Return the values for a failed program: not ok, the reason, and empty fields."""
     layout = program.layout
     fields = layout.fields if layout.repeat is None else layout.head
     values = {
