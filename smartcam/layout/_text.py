@@ -193,8 +193,8 @@ class LayoutSpec(NamedTuple):
     @property
     def is_list(self) -> bool:
         """True if the value is a plain list: an unnamed group, without other values."""
-        told = (field.sequence or field.name == self.repeat for field in self.head)
-        return self.repeat is not None and self.group is None and all(told)
+        special = (field.sequence or field.name == self.repeat for field in self.head)
+        return self.repeat is not None and self.group is None and all(special)
 
     @property
     def group_field(self) -> str:
