@@ -381,7 +381,7 @@ class LineCamera(WireCamera):
         client = self._clients.get(link)
         if client is None or not isinstance(message, HeardLine):
             return
-        faults = self._provoke(self.queue.device_heard, message)
+        faults = self._provoke(self.queue.device_on_client, message)
         client.begin(message)
         self.begun(client, message)
         self.hear(client, self.lines.text(message.data))
@@ -408,7 +408,7 @@ class LineCamera(WireCamera):
     def say(self, link: ClientLink, message: SaidLine) -> None:
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
-            faults = self._provoke(self.queue.device_said, message)
+            faults = self._provoke(self.queue.device_on_camera, message)
             link.say(message)
             self._spoken_to[link] = None
             self._act(faults, "after")

@@ -33,7 +33,7 @@ _SENDERS = {sender.value: sender for sender in m.Sender}
 
 
 def message_name(value: object) -> object:
-    """Return the name of a message class, and anything else as it is."""
+    """Return the name of a message class; anything else unchanged."""
     if isinstance(value, bool):
         raise ValueError("a message's name or id")  # noqa: TRY004  pydantic wants a ValueError
     return value.__name__ if isinstance(value, type) else value
@@ -43,7 +43,7 @@ def known_name(value: str) -> str:
     """Return the name of a message.
 
     Raises:
-        ValueError: no message is called so.
+        ValueError: no message has this name.
     """
     if value not in MESSAGE_NAMES:
         raise ValueError(f"no message is called {value!r}; there are {', '.join(MESSAGE_NAMES)}")
@@ -81,11 +81,11 @@ class BaseFault(EmulatorData):
     """Base of all faults: the choice of the message that a fault waits for."""
 
     default_sender: ClassVar[m.Sender]
-    """Sender that is assumed where neither ``on`` nor ``sender`` names one."""
+    """Sender if neither ``on`` nor ``sender`` names one."""
     senders: ClassVar[frozenset[m.Sender]] = frozenset(m.Sender)
     """Senders whose messages the fault can wait for."""
     can_act_at_once: ClassVar[bool]
-    """True if the fault acts at once when it has no message to wait for."""
+    """True if the fault acts at once if it has no message to wait for."""
 
     on: On = Field(
         default=None,
