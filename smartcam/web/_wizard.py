@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class WizardSite(Site):
     """A page and HTTP calls that drive the wizards of calibrations.
 
-    It runs in the event loop that the service's actions run in. Whoever uses it at the same time
-    uses one sequence: a token tells which step a call meant.
+    It runs in the event loop of the service's actions. Users at the same time share one
+    sequence: a token names the step of a call.
 
     ::
 
@@ -37,13 +37,13 @@ class WizardSite(Site):
 
     Args:
         service: the calibrations' folder and their wizards; closed by its maker.
-        host: address to listen on; nothing but this.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
-            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+        token: token that every call must carry in ``Authorization: Bearer``: at least 16 letters,
+            digits, ``-`` and ``_``. None: no token on a loopback address; else one is made.
 
     Attributes:
-        service: service that was given.
+        service: the given service.
 
     Raises:
         ConfigurationError: the token cannot be used.
@@ -61,7 +61,7 @@ class WizardSite(Site):
         self.service: CalibrationService = service
 
 
-# ---------------------------------------------------------------------- what calls take
+# ---------------------------------------------------------------------- arguments of calls
 
 
 class _StartBody(CallBody):
@@ -97,7 +97,7 @@ class _CameraPose(CallBody):
     frame: str | None = None
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 _STATUS = {
     Code.NOT_FOUND: 404,
@@ -108,7 +108,7 @@ _STATUS = {
     Code.IN_USE: 409,
     Code.NOT_WRITTEN: 500,
 }
-"""HTTP status by what a call is refused for; 422 for the rest."""
+"""HTTP status by the code of a refusal; 422 for all others."""
 
 
 def _refused(error: CalibrationError) -> RefusedError:
@@ -125,10 +125,10 @@ CALLS: Calls[WizardSite] = Calls()
 def _call(
     method: Literal["GET", "POST"], path: str, *, writes: str = "folder", **takes: Any
 ) -> Callable[[Handler], Handler]:
-    """Make a call of the function below, which does it to the service, given the body.
+    """Make the decorated function a call's handler, which gets the service and the body.
 
-    ``path`` stands behind that of all calls, ``writes`` is what it writes to; what it takes, see
-    :meth:`~smartcam.web._routes.Calls.add`.
+    ``path`` follows the prefix of all calls; ``writes`` names the file or folder written to; for
+    ``takes`` see :meth:`~smartcam.web._routes.Calls.add`.
     """
 
     def declare(handler: Handler) -> Handler:
