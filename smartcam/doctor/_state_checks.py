@@ -161,11 +161,11 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.patient, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # this was reported, and explains everything
+        return  # this was reported already, and explains the rest
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # perhaps while the camera was watched
+    stopped = _is_stopped(seen[-1])  # it may have stopped meanwhile
     if any(_waits(one) for one in seen) and not stopped:
         exam.may_trigger = True
         came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
@@ -212,7 +212,7 @@ async def _watch(exam: Examination, seconds: float) -> list[Status]:
         return False
 
     exam.witness.forget_arrivals()
-    # held while watching, since results are made only if somebody takes them
+    # open while watching, since results are made only if there is a subscriber
     async with exam.patient.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
             await exam.patient.wait_status(note, timeout=seconds)
@@ -224,7 +224,7 @@ def _intervals(witness: Witness) -> Figures:
 
 
 def _rate(witness: Witness) -> dict[str, Any]:
-    """Return rate and spread of results that came by themselves; nothing for a single one."""
+    """Return rate and spread of unasked results; nothing for a single one."""
     arrivals = witness.arrivals
     if len(arrivals) < 2:
         return {}

@@ -1,4 +1,4 @@
-"""Checks about the application that is wanted, and the triggers, where they are allowed."""
+"""Checks of the wanted application, and of triggers if they are allowed."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 async def look_at_application(exam: Examination) -> None:
-    """Check ``application``: whether the wanted one is active; loaded for triggers only.
+    """Check ``application``: whether the wanted one is active; load it for triggers only.
 
-    The protocol has no way to ask whether an application is there but to load it.
+    The protocol cannot ask whether an application exists without loading it.
     """
     camera, wanted = exam.patient, exam.options.application
     active = await camera.query_application()
@@ -32,7 +32,7 @@ async def look_at_application(exam: Examination) -> None:
     if wanted is None or (wanted == active and not exam.wants_trigger):
         exam.say("ok", f"{called(active)} is active", **details)
     elif wanted == 0:
-        exam.wants_trigger = False  # of another application than the one that is meant
+        exam.wants_trigger = False  # triggers would run another application
         exam.fail(
             f"no application has the id 0; {called(active)} is active",
             "Name another id: the camera's pages show them.",
@@ -55,7 +55,7 @@ async def look_at_application(exam: Examination) -> None:
 async def _borrow(exam: Examination, active: int, wanted: int) -> None:
     camera = exam.patient
     details: dict[str, Any] = {"active": active, "wanted": wanted}
-    exam.wants_trigger = False  # until it is the one that is meant
+    exam.wants_trigger = False  # until the wanted application is loaded
     try:
         await exam.borrowed.enter_async_context(camera.application(wanted))
     except CommandRejectedError as exc:
@@ -72,7 +72,7 @@ async def _borrow(exam: Examination, active: int, wanted: int) -> None:
 
 
 async def give_back(exam: Examination) -> None:
-    """Have the application and the run state back that were there before the triggers."""
+    """Restore the application and the run state from before the triggers."""
     try:
         await exam.borrowed.aclose()
     except LinkError:
@@ -89,7 +89,7 @@ async def give_back(exam: Examination) -> None:
 
 
 async def trigger(exam: Examination) -> None:
-    """Check ``trigger``: send some, one after the other; the first without a result ends it."""
+    """Check ``trigger``: send some, one by one, up to the first without a result."""
     if not (exam.wants_trigger and exam.may_trigger):
         return
     camera, loop, options = exam.patient, asyncio.get_running_loop(), exam.options
@@ -104,7 +104,7 @@ async def trigger(exam: Examination) -> None:
             except LinkError:
                 raise
             except InterpretationError:
-                break  # the check of the layout tells it
+                break  # the check of the layout reports it
             except SmartCamError as exc:
                 _say_failed(exam, exc, len(times))
                 break
