@@ -1,6 +1,6 @@
-"""Options of the command line for judging cameras and clients, and what is found of clients.
+"""Command-line options for judging cameras and clients, and the findings about clients.
 
-It is light: the pytest plugin imports it in every run of pytest.
+The module is light, since the pytest plugin imports it in every run of pytest.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 PROPERTY = "smartcam-client-finding"
-"""Name of a test report's property that holds a finding: reports pass from process to process."""
+"""Property of a test report that holds a finding, since reports pass between processes."""
 
 CAMERA: Mapping[str, str] = {
     "--camera-url": (
@@ -39,7 +39,7 @@ CAMERA: Mapping[str, str] = {
     "--camera-input": "input data that the application takes, as hex",
     "--camera-report": "file to write the report to, as JSON",
 }
-"""Help text of each option that is about a camera."""
+"""Help text of each option about a camera."""
 
 CLIENT: Mapping[str, str] = {
     "--client-command": (
@@ -51,7 +51,7 @@ CLIENT: Mapping[str, str] = {
     "--client-transport": "tcp, udp, or both with a comma between them; default tcp.",
     "--client-timeout": "Seconds that a task may take; default 30.",
 }
-"""Help text of each option that is about a client."""
+"""Help text of each option about a client."""
 
 
 def add_options(parser: Any) -> None:
@@ -68,7 +68,7 @@ def add_options(parser: Any) -> None:
 
 
 def terminal_summary(reporter: Any) -> None:
-    """Write what was found of clients into pytest's report; nothing where nothing was."""
+    """Write the findings about clients into pytest's report, if there are any."""
     found = [
         value
         for reports in reporter.stats.values()

@@ -1,4 +1,4 @@
-"""Questions: an experiment for each field of Quirks, and for what the documents contradict."""
+"""Questions: an experiment for each field of Quirks, and for each contradiction of documents."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 MAX_CONTAINERS = 1024
-"""Largest number of input containers sent to find how many are queued."""
+"""Largest number of input containers sent to find the length of the queue."""
 
 MAX_LEFT = 64
-"""Triggers at most to use up the input containers that somebody else has left."""
+"""Largest number of triggers that use up input containers of another client."""
 
 _OPEN = {"": "no document, open"}
 
@@ -74,7 +74,7 @@ def no_id(camera: CameraUnderTest) -> bool:
 @question(_OPEN, needs=Allow.TRIGGER)
 def waiting_before_result(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger rises before the result comes."""
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     orders: set[bool] = set()
     for one in [unasked(camera)] if camera.wire.is_bid else inspections(camera):
         _, result, rose = one.places()
@@ -245,7 +245,7 @@ def _was_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> bool:
 def big_endian_number(camera: CameraUnderTest) -> bool:
     """The number of Set sequence number is big endian."""
     little = (0x01020304).to_bytes(4, "little")
-    observations.no_id(camera)  # which tells where the number stands
+    observations.no_id(camera)  # raises if the number's place is unknown
     with camera.session() as client:
         camera.ready(client)
         client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
@@ -266,7 +266,7 @@ def input_queue_depth(camera: CameraUnderTest) -> int:
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
     bit = camera.wire.bits.input_container
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
         camera.ready(client)
         _use_up(camera, client, MAX_LEFT)

@@ -1,4 +1,4 @@
-"""One way to the camera: a socket, every wait with a deadline, everything written down."""
+"""A link to the camera: a socket, a deadline for every wait, a record of every message."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ if TYPE_CHECKING:
     from typing import Self
 
 MAX_HEARD_BYTES = 1 << 24
-"""Largest number of bytes of bodies that one client keeps: 256 of the largest results; more end the
+"""Largest number of bytes of bodies that one client keeps: 256 of the largest results. More end the
 experiment."""
 
 MAX_TRAIL = 60
-"""Largest number of lines of what went over the wire that a report shows: the last ones."""
+"""Largest number of lines of the record that a report shows: the last ones."""
 
 FAREWELL = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
 
 LOOK_AGAIN = 0.01
-"""Seconds between two requests for a status that does not come by itself."""
+"""Seconds between two requests for a status that does not come unasked."""
 
 
 class EndedError(Exception):
-    """The camera has ended the link, or nothing is there any more."""
+    """The camera has closed the link, or is gone."""
 
 
 @dataclass(eq=False)
 class RawClient:
     """A TCP connection or a UDP socket; a context manager.
 
-    Leaving it says Disconnect where there may be a session, and closes the socket.
+    Leaving it sends Disconnect if there may be a session, and closes the socket.
 
     Raises:
         OSError: no connection.
@@ -52,8 +52,8 @@ class RawClient:
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
     _quiet: float  # seconds of silence that count as no answer
-    _trail: deque[str]  # record of everything that passes
-    _on_change: Callable[[], None]  # before something goes out that changes the camera's state
+    _trail: deque[str]  # record of all messages
+    _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
         self.heard: list[Heard] = []  # every frame that came, in order
@@ -87,14 +87,14 @@ class RawClient:
         self.close()
 
     def close(self) -> None:
-        """End the session where there may be one, and close the socket; bounded."""
+        """End the session if there may be one, and close the socket; bounded."""
         with contextlib.suppress(OSError, EndedError), self._socket:
             if self.ended:
                 return
             if self._may_have_session:
                 self._write(self.wire.request(m.Disconnect()))
             if self._tcp:
-                # a socket that is closed with unread bytes sends a reset, which may overtake
+                # closing a socket with unread bytes sends a reset, which may overtake
                 self._socket.shutdown(socket.SHUT_WR)
                 deadline = time.monotonic() + FAREWELL
                 while (left := deadline - time.monotonic()) > 0:
@@ -105,7 +105,7 @@ class RawClient:
     # ------------------------------------------------------------------ out
 
     def say(self, *messages: m.Message) -> float:
-        """Send requests, in one write on TCP and a datagram each on UDP; return when.
+        """Send requests, in one write on TCP and a datagram each on UDP; return the time.
 
         Raises:
             EndedError: the link is down.
@@ -120,7 +120,7 @@ class RawClient:
         return self.write(*[self.wire.request(message) for message in messages])
 
     def write(self, *data: bytes) -> float:
-        """Send bytes, whatever they are; as :meth:`say`."""
+        """Send any bytes; as :meth:`say`."""
         for one in data:
             self._note(">", self.wire.spell_request(one))
         at = time.monotonic()
@@ -140,7 +140,7 @@ class RawClient:
     # ------------------------------------------------------------------ in
 
     def next(self, within: float) -> Heard | None:
-        """Return the next frame, None if none comes ``within`` so many seconds.
+        """Return the next frame, None if none comes within so many seconds.
 
         Raises:
             EndedError: the camera ends the link.
@@ -211,13 +211,13 @@ class RawClient:
     def until(
         self, fits: Callable[[Heard], object] | int, within: float, expected: str, *, mark: int = -1
     ) -> Heard:
-        """Return the first frame that fits, of those that came behind ``mark`` or come now.
+        """Return the first frame that fits, of those after ``mark`` and those that come now.
 
         Args:
             fits: id of the wanted message, or a function that is true for the wanted frame.
             within: seconds from now.
-            expected: text of the difference, where no such frame comes.
-            mark: a length of :attr:`heard`; default: only what comes now.
+            expected: text of the difference if no such frame comes.
+            mark: a length of :attr:`heard`; default: only frames that come now.
 
         Raises:
             Differs: the answer does not come in time.
@@ -251,7 +251,7 @@ class RawClient:
         return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
 
     def fence(self) -> list[Heard]:
-        """Send a Query and return what came before its answer: all that was on its way.
+        """Send a Query and return the frames before its answer: all that were on their way.
 
         Raises:
             Differs: the Query is not answered.
@@ -262,7 +262,7 @@ class RawClient:
         return self.heard[mark:-1]
 
     def listen(self, seconds: float) -> list[Heard]:
-        """Return the frames that come in so many seconds; an end of the link ends it."""
+        """Return the frames that come in so many seconds; the end of the link ends it."""
         mark, deadline = len(self.heard), time.monotonic() + seconds
         with contextlib.suppress(EndedError):
             while (left := deadline - time.monotonic()) > 0:
@@ -280,7 +280,7 @@ class RawClient:
     # ------------------------------------------------------------------ the status
 
     def look(self) -> int:
-        """Return the status word as it is now: asked for where it can be, else the last one.
+        """Return the present status word: by a request if possible, else the last one.
 
         Raises:
             NotObserved: no status came since Connect.

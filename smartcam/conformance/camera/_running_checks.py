@@ -54,7 +54,7 @@ def second_start_is_harmless(camera: CameraUnderTest) -> None:
 @check({"": "SC-B33, MV27, published", "bid": "ID-b 213, ID-b 221, published"}, needs=Allow.TRIGGER)
 def trigger_gives_one_result(camera: CameraUnderTest) -> str:
     """A trigger gives one result container, of the active application."""
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     word = camera.wire.word
     for one in inspections(camera):
         if len(one.results) != 1:
@@ -86,8 +86,8 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
         if one.under_way is not None:
             fell = not one.under_way & one.waiting
             if not fell and one.results and one.results[0].at - one.sent_at < camera.options.quiet:
-                continue  # it was over before the status was asked for
-            rose = True  # observing has waited for it
+                continue  # the inspection was over before the status came
+            rose = True  # the observation has waited for it
         else:
             places = one.places()
             fell, rose = places[0] is not None, places[2] is not None

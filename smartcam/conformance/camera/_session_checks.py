@@ -1,4 +1,4 @@
-"""Checks: how a session begins and ends, and what a camera says outside of one."""
+"""Checks: begin and end of a session, and messages outside of a session."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._wire import Heard
 
 ON_THE_WAY = 0.02
-"""Seconds that what was said before a Disconnect may be on its way at least."""
+"""Least number of seconds that messages before a Disconnect may be on their way."""
 
 
 BETWEEN_PIECES = 0.005
-"""Seconds between the bytes of a message that comes in pieces, so that each has a segment."""
+"""Seconds between the bytes of a message that is sent in pieces, so that each has a segment."""
 
 _NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
 

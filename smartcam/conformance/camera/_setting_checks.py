@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._wire import Heard
 
 UNKNOWN_APPLICATION = 0xFFFD
-"""An id that no application has, in all probability; it fits 16 bits."""
+"""An id that most probably no application has; it fits 16 bits."""
 
 SECONDS_APART = timedelta(seconds=3)
-"""Time by which a clock may be off right after it was set: the way, and the next full second."""
+"""Time by which a clock may be off right after it was set: transmission, and the next second."""
 
 A_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
 """The date of the published examples (MV30, ID-b 218). The camera has no time zone."""
@@ -130,14 +130,14 @@ def _judge_second(
 ) -> None:
     switched = of_kind(client.heard[mark:], MessageId.SWITCH_APPLICATION)
     answers = [camera.wire.numbers(one.body) for one in switched]
-    told = camera.wire.numbers(query.body)
+    numbers = camera.wire.numbers(query.body)
     if camera.wire.is_bid:
-        if told != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
+        if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
             raise Differs(
                 f"the code 0x16 and 0 to the Query, 0x16 and {active} to the second switch",
                 client.words(mark),
             )
-    elif told[-1] != active or len(answers) != 1:
+    elif numbers[-1] != active or len(answers) != 1:
         raise Differs(
             f"the id of before, {active}, and no answer to the second switch", client.words(mark)
         )
@@ -169,10 +169,10 @@ def _set_clock(camera: CameraUnderTest, client: RawClient, when: datetime) -> No
         minute=when.minute,
         second=when.second,
     )
-    _tell(camera, client, request, (0,))
+    _send_setting(camera, client, request, (0,))
 
 
-def _tell(
+def _send_setting(
     camera: CameraUnderTest, client: RawClient, request: m.Request, code: tuple[int, ...]
 ) -> None:
     """Send a request that a BVS ID acknowledges and a smart camera does not answer."""
@@ -217,8 +217,8 @@ def impossible_date_is_harmless(camera: CameraUnderTest) -> None:
     with camera.session() as client:
         was, began = _read_clock(camera, client), time.monotonic()
         try:
-            _tell(camera, client, request, (0x10,))
-            _read_clock(camera, client)  # which is a date
+            _send_setting(camera, client, request, (0x10,))
+            _read_clock(camera, client)  # raises if it is no date
         finally:
             _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
 
@@ -255,7 +255,7 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
 def sequence_number_is_set(camera: CameraUnderTest) -> None:
     """Set sequence number is the number of the next run; the run behind has one more."""
     number = 0x01020304
-    no_id(camera)  # which tells where the number stands
+    no_id(camera)  # raises if the number's place is unknown
     little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")
     with camera.session() as client:
         camera.ready(client)
@@ -263,7 +263,7 @@ def sequence_number_is_set(camera: CameraUnderTest) -> None:
         first = next_number(camera, client)
         second = next_number(camera, client)
     if camera.dialect == "b16" and first == big:
-        return  # the question big_endian_number tells it
+        return  # the question big_endian_number reports it
     following = (number + 1).to_bytes(4, "little")
     if (first, second) != (little, following):
         raise Differs(
@@ -286,8 +286,8 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
     with camera.session() as client:
         camera.ready(client)
         mark = len(client.heard)
-        for _ in range(2):  # what the bit says of the time before is over then
-            _tell(camera, client, m.SetInput(data=data), (0,))
+        for _ in range(2):  # the first trigger clears the bit's history
+            _send_setting(camera, client, m.SetInput(data=data), (0,))
             camera.once_waiting(client)
             mark = len(client.heard)
             within = takes + camera.options.timeout

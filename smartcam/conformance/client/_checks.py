@@ -1,4 +1,4 @@
-"""The rules for a client, each with its scene, its weight and the state of the camera.
+"""The rules for a client, each with its scene, its weight and its source.
 
 Sources are the keys of the list in ``docs/sources.md``.
 """
@@ -26,13 +26,13 @@ class Grade(enum.Enum):
     MUST = "must"
     """A client that breaks the rule is wrong: a test fails."""
     SHOULD = "should"
-    """A client that keeps the rule is better, but the documents leave it open, or it costs
-    something: only reported."""
+    """A client that follows the rule is better, but the documents leave it open, or it costs
+    effort: only reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientCheck:
-    """A rule in a scene."""
+    """A rule with the scene in which it is checked."""
 
     name: str  # name of the check, in reports and for ``-k``
     scene: Scene  # the camera and the task

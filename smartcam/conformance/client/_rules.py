@@ -1,7 +1,7 @@
 """Rules for a client, checked against its messages and its results.
 
-Each rule takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake in
-words, or None.
+Each rule gets a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake as
+text, or None.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.messages import Request, Sender
 
 if TYPE_CHECKING:
-    from smartcam.conformance.client._runs import ClientRun, Said
+    from smartcam.conformance.client._runs import ClientRun, WireMessage
 
 GRACE = 0.05
-"""Seconds that a status may take to the client, which cannot know of it before."""
+"""Seconds that a status may take to reach the client, which cannot know it earlier."""
 
 
 def _wrong_results(run: ClientRun) -> str | None:
-    """Return the first mistake in the client's results; too few are no mistake."""
+    """Return the first mistake in the client's results; too few results are no mistake."""
     scene, sent, last = run.scene, run.sent_turns, -1
     for number, data in enumerate(run.outcome.results, 1):
         what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
@@ -95,7 +95,7 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 def connects_first(run: ClientRun) -> str | None:
     """The client says nothing but Connect, and Disconnect before it, until it is answered."""
     answered: set[str] = set()
-    for one in run.said:
+    for one in run.messages:
         if isinstance(one.message, m.ConnectAnswer):
             answered.add(one.peer)
         elif (
@@ -111,8 +111,8 @@ def connects_first(run: ClientRun) -> str | None:
 
 def disconnects(run: ClientRun) -> str | None:
     """The client's last word is Disconnect."""
-    last: dict[str, Said] = {}
-    for one in run.said:
+    last: dict[str, WireMessage] = {}
+    for one in run.messages:
         if one.sender is Sender.CLIENT:
             last[one.peer] = one
     if not last:
@@ -127,14 +127,14 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
     A trigger may stand between two Queries, or two Get status: their answers come in order.
     """
     open_requests: set[tuple[str, type[m.Message]]] = set()
-    for one in run.said:
+    for one in run.messages:
         message = one.message
         if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
             key = (one.peer, message.answer)
             if key in open_requests:
                 return f"{_name(one)} came although the one before was not answered yet"
             open_requests.add(key)
-        if isinstance(message, m.Trigger):  # which may stand between two questions
+        if isinstance(message, m.Trigger):  # a trigger may stand between two queries
             open_requests -= {(one.peer, m.QueryAnswer), (one.peer, m.StatusReport)}
         elif message is not None and one.sender is Sender.CAMERA:
             open_requests.discard((one.peer, type(message)))
@@ -181,8 +181,8 @@ def stops_first(run: ClientRun) -> str | None:
 
 def waits_for_switch(run: ClientRun) -> str | None:
     """The client gives no command between SwitchApplication and its answer."""
-    switching: Said | None = None
-    for one in run.said:
+    switching: WireMessage | None = None
+    for one in run.messages:
         if isinstance(one.message, m.SwitchApplication):
             switching = one
         elif isinstance(one.message, m.SwitchAnswer):
@@ -196,7 +196,7 @@ def waits_for_switch(run: ClientRun) -> str | None:
 def is_quiet_while_busy(run: ClientRun) -> str | None:
     """The client gives no command while the last status that was sent has BUSY."""
     since: float | None = None
-    for one in run.said:
+    for one in run.messages:
         if isinstance(one.message, m.StatusReport) and not one.lost:
             busy = Status.BUSY in one.message.status
             since = None if not busy else one.time if since is None else since
@@ -205,11 +205,11 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
     return None
 
 
-def _is_command(one: Said) -> bool:
-    """Return True if a message is a command; questions and the session's end are not."""
+def _is_command(one: WireMessage) -> bool:
+    """Return True if a message is a command; queries and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 
 
-def _name(one: Said) -> str:
+def _name(one: WireMessage) -> str:
     return one.hex if one.message is None else type(one.message).__name__
