@@ -325,18 +325,18 @@ class Impatient(Machine):
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        asked, self._asked = self._asked, []
+        asked, self._open = self._open, []
         try:
             super().send(message, answered=answered)
         finally:
-            self._asked[:0] = asked
+            self._open[:0] = asked
 
 
 class Credulous(Machine):
     """Knows an answer by its looks."""
 
     def _read(self, line: str) -> None:
-        if line.isdecimal() and not self._asked:
+        if line.isdecimal() and not self._open:
             self._held.pass_on((m.QueryAnswer(application=int(line)),))
         else:
             super()._read(line)

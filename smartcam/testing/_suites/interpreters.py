@@ -10,8 +10,8 @@
             ContainerSample(b"", {}),
         )
 
-An interpreter is called as the client calls it, except that the client makes an InterpretationError
-of whatever an interpreter raises; here another error is a mistake.
+An interpreter is called as the client calls it, except that the client turns any error of an
+interpreter into an InterpretationError; here any other error is a mistake.
 """
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 
     from smartcam.interpreters import Spec
 
-MAX_ERROR_TEXT = 500
-"""Characters of an error's text: a container's bytes are in it, 64 of them at most."""
+MAX_ERROR_LENGTH = 500
+"""Largest number of characters of an error's text, which has at most 64 of a container's bytes."""
 
 MAX_PLACES = 256
-"""Largest number of places of a container at which one thing is tried."""
+"""Largest number of places of a container at which one variation is tried."""
 
 TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
-"""Bytes that may stand behind a container."""
+"""Bytes that may follow a container."""
 
 NOT_FINITE = tuple(
     struct.pack(order + code, number)
@@ -62,7 +62,7 @@ NOT_FINITE = tuple(
 """Bytes of numbers that are not valid, in each size and order."""
 
 LAYOUTS = ("x: int8", "x: real32 mm, y: real32 mm, theta: real32 deg", "(name: string[3])*")
-"""Layouts that a user may write behind an interpreter's name."""
+"""Layouts that a user may write after an interpreter's name."""
 
 _AT = datetime(2024, 2, 29, 23, 59, 30, tzinfo=UTC)
 _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
@@ -70,15 +70,15 @@ _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
 
 @dataclass(frozen=True)
 class ContainerSample:
-    """A container and the value that it stands for.
+    """A container and its value.
 
     Attributes:
-        data: bytes of the container behind the application id, with little-endian numbers.
-        value: value that the interpreter returns; for an array its ``tolist()`` will do.
-        layout: text that the user writes behind the interpreter's name, None for nothing.
-        big: bytes of the container with big-endian numbers, equal to ``data`` where it has no
-            numbers. It may be left out where the interpreter has a layout, which says where
-            numbers stand.
+        data: bytes of the container after the application id, with little-endian numbers.
+        value: value that the interpreter returns; for an array its ``tolist()`` suffices.
+        layout: text that the user writes after the interpreter's name, None without one.
+        big: bytes of the container with big-endian numbers, equal to ``data`` if it has no
+            numbers. It may be left out if the interpreter has a layout, which gives the places
+            of numbers.
         sequence: sequence number of the container.
         name: name of the sample for people.
     """
@@ -95,8 +95,8 @@ class InterpreterSuite(SaysWhatWasExpected):
     """The tests that every interpreter has to pass.
 
     Attributes:
-        spec: the interpreter as ``interpret_as`` takes it: a function, a class, an object, a name.
-        samples: containers and what they mean; each layout of interest has one.
+        spec: the interpreter as a value of ``interpret_as``: a function, a class or a name.
+        samples: containers and their values; at least one for each layout of interest.
         name: name of its entry point, "" without one.
     """
 
@@ -120,12 +120,12 @@ class InterpreterSuite(SaysWhatWasExpected):
         metafunc.parametrize("sample", self.samples, ids=labels)
 
     def make(self, layout: str | None = None) -> Interpreter:
-        """Return a new interpreter, with what a user would write behind its name.
+        """Return a new interpreter, with the text that a user would write after its name.
 
         Raises:
             ConfigurationError: the interpreter takes no layout, needs one, or not this one.
         """
-        spec = type(self).spec  # of an object a function would be a method
+        spec = type(self).spec  # from the object, a function would be a method
         if layout is None:
             return resolve(spec)
         if isinstance(spec, str):
@@ -178,7 +178,7 @@ class InterpreterSuite(SaysWhatWasExpected):
     def test_nothing_is_kept(self, sample: ContainerSample) -> None:
         """Neither bytes nor anything else; the bytes stay what they are."""
         interpreter = self.make(sample.layout)
-        outcome(interpreter, sample.data)  # what it finds out at first it may keep
+        outcome(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
         kept, before = repr(vars(interpreter)), sys.getrefcount(data)
         for _ in range(3):
@@ -312,7 +312,7 @@ def _reader(interpreter: Interpreter, data: bytes, **context: Any) -> Reader:
 
 
 def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
-    """Return an interpreter's value; whatever it raises comes out as it is."""
+    """Return an interpreter's value; errors are not changed."""
     return interpreter.interpret(_reader(interpreter, data, **context))
 
 
@@ -325,10 +325,10 @@ def outcome(interpreter: Interpreter, data: bytes) -> object:
 
 
 def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
-    """See that bytes give a value without nonsense, or the right kind of error.
+    """Check that bytes give a sensible value, or the right kind of error.
 
     Raises:
-        AssertionError: the bytes do not.
+        AssertionError: the bytes give neither.
     """
     where = f"{len(data)} bytes {data[:64]!r}, {context}"
     try:
@@ -345,22 +345,22 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
 
 
 def see_error(error: InterpretationError, data: bytes) -> None:
-    """See that an error says what was expected where, in a few words, and survives pickle.
+    """Check that an error is short, says what was expected at which place, and survives pickle.
 
     Raises:
-        AssertionError: the error does not.
+        AssertionError: the error fails.
     """
     where = f"{len(data)} bytes {data[:64]!r}: {error!r:.300}"
     assert str(error), f"{where}: it says nothing"
-    assert len(str(error)) <= MAX_ERROR_TEXT, f"{where}: a text of {len(str(error))} characters"
+    assert len(str(error)) <= MAX_ERROR_LENGTH, f"{where}: a text of {len(str(error))} characters"
     assert error.field or error.expected is not None, f"{where}: neither field nor expected"
     assert error.offset >= 0, f"{where}: offset {error.offset}"
     try:
         copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
     except Exception as exc:
         raise AssertionError(f"{where}: it does not survive pickle: {exc!r}") from exc
-    said = (type(error), str(error), error.field, error.offset)
-    assert (type(copy), str(copy), copy.field, copy.offset) == said, f"{where}: a copy is {copy!r}"
+    same = (type(error), str(error), error.field, error.offset)
+    assert (type(copy), str(copy), copy.field, copy.offset) == same, f"{where}: a copy is {copy!r}"
 
 
 def _cuts(data: bytes) -> Iterator[bytes]:
@@ -421,12 +421,12 @@ def _is_open(value: object) -> bool:
 
 
 def _is_array(value: object) -> bool:
-    numpy = sys.modules.get("numpy")  # only who has arrays has it
+    numpy = sys.modules.get("numpy")  # without numpy imported there are no arrays
     return numpy is not None and isinstance(value, numpy.ndarray)
 
 
 def _like(value: Any, expected: Any) -> bool:
-    """Return True if a value is what an author wrote down."""
+    """Return True if a value equals the author's value."""
     if _is_array(value):
         return _same(value, expected) if _is_array(expected) else value.tolist() == expected
     if isinstance(value, float) and isinstance(expected, float):
@@ -435,7 +435,7 @@ def _like(value: Any, expected: Any) -> bool:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Return True if two values are alike, types and NaN included."""
+    """Return True if two values are equal, including types and NaN."""
     if type(one) is not type(other):
         return False
     if _is_array(one):

@@ -40,7 +40,7 @@ MAX_ERROR_CHARACTERS = 500
 """Largest number of characters of an error's text, with at most 64 bytes of a peer."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
-"""Bytes of a camera that sends one of them without an end."""
+"""Bytes that a camera repeats endlessly, one at a time."""
 
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
@@ -93,15 +93,15 @@ class MachineChecks(Parameters):
         samples = _samples(stream)
         pieces = strategies.st.lists(strategies.noise(samples), max_size=3)
 
-        def told(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
+        def outcome(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
             player = Player(self.protocol, stream).play(place)
             events = [event for chunk in cut for event in player.deliver(chunk)]
             return events, player.machine.state
 
         def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
-            first = told(place, [whole])
+            first = outcome(place, [whole])
             for cut in (chunks, [bytes([one]) for one in whole]):
-                other = told(place, cut)
+                other = outcome(place, cut)
                 assert other == first, f"whole: {first}, in pieces: {other}"
 
         def check(data: DataObject) -> None:
@@ -324,11 +324,11 @@ class MachineChecks(Parameters):
             assert not secret or secret not in shown, f"the trace has the password: {shown}"
         spoken = {
             sender
-            for sender, said in (
+            for sender, frames in (
                 (m.Sender.CLIENT, [one.wire for one in conversation.steps]),
                 (m.Sender.CAMERA, [*_samples(conversation)]),
             )
-            if any(said)
+            if any(frames)
         }
         missing = spoken - {sender for sender, _ in seen}
         assert not missing, f"nothing of the {missing} was traced"
@@ -349,7 +349,7 @@ class _Judge:
         return isinstance(self.last, (LinkFailed, LinkEnded, State))
 
     def let(self, action: bytes | m.Message) -> None:
-        """Pass bytes to the machine, or send a request."""
+        """Pass bytes or a request to the machine."""
         if isinstance(action, m.Message):
             try:
                 self.machine.send(action)
@@ -363,7 +363,7 @@ class _Judge:
         self._look()
 
     def end(self) -> None:
-        """Close the link twice as the camera, and pass bytes after that."""
+        """Close the link twice from the camera's side, and pass bytes after that."""
         before = self.over
         for _ in range(2):
             self.machine.receive_eof()
@@ -458,7 +458,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
 
 
 def _answers(conversation: Conversation) -> Iterator[tuple[int, type[m.Message], list[bytes]]]:
-    """Yield each answered request's place, its answer's type, and what came up to the answer."""
+    """Yield each answered request's place, its answer's type, and the bytes before the answer."""
     steps = conversation.steps
     for place, step in enumerate(steps):
         if not isinstance(step, Sent) or not isinstance(step.message, m.Request):

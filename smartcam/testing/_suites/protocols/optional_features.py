@@ -1,4 +1,4 @@
-"""Checks of what not every camera can do: it does, or an error says so and the session goes on."""
+"""Checks of optional features: they work, or an error says so and the session continues."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's cloc
 
 
 class OptionalFeatureChecks(Parameters):
-    """The checks of optional abilities: each works, or an error says so and the session lasts."""
+    """The checks of optional features: each works, or an error says so and the session goes on."""
 
     @in_a_loop
     async def test_start_and_stop(self, camera_kind: CameraKind) -> None:

@@ -1,4 +1,4 @@
-"""Checks of a session: made, left, lost, taken."""
+"""Checks of a session: opened, closed, lost, taken."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
 class SessionChecks(Parameters):
-    """A session: made, left, lost, taken."""
+    """A session: opened, closed, lost, taken."""
 
     @in_a_loop
     async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:

@@ -1,4 +1,4 @@
-"""Checks of triggers: one outcome each, and whose each result is."""
+"""Checks of triggers: each has one outcome, and its own result."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class TriggerChecks(Parameters):
-    """Triggers: one outcome each, and whose each result is."""
+    """Triggers: each has one outcome, and its own result."""
 
     @in_a_loop
     async def test_trigger_gives_a_typed_result(self, camera_kind: CameraKind) -> None:
