@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats import LengthUnit
 
 DIFFERENT = 7
-"""Exit code after a comparison of calibrations that differ by more than their noise explains."""
+"""Exit code after a comparison of calibrations that differ by more than noise explains."""
 
 COLUMNS = ("centre", "corners", "worst", "mean")
 """Names of a map's figures."""
@@ -33,7 +33,7 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 """The values of --wizard."""
 
 MIN_LIKENESS = 0.75
-"""A word counts as a command, not as a host, from this likeness on (0 to 1)."""
+"""Likeness to a command, 0 to 1, from which a word counts as that command and not as a host."""
 
 OWN = "wizard"
 """Name of the default command below ``calibrate``, which users need not type."""
@@ -59,7 +59,7 @@ class WithParts(click.Command):
 
 
 class WithFiles(ListedGroup):
-    """A command with others below it, of which a default takes arguments without a name."""
+    """A group of commands with a default one, which takes arguments without a name."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
@@ -106,7 +106,7 @@ def distance_option(function: Any) -> Any:
         "--distance",
         type=click.FloatRange(min=0, min_open=True, max=1e6),
         metavar="M",
-        help="Of the points before the camera, metres.  [default: infinity]",
+        help="Distance of the points from the camera, metres.  [default: infinity]",
     )(function)
 
 
@@ -125,7 +125,7 @@ def distance_option(function: Any) -> Any:
 @click.option(
     "--unit",
     type=click.Choice(["m", "cm", "mm", "inch"]),
-    help="Of the lengths between cameras, for files that do not say it, such as OpenCV's.",
+    help="Unit of lengths between cameras, for files without one, such as OpenCV's.",
 )
 @click.option(
     "--svg",
@@ -164,8 +164,8 @@ async def compare(
         turn, shift = rig_difference(one, other, *pair)
         between = f"{one.target} to {one.source}"
         value = {"between": between, "turn_deg": math.degrees(turn), "shift_mm": 1e3 * shift}
-        said = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
-        options.show(value, said)
+        text = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
+        options.show(value, text)
     if svg is not None:
         _draw(svg, first.names, found, f"{a} and {b}")
     if any(one.same is False for one in found):
@@ -185,7 +185,7 @@ async def compare(
     type=click.Path(dir_okay=False),
     required=True,
     callback=_svg,
-    help="Where the picture goes; .svg.",
+    help="File for the picture; .svg.",
 )
 @click.option(
     "--what",

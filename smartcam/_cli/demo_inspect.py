@@ -1,4 +1,4 @@
-"""``smartcam demo --inspect``: a software camera that checks drawn parts, beside the truth."""
+"""``smartcam demo --inspect``: a software camera checks drawn parts; results beside the truth."""
 
 from __future__ import annotations
 

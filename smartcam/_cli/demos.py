@@ -1,4 +1,4 @@
-"""``smartcam demo``: which of the demonstrations is meant."""
+"""``smartcam demo``: choose the demonstration."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class PalletSize(_ParamType):
 @click.option(
     "--folder",
     type=click.Path(file_okay=False),
-    help="With --inspect and --plain: where pictures, cell file and models go.  [default: "
+    help="With --inspect and --plain: folder for pictures, cell file and models.  [default: "
     "demo-inspect, demo-pick]",
 )
 @click.option(
@@ -83,14 +83,14 @@ class PalletSize(_ParamType):
     type=click.Path(dir_okay=False),
     default="pick.svg",
     show_default=True,
-    help="With --pick alone: where the picture of the calibration goes (SVG).",
+    help="With --pick alone: file for the picture of the calibration (SVG).",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=1,
     show_default=True,
-    help="With --pick, --tower and --inspect: of all noise, and of where things are.",
+    help="With --pick, --tower and --inspect: seed of all noise and places.",
 )
 @runs(*OUTPUT)
 async def demo(

@@ -172,7 +172,7 @@ def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result:
     "Exit code: 0 if all did it, else that of the first error."
 )
 @click.argument("url")
-@click.option("--agent", metavar="NAME", help="This one only.")
+@click.option("--agent", metavar="NAME", help="Only this agent.")
 @runs("--timeout", *OUTPUT)
 async def reload(url: str, agent: str | None, options: Options) -> None:
     async with _opened(url, options) as opened:
@@ -236,8 +236,8 @@ async def _ask_outlets(url: str, options: Options) -> None:
     if options.as_json:
         for one in found:
             account = one._asdict()
-            said = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**said, "account": account}, "")
+            shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**shown, "account": account}, "")
         return
     rows = [
         (one.agent, one.outlet, *_account_row(one._asdict()), one.trouble or "well")
@@ -297,15 +297,15 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
 @contextlib.asynccontextmanager
 async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
     """Open the fleet, once it has an agent."""
-    told = False
+    warned = False
     for delay in Backoff(maximum=2.0).delays():
         opened = _opened(url, options)
         try:
             await opened.open()
         except ConnectFailedError as exc:
-            if not told:
+            if not warned:
                 click.echo(f"{exc}; it is awaited", err=True)
-            told = True
+            warned = True
         else:
             try:
                 yield opened

@@ -1,4 +1,4 @@
-"""``smartcam frames features`` and ``frames force-address``: a device's features; its address."""
+"""``smartcam frames features`` and ``frames force-address``: features and address of a device."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @click.option("--load", metavar="SET", help="Have the device load a user set, such as Default.")
 @click.option("--execute", multiple=True, metavar="COMMAND", help="Execute a command.")
 @click.option("--save", metavar="SET", help="Have the device keep its features in a user set.")
-@option("--timeout", help="Bound of each of these.  [default: 10]")
+@option("--timeout", help="Longest time for each of these.  [default: 10]")
 @runs(*OUTPUT)
 async def features_command(
     url: str,

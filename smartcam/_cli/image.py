@@ -1,4 +1,4 @@
-"""``smartcam image``: a camera's last picture to a file."""
+"""``smartcam image``: write a camera's last picture to a file."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class _OutletSource:
 
         options = self._options
         spec = options.interpret_as or "raw"
-        if self.camera is not None:  # a camera that knows its own layouts has them there
+        if self.camera is not None:  # a camera with layouts of its own has them here
             spec = self.camera.settings.interpret_as
         read = Interpretation(spec, lenient=False, y_down=options.y_down)
         return columns_of(read.interpreter(application))
@@ -138,7 +138,7 @@ class _OutletSource:
 
 async def _results(name: str, results: Any, outlets: Outlets) -> None:
     """Pass on results; results that the subscription lost are reported as an error."""
-    told = 0
+    reported = 0
     while True:
         try:
             result = await anext(results)
@@ -152,10 +152,10 @@ async def _results(name: str, results: Any, outlets: Outlets) -> None:
             outlets.offer_result(result)
         account = results.statistics()
         lost = account.dropped + account.missed
-        if lost > told:
-            text = f"{lost - told} results did not arrive"
+        if lost > reported:
+            text = f"{lost - reported} results did not arrive"
             outlets.offer_error(name, datetime.now(UTC), text, "Missed")
-            told = lost
+            reported = lost
 
 
 async def _events(events: Any, outlets: Outlets) -> None:

@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 ROS_ARGS = "--ros-args"
-"""The option from which on all is for ROS, as of any program of ROS."""
+"""The option after which all arguments are for ROS, as in any program of ROS."""
 
 THROUGH = {"zenoh": "zenoh", "native": "rclpy"}
 """Values of ``--rmw``, and their names in a fleet file."""
 
 
 class RosCommand(click.Command):
-    """A command that leaves what follows ``--ros-args`` to ROS."""
+    """A command that leaves the arguments after ``--ros-args`` to ROS."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Keep the arguments for ROS, and read the others."""
+        """Keep the arguments for ROS, and parse the others."""
         at = args.index(ROS_ARGS) if ROS_ARGS in args else len(args)
         left = super().parse_args(ctx, args[:at])
         ctx.params["ros_args"] = tuple(args[at:])
@@ -49,16 +49,16 @@ class RosCommand(click.Command):
     type=click.IntRange(0, 0xFFFFFFFF),
     help="The domain's number; default ROS_DOMAIN_ID, or 0.",
 )
-@click.option("--namespace", help="In front of the cameras' names, such as /plant.")
+@click.option("--namespace", help="Prefix of the cameras' names, such as /plant.")
 @click.option(
     "--distribution",
     type=click.Choice(["humble", "jazzy", "kilted", "lyrical", "rolling"]),
-    help="Of ROS, whose type hashes are spoken; default jazzy, or the installed one.",
+    help="ROS distribution whose type hashes are used; default jazzy, or the installed one.",
 )
 @click.option(
     "--rmw",
     type=click.Choice(list(THROUGH)),
-    help="Who speaks: smartcam itself as rmw_zenoh does, or the installed ROS; default zenoh.",
+    help="zenoh: smartcam itself, like rmw_zenoh; native: the installed ROS.  [default: zenoh]",
 )
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def ros2(
@@ -70,15 +70,15 @@ async def ros2(
     ros_args: tuple[str, ...],
     options: Options,
 ) -> None:
-    """Have cameras seen in ROS 2."""
-    said: dict[str, object] = {
+    """Make cameras nodes in ROS 2."""
+    chosen: dict[str, object] = {
         "domain": domain,
         "namespace": namespace,
         "distribution": distribution,
         "through": None if rmw is None else THROUGH[rmw],
         "args": ros_args or None,
     }
-    given = {name: value for name, value in said.items() if value is not None}
+    given = {name: value for name, value in chosen.items() if value is not None}
     from smartcam.settings import is_fleet
 
     if is_fleet(place):

@@ -1,7 +1,7 @@
-"""The ``smartcam`` command: which commands there are, and where they stand.
+"""The ``smartcam`` command: the list of its commands, with their modules.
 
-What a command needs is imported when it is used. Its line of ``--help`` stands here, so that the
-list needs none of them.
+The modules of a command are imported when it is used. The list has each command's line of
+``--help``, so that showing it imports none of them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Listed(NamedTuple):
     Attributes:
         module: module of this package that has a function with the command's name.
         summary: the first sentence of its help.
-        extra: the extra that brings the module, where smartcam alone does not.
+        extra: the extra that brings the module, "" if smartcam alone has it.
     """
 
     module: str
@@ -198,17 +198,17 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
 """Commands by topic, in the order of ``--help``."""
 
 LISTED = {name: listed for commands in TOPICS.values() for name, listed in commands.items()}
-"""All of them."""
+"""All commands by name."""
 
 ALIASES = {"emulate": "emulator"}
 """Other names of commands, which no list shows."""
 
 
 class CommandTable(MutableMapping[str, click.Command]):
-    """The commands by name, each imported when it is asked for.
+    """The commands by name, each imported when it is used.
 
     Args:
-        listed: where they stand.
+        listed: modules and summaries of the commands.
     """
 
     def __init__(self, listed: Mapping[str, Listed]) -> None:
@@ -236,7 +236,7 @@ class CommandTable(MutableMapping[str, click.Command]):
 
 
 def _module(name: str, listed: Listed) -> ModuleType:
-    """Return the module of a command; a usage error where the extra that brings it is missing."""
+    """Return the module of a command; raise a usage error if its extra is missing."""
     from smartcam._extras import from_part
     from smartcam.exceptions import MissingExtraError
 
@@ -254,7 +254,7 @@ class CommandsByTopic(ListedGroup):
         super().__init__(name, commands=CommandTable(LISTED), **given)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command by its name, or by another one that it has."""
+        """Return a command by its name, or by another name of it."""
         return super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -264,11 +264,11 @@ class CommandsByTopic(ListedGroup):
                 formatter.write_dl([(name, listed.summary) for name, listed in commands.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands and options that begin like this."""
+        """Return the commands and options that begin with this text."""
         from click.shell_completion import CompletionItem
 
         found = [
-            # what click shows of a command, which is not imported for it
+            # click's help text of a command, which is not imported for it
             CompletionItem(
                 name, help=click.Command(name, help=LISTED[name].summary).get_short_help_str()
             )
