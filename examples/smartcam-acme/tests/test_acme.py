@@ -1,4 +1,4 @@
-"""The Acme camera in smartcam's suite, and in tests of one's own."""
+"""The Acme camera in smartcam's suite, and in its own tests."""
 
 import contextlib
 from collections.abc import AsyncIterator
@@ -37,24 +37,24 @@ class LiveAcme(LiveCamera):
 
     @property
     def url(self) -> str:
-        """Its address."""
+        """The camera's address."""
         return f"{self.emulator.url}?dialect=lines"
 
     @property
     def has_session(self) -> bool:
-        """Whether it serves a client."""
+        """True if the camera serves a client."""
         return self.emulator.has_session
 
 
 @contextlib.asynccontextmanager
 async def put_up() -> AsyncIterator[LiveCamera]:
-    """Put one up that counts."""
+    """Start a camera."""
     async with AcmeCamera(parts=[str(number) for number in range(1000)]) as emulator:
         yield LiveAcme(emulator)
 
 
 class TestAcme(ProtocolSuite):
-    """Everything that the suite checks."""
+    """All tests of the suite."""
 
     protocol = ACME
     conversations = (
