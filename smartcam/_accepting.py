@@ -4,14 +4,14 @@ Emulators, pages, the RTSP server and the link proxy use it. :class:`Places` dec
 connections may stay; it uses no socket and no clock. :class:`Acceptor` accepts them, and keeps the
 deadlines.
 
-- A newcomer always gets in as long as one of the others has no session: the one without a session
-  for longest makes room. One with a session never does. The server defines what a session is; a
-  request that needs none, such as OPTIONS, does not make one.
+- A newcomer always gets in as long as some connection has no session: the connection that has had
+  none for longest is closed. A connection with a session stays. The server defines what a session
+  is; a request that needs no session, such as OPTIONS, does not make one.
 - A connection without a session in time is closed, even if it has sent data.
 - One address gets at most three quarters of the places; the programs of this machine share one
   address, so loopback may have all.
 - Some file descriptors of the process are left to others. If only those are left, the connection
-  without a session for longest, of any server on this event loop, makes room.
+  without a session for longest, of any server on this event loop, is closed.
 
 Connections are not accepted by ``asyncio.Server``. A connection that it has accepted but not yet
 wrapped when it is closed stays open until the garbage collector finds it, and a client would wait
@@ -93,8 +93,8 @@ class Occupant(Protocol):
 @dataclass(slots=True)
 class _TakenPlace:
     peer: str  # address of the peer, without a port
-    since: float  # time at which it came, or last had a session
-    within: float  # seconds that it has from then on
+    since: float  # time at which the connection came, or last had a session
+    within: float  # seconds that the connection may stay from then on
     what: str  # name of the missing thing, for the log
     deadline: float
 
@@ -110,7 +110,7 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        what: reason for the log why such a connection is closed, "no session".
+        what: name of the missing thing, which the log gives as the reason for closing.
         own: name of a session in the log, "a session".
 
     Attributes:
@@ -146,7 +146,7 @@ class Places(Generic[G]):
         """Give a newcomer a place; another connection may be closed for it.
 
         Returns:
-            "", or the reason why it gets none.
+            "", or the reason why the connection gets no place.
         """
         crowd, taken = list(self._places), f"{self.most} others are open"
         if len(crowd) < self.most:
@@ -300,7 +300,7 @@ class Acceptor(Generic[G]):
     # ------------------------------------------------------------------ its connections
 
     def enter(self, occupant: G, address: Any) -> str:
-        """Give a new connection a place; return "", or why there is none.
+        """Give a new connection a place; return "", or the reason why it gets none.
 
         Args:
             occupant: the connection.
@@ -374,7 +374,7 @@ class Acceptor(Generic[G]):
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
             return  # the client has closed the connection already
         except OSError as exc:  # no file descriptor is left: the reader would be called endlessly
-            self._tell(f"a connection cannot be accepted: {exc}")
+            self._warn_once(f"a connection cannot be accepted: {exc}")
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock)
             pause = 0.0 if _make_room() else ACCEPT_PAUSE
@@ -388,13 +388,13 @@ class Acceptor(Generic[G]):
             try:
                 connection, _ = await loop.sock_accept(sock)
             except OSError as exc:
-                self._tell(f"a connection cannot be accepted: {exc}")
+                self._warn_once(f"a connection cannot be accepted: {exc}")
                 await asyncio.sleep(0.0 if _make_room() else ACCEPT_PAUSE)
             else:
                 self._admit(connection)
 
-    def _tell(self, what: str) -> None:
-        """Say once that nothing can be accepted, until it can be again."""
+    def _warn_once(self, what: str) -> None:
+        """Log that nothing can be accepted; once, until accepting works again."""
         if not self._scarce:
             self._log.warning("! %s", what)
         self._scarce = True
@@ -407,7 +407,7 @@ class Acceptor(Generic[G]):
             self._moving += 1
             asyncio.get_running_loop().call_soon(self._move, connection)
         else:
-            self._tell("a connection was refused: the process has too few file descriptors left")
+            self._warn_once("a connection was refused: too few file descriptors are left")
             connection.close()
 
     def _move(self, connection: socket.socket) -> None:

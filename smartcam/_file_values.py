@@ -91,7 +91,7 @@ Patterns = Annotated[
 
 
 def chosen(patterns: Sequence[str], camera: str) -> bool:
-    """Return True if a camera of this name is meant by one of the patterns."""
+    """Return True if one of the patterns matches the camera's name."""
     return any(_matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in patterns)
 
 
@@ -110,7 +110,7 @@ def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits
 
 
 def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
-    """Return places in a pattern with those behind what may stand for nothing."""
+    """Return places in a pattern, with the places after parts that may match nothing."""
     for place, one in enumerate(pattern):
         if place in places and one == many:
             places = places | {place + 1}

@@ -14,11 +14,11 @@ class Server(ABC):
 
     @abstractmethod
     async def start(self) -> None:
-        """Start the server; do nothing where it is started already."""
+        """Start the server; do nothing if it is started already."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Stop the server; do nothing where it is stopped."""
+        """Stop the server; do nothing if it is stopped."""
 
     async def __aenter__(self) -> Self:
         await self.start()

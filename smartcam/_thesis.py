@@ -43,8 +43,8 @@ _Application = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 def said_spec(text: str) -> str | None:
     """Return the specification that a text names; None for an empty text."""
-    said = text.strip()
-    return _KEYWORDS.get(said.lower(), said) or None
+    spec = text.strip()
+    return _KEYWORDS.get(spec.lower(), spec) or None
 
 
 class ThesisRequest(BaseModel):
@@ -57,7 +57,7 @@ class ThesisRequest(BaseModel):
 
 
 class SetupRequest(ThesisRequest):
-    """A camera's address, and what is to be had of the camera."""
+    """A camera's address, and the application and interpretation that are wanted."""
 
     camera_model_name: _Text = ""
     port: Annotated[int, Field(ge=0, le=0xFFFF)] | _Text = 0
@@ -70,7 +70,7 @@ class SetupRequest(ThesisRequest):
         """Return the camera's address.
 
         Raises:
-            ConfigurationError: no camera can be there.
+            ConfigurationError: no camera can have this address.
         """
         place = self.con_address
         if "://" not in place:
@@ -95,7 +95,7 @@ class ApplicationRequest(ThesisRequest):
 
 
 class ThesisTriggerRequest(ThesisRequest):
-    """The application to trigger, before the camera goes back; 0 is the active one."""
+    """The application to trigger, before the camera returns to its own; 0 is the active one."""
 
     application_id: _Application = 0
 
@@ -107,7 +107,7 @@ class ThesisFace(Protocol):
         name: the camera's name.
         address: where the camera itself is.
         application: the id of the active application; None if that is not known.
-        reading: how its results are read; None if nobody knows what they hold.
+        reading: interpretation of its results; None if their contents are not known.
         stopped: whether SmartcameraStop has closed the camera for these services.
     """
 
@@ -154,10 +154,10 @@ class ThesisFace(Protocol):
         """Publish nothing more on the topics that requests have named."""
 
     async def have_session(self) -> None:
-        """Have a session with the camera, or raise the error that says why there is none."""
+        """Make sure of a session with the camera; raise the reason if there is none."""
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Have an application running and ready."""
+        """Make sure that an application is running and ready."""
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
@@ -172,7 +172,7 @@ class ThesisCall(NamedTuple):
 
     Attributes:
         face: the camera.
-        request: what is asked for, of the service's own kind.
+        request: the request, of the service's own class.
         timeout: seconds.
     """
 
@@ -185,9 +185,9 @@ class ThesisService(NamedTuple):
     """One of the six services.
 
     Attributes:
-        request: what it takes.
-        do: does it, and returns what its answer has beside ``error``.
-        timeout: seconds, where the request says none.
+        request: class of its requests.
+        do: function that carries the service out, and returns the answer's fields but ``error``.
+        timeout: seconds, if the request gives none.
         settles: the service changes what is published, and waits for others that do.
         after_stop: whether the service works after SmartcameraStop, before the next
             SmartcameraSetup.
@@ -202,11 +202,11 @@ class ThesisService(NamedTuple):
     nothing: str | None = None
 
     async def answer(self, call: ThesisCall) -> dict[str, Any]:
-        """Do what is asked for; return what the answer has beside ``error``.
+        """Carry the service out; return the fields of its answer, without ``error``.
 
         Raises:
             LocalProtocolError: the camera was stopped.
-            SmartCamError: as the service ends.
+            SmartCamError: the service failed.
         """
         if call.face.stopped and not self.after_stop:
             raise LocalProtocolError(
@@ -216,7 +216,7 @@ class ThesisService(NamedTuple):
 
 
 async def _setup(call: ThesisCall) -> dict[str, Any]:
-    """Have a camera as a request describes it; nothing is done where it is another one."""
+    """Set a camera up as a request describes it; do nothing if the request means another one."""
     face, request = call.face, call.request
     _check_place(face, request)
     spec = said_spec(request.interpret_as)
@@ -233,7 +233,7 @@ async def _setup(call: ThesisCall) -> dict[str, Any]:
 
 
 def _check_place(face: ThesisFace, request: SetupRequest) -> None:
-    """See that a request means the camera that the face has.
+    """Check that a request means the camera of the face.
 
     Raises:
         ConfigurationError: the request means another camera.

@@ -73,9 +73,9 @@ class Address(NamedTuple):
         """The address as a URL, with everything pinned that is known; never with a password."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         user = "".join(quote(value, safe="") + "@" for key, value in self.parameters if key == USER)
-        said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
+        values = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
         query = urlencode(
-            [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
+            [(key, value) for key, value in values if value and key not in {USER, PASSWORD}],
             safe=",:",
         )
         place = f"{user}{host}:{self.port}" if host else ""
@@ -133,7 +133,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         port = protocol.default_port
     if not host:
         raise ConfigurationError(f"camera address {shown!r} has no host")
-    # urlsplit lets some pass, and which ones differs from Python to Python
+    # urlsplit accepts some of these, and which ones depends on the version of Python
     place = parts.netloc.rpartition("@")[2]
     if "[" in host or "]" in host or place.rfind("[") > 0:
         raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
@@ -154,10 +154,10 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
             f"camera address {shown!r} has {surplus[0]}, which means nothing: expected "
             f"{parts.scheme}://HOST[:PORT]"
         )
-    said = _query(shown, parts.query, protocol)
+    values = _query(shown, parts.query, protocol)
     if has_login and parts.username is not None:
-        said[USER], said[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
-    dialect, quirks = said.pop("dialect", None), said.pop("quirks", "")
+        values[USER], values[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
+    dialect, quirks = values.pop("dialect", None), values.pop("quirks", "")
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(
             f"camera address {shown!r}: {protocol.name} has no dialect {dialect!r}; "
@@ -170,12 +170,12 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         port,
         dialect,
         tuple(sorted({name.strip() for name in quirks.split(",") if name.strip()})),
-        tuple(said.items()),
+        tuple(values.items()),
     )
     try:
         if dialect is None and address.quirks:
             raise ConfigurationError("quirks are a dialect's: name the dialect, too")
-        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, said)
+        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, values)
     except ConfigurationError as exc:
         raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
     return address
@@ -188,17 +188,17 @@ USER, PASSWORD = "user", "password"
 def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
     """Return the parameters of a URL's query; ``shown`` is the URL for error texts."""
     known = ["dialect", "quirks", *(key for key in protocol.parameters if key not in _LOGIN)]
-    said: dict[str, str] = {}
+    values: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
             raise ConfigurationError(
                 f"camera address {shown!r}: unknown {key!r}; known are "
                 f"{', '.join(map(repr, known))}{did_you_mean(key, known)}"
             )
-        if key in said:
+        if key in values:
             raise ConfigurationError(f"camera address {shown!r} names two {key}")
-        said[key] = value
-    return said
+        values[key] = value
+    return values
 
 
 _LOGIN = frozenset({USER, PASSWORD})
@@ -424,7 +424,7 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
     """Return pydantic's findings as one line: where, what was expected, what came.
 
-    ``known``: names that may stand at the top, one of which may have been meant.
+    ``known``: names of the fields at the top, of which one may have been meant.
     """
     return "; ".join(
         f"{'.'.join(f'{part!s:.80}' for part in item['loc']) or 'value'}: {item['msg']}"
