@@ -2,7 +2,7 @@
 
 A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
 ``_framed/dialect.py`` has the dialect of binary frames. A :class:`Policy`, chosen by role and
-transport, says how broken input is handled.
+transport, decides how broken input is handled.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class RawRequest(NamedTuple):
     Attributes:
         message: the message to send.
         answer: the answer's message type, or its id.
-        answered: whether the documents say that it is answered; True for an unknown id.
+        answered: whether it is answered by the documents; True for an unknown id.
         known: whether the dialect knows the id.
     """
 
@@ -303,7 +303,6 @@ class Protocol:
             :class:`~smartcam.emulator.LineCamera`; "" if it brings none.
         greeting: bytes that a camera sends to a new client before it received anything; ``b""`` if
             it waits for the client, None if that is not known.
-            ``b""`` if it keeps silent until it is spoken to, None if that is not known.
     """
 
     name: str

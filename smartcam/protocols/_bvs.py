@@ -121,7 +121,7 @@ HANDBOOK = FramedDialect(
     header=HeaderLayout(magic=bytes.fromhex("50535642"), code="I", order="length, id"),
     word="I",
     table=MESSAGES,
-    about="magic 50 53 56 42, 32 bit, the length counts what follows the message id",
+    about="magic 50 53 56 42, 32 bit, the length counts the bytes after the message id",
     source="SC manual p. 28, 29 and vector A-1 (mvBlueGEMINI manual p. 30), published",
 )
 
@@ -358,7 +358,7 @@ class _Bvs(Protocol):
     dialects: Mapping[str, FramedDialect]
 
 
-# while it is not known which of the last two it is, frames are shown as bid's, which is published
+# while either of the last two may be spoken, frames are shown as bid's, which is published
 _16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
 BVS: _Bvs = _Bvs(

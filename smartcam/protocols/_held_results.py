@@ -101,7 +101,7 @@ class HeldResults:
 
         Args:
             application: id of the application.
-            question: number of the question that this answers, 0 for another one.
+            question: number of the question that the message answers, 0 for none.
 
         Returns:
                 True if a question is needed now for a result that came since the last one.

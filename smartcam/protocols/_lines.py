@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     """One message, or several, that an answer becomes."""
 
     Script = Generator[str, str, Reported]
-    """Yields lines, receives the answer to each, and returns what it found out."""
+    """Yields lines, receives the answer to each, and returns the facts in them."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
@@ -110,7 +110,7 @@ class LineReply(m.Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineCommand(m.Request):
-    """A line of the user's own; a dialect has it if a row says how it is answered."""
+    """The user's own line; a dialect has it if a row gives the form of its answer."""
 
     answer: ClassVar[type[m.Message] | None] = LineReply
 
@@ -170,7 +170,7 @@ class LineDialect(Dialect):
 
     @property
     def capabilities(self) -> Capabilities:
-        """Abilities of a camera in this dialect, as the rows say."""
+        """Abilities of a camera in this dialect, from its rows."""
         able = {name: True for kind, name in _ABILITIES.items() if self.row(kind) is not None}
         unasked = {row.answer for row in self.rows if row.request is None}
         return Capabilities(
@@ -276,8 +276,7 @@ class LineDialect(Dialect):
         Raises:
             UnsupportedError: how another line is answered is not known.
             ConfigurationError: the text is no line that can be sent.
-            LocalProtocolError: the line triggers, and its answer would not show whose trigger it
-                was.
+            LocalProtocolError: the line triggers, and its answer would not name the trigger.
         """
         if self.row(LineCommand) is None or not isinstance(message_id, str):
             raise UnsupportedError(f"dialect {self.name}: there are no other requests")
@@ -313,8 +312,8 @@ class LineDialect(Dialect):
         """Return the bytes of the answer to a line of the user's own.
 
         Raises:
-            UnsupportedError: the camera says that it does not know the line.
-            CommandRejectedError: the camera says that it did not do it.
+            UnsupportedError: by its answer, the camera does not know the line.
+            CommandRejectedError: by its answer, the camera did not carry it out.
         """
         if not isinstance(answer, LineReply):
             raise LocalProtocolError(f"{type(answer).__name__} is no answer to a line")
@@ -372,7 +371,7 @@ class _OpenRequest:
 
 
 class LineMachine:
-    """One connection's lines, in the client's role; what a link needs.
+    """One connection's lines, in the client's role, as a link needs it.
 
     See :class:`~smartcam.protocols.LinkMachine`. If lines do not name their request, a
     request is sent when the one before it is answered, so that a lost answer does not shift the

@@ -4,8 +4,8 @@ Each message is a frozen dataclass that declares its body once: a field's annota
 on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table
 (``protocols/_bvs.py``) gives each message its id, and lists the fields that the dialect leaves
 out; codecs, construct views and the documentation are made from both. ``TRANSITIONS`` in
-``protocols/_framed/machine.py`` says when a message may come: a new request or report stands among
-those of a session there.
+``protocols/_framed/machine.py`` lists when messages may come; new requests and reports join those
+of a session there.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class Request(Message):
 
 
 class Report(Message):
-    """A message from camera to client: an answer, or sent by itself."""
+    """A message from camera to client: an answer, or sent unasked."""
 
     __slots__ = ()
     sender: ClassVar[Sender] = Sender.CAMERA
@@ -222,19 +222,19 @@ class SwitchAnswer(Acknowledgement):
 
 
 class TriggerAnswer(Acknowledgement):
-    """The trigger was understood; this does not say that an inspection began."""
+    """The trigger was understood; an inspection may not have begun."""
 
     __slots__ = ()
 
 
 class SetClockAnswer(Acknowledgement):
-    """The clock is set, or the code says why not."""
+    """The clock is set, or the code gives the reason why not."""
 
     __slots__ = ()
 
 
 class SetInputAnswer(Acknowledgement):
-    """The input data (BVS ID: the reference value) is taken, or the code says why not."""
+    """The input data (BVS ID: the reference value) is taken, or the code gives the reason."""
 
     __slots__ = ()
 
@@ -246,13 +246,13 @@ class ResetErrorsAnswer(Acknowledgement):
 
 
 class StartAnswer(Acknowledgement):
-    """Run mode is entered, or the code says why not."""
+    """Run mode is entered, or the code gives the reason why not."""
 
     __slots__ = ()
 
 
 class StopAnswer(Acknowledgement):
-    """Run mode is left, or the code says why not."""
+    """Run mode is left, or the code gives the reason why not."""
 
     __slots__ = ()
 
@@ -383,7 +383,7 @@ class Trigger(Request):
 
 
 class EndTrigger(Request):
-    """End the running trigger now: its result is what the camera has seen by then."""
+    """End the running trigger now: its result has the codes that were read by then."""
 
     __slots__ = ()
 
@@ -430,7 +430,7 @@ class MalformedMessage(Message):
 def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
     """Return name and wire type of each field of a message's body, in order.
 
-    It has all fields of all dialects; a dialect's row says which of them are on its wire.
+    It has all fields of all dialects; a dialect's row lists those on its wire.
     """
     found = _WIRE_FIELDS.get(message_type)
     if found is None:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from smartcam.layout import Field, Layout
 
 MARK = "smartcam;"
-"""The text before each result of an uploaded layout, which no code and no result of another
-layout begins with."""
+"""The text before each result of an uploaded layout; other results and codes begin
+otherwise."""
 
 _TYPES: Mapping[str, tuple[str, str]] = {
     **{f"int{bits}": (f"int{bits}", code) for bits, code in ((8, "b"), (16, "h"), (32, "i"))},
@@ -44,7 +44,7 @@ def layout_json(layout: Layout) -> str:
     fields = [_element(field) for field in layout.fields]
     if isinstance(layout.repeat, int):
         raise ConfigurationError(
-            f"ifm: a device sends as many records as there are, write ( ... )*: {layout.text}"
+            f"ifm: the number of records is not fixed, write ( ... )*: {layout.text}"
         )
     if layout.repeat is None:
         elements += fields

@@ -17,7 +17,7 @@ LAST_COUNT = 32_767
 """The largest count of triggers; the next one is 1."""
 
 LEAST_RATE = 70
-"""The least rate for which a tool says OK."""
+"""The least rate that a tool accepts as OK."""
 
 
 class EmulatedIv3(EvaluatingCamera):

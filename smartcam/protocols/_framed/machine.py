@@ -769,7 +769,7 @@ class Machine:
         return codec.decode(payload, 0, len(payload)), surplus
 
     def _note_familiar(self, codec: Codec, message: Message, begin: int, end: int) -> None:
-        """Store a message by its frame, as long as this state lasts; ``begin``: of its payload."""
+        """Store a message by its frame, for this state only; ``begin``: place of its payload."""
         frame = begin - self._header_size
         if type(message) is m.ResultContainer:
             if self._takes_bursts and len(self._results) < MAX_FAMILIAR:

@@ -210,7 +210,7 @@ def _number(line: str, what: str) -> int:
 
 
 def unexpected(line: str, expected: str) -> FrameError:
-    """Return the error of a line that came where something else was expected."""
+    """Return the error of a line in place of the expected one."""
     return FrameError(
         f"{line[:64]!r} came, {expected} was expected", data=line.encode(ENCODING, "replace")
     )

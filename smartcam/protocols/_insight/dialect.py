@@ -120,7 +120,7 @@ class InSightDialect(Dialect):
 
     @property
     def remark(self) -> str:
-        """Text which says that a result is empty if no cells are named."""
+        """Text for users: a result is empty if no cells are named."""
         if self.cells:
             return ""
         return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
@@ -196,8 +196,8 @@ class InSightDialect(Dialect):
         """Return the data after the code.
 
         Raises:
-            UnsupportedError: the code says that the camera does not know the command.
-            CommandRejectedError: the code says that the command was not done.
+            UnsupportedError: by its code, the camera does not know the command.
+            CommandRejectedError: by its code, the camera did not carry out the command.
         """
         if not isinstance(answer, Reply):
             raise LocalProtocolError(f"{type(answer).__name__} is no answer to a command")
@@ -229,7 +229,7 @@ def _cell_names(text: str) -> list[str]:
 
 NATIVE = InSightDialect(
     name="native",
-    about="native mode: text over telnet; ?cells= names what is read after a trigger",
+    about="native mode: text over telnet; ?cells= names the cells to read after a trigger",
     source="docs/insight.md, published and derived",
 )
 

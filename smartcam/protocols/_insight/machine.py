@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from smartcam.protocols._insight.dialect import InSightDialect
 
     Script = Generator[str, CommandAnswer, None]
-    """Yields command lines and receives their answers; what it finds out becomes messages."""
+    """Yields command lines and receives their answers, which become messages."""
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 """Status of a camera that is online and accepts event 8; the camera shows no other state."""
@@ -56,7 +56,7 @@ MAX_READ_BYTES = 1 << 15
 
 
 class Piece(enum.IntEnum):
-    """The kind of a frame in a trace; it stands where other protocols have the message id."""
+    """The kind of a frame in a trace, in place of a message id."""
 
     LINE = 0
     """A line, without its end."""
@@ -109,7 +109,7 @@ class _PendingRequest(NamedTuple):
 
 
 class InSightMachine:
-    """One connection in native mode, in the client's role; what a link needs.
+    """One connection in native mode, in the client's role, as a link needs it.
 
     See :class:`~smartcam.protocols.LinkMachine`. An answer belongs to the command before it. A line
     that no command asked for ends the link.
@@ -398,7 +398,7 @@ class InSightMachine:
     def _trigger(self, _message: m.Message) -> Script:
         """Trigger, and read the cells when they are up to date.
 
-        If the camera accepted no trigger, its status is reported first, since it may say why.
+        If the camera accepted no trigger, its status is reported first, which may have the reason.
         """
         code = (yield f"SW{TRIGGER_EVENT}").code
         if code == StatusCode.FAILED:

@@ -328,7 +328,7 @@ _JOB_NUMBER = re.compile(r"([0-9]{1,3})(?![0-9])", re.ASCII)
 
 
 def parse_cell(text: str) -> Cell:
-    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: it is no cell."""
+    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: no such cell."""
     match = _CELL.fullmatch(text)
     if match is None or int(match[2]) > LAST_ROW:
         raise ConfigurationError(
@@ -372,7 +372,7 @@ def parse_tag(text: str) -> str:
     """Read a cell's name: letters, digits, underscores and dots, at most 127 (manual, published).
 
     Two names that differ only in case are the same (manual, published), so the name is returned in
-    lower case. Raises ConfigurationError: it is not valid, or it has the form of a cell.
+    lower case. Raises ConfigurationError: the name is not valid, or has the form of a cell.
     """
     if not _TAG.fullmatch(text) or _CELL_LIKE.fullmatch(text):
         raise ConfigurationError(
