@@ -48,7 +48,7 @@ class Context:
         application: id of the application that made it.
         number: the client's own count of containers.
         received_at: when its last byte arrived, UTC.
-        byte_order: order of the bytes of a number, as the camera's status says.
+        byte_order: order of the bytes of a number, from the camera's status.
         y_down: whether the camera's y axis points down; poses are turned to y up.
         lenient: take any byte but zero for a true bool.
         empty_slots: number of records of zeros that were skipped; the interpreter counts them.
@@ -79,7 +79,6 @@ class Reader:
 
     All offsets are bytes from the start of ``data``. Every method raises
     :class:`~smartcam.InterpretationError` with offset, expected and got if bytes are missing.
-    are not all there.
     """
 
     __slots__ = ("context", "data", "layout")
@@ -279,7 +278,7 @@ class PlainInterpreter(Interpreter):
     def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
         """Return the values of several containers that came together; as :meth:`read` for each.
 
-        Override it if that is quicker. If it raises, the containers are read again, one by one.
+        Override it for a quicker way. If it raises, the containers are read again, one by one.
         """
         values: list[object] = []
         for data in containers:

@@ -162,7 +162,7 @@ class LocalizationsInterpreter(PlainInterpreter):
     def _with_sigmas(
         self, found: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
-        """Return localizations with the errors of their poses, where these are numbers."""
+        """Return localizations with the errors of their poses, if these are numbers."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
         taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
@@ -218,7 +218,7 @@ class _Use(NamedTuple):
 
     Attributes:
         missing: defaults of the fields that the record lacks; they are put after its own fields.
-        pick: function that puts the values into the order of use; None if they are in it.
+        pick: function that puts the values into the order of use; None if they are in order.
         z: place of ``z``, which is rare; None without it.
         scales: factors that turn the values into SI; None if they are SI.
         checks: True if unused texts and bools have to be checked, too.

@@ -472,7 +472,7 @@ class _Parser:
         self._fail(f"expected {expected}, got {token}", token)
 
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
-        """Raise the error after a whole field: say what could have followed."""
+        """Raise the error after a whole field, naming the parts that could have followed."""
         here = self._peek()
         if here.kind == "name":
             self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)

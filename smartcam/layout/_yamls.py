@@ -46,7 +46,7 @@ class BadYamlError(ConfigurationError):
 def load(text: str, *, what: str = "YAML") -> Any:
     """Return the data of a document; None for an empty one.
 
-    ``what``: name of what needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
+    ``what``: the feature that needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
     exceeds a bound; MissingExtraError if PyYAML is not installed.
     """
     root = compose(text, what=what)
