@@ -105,7 +105,7 @@ class EmulatedCamera(WireCamera):
         name: the name in use.
         scenario: the scenario with all arguments merged into it.
         clock: clock that the camera runs by.
-        device: the camera behind the wire. Its operator's methods (``trigger()``,
+        device: the camera itself. Its operator's methods (``trigger()``,
             ``set_condition()``, ...) may be called at any time in the event loop's thread; the
             messages that they cause are sent. Its time is advanced at every action.
         seed: seed of all random numbers.
@@ -254,7 +254,7 @@ class EmulatedCamera(WireCamera):
         """Return the options for a camera whose application is active, and runs, from the start."""
         return {"active": active, "running": running}
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:

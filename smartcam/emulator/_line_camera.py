@@ -320,7 +320,7 @@ class LineCamera(WireCamera):
         client.answer(self.answer(line))
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Note a client's line as it came, before it is carried out; override to use it."""
+        """Receive a client's raw line, before it is carried out; override to use it."""
 
     def greet(self, client: LineClient) -> None:
         """Greet a client that has just connected; override to send something."""
@@ -337,7 +337,7 @@ class LineCamera(WireCamera):
         with self.step():
             heapq.heappush(self._agenda, (when, next(self._numbers), action))
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:

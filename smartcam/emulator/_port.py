@@ -74,7 +74,7 @@ class Port:
         self._close_socket()
 
     async def wait_closed(self) -> None:
-        """Wait until all of it is closed; call :meth:`shut` first."""
+        """Wait until the port and its connections are closed; call :meth:`shut` first."""
         opening, self._opening = self._opening, None
         if opening is not None:
             await asyncio.wait({opening})

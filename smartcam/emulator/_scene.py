@@ -47,7 +47,7 @@ PIECES: Mapping[str, TablePose] = {
     "square": TablePose(0.240, 0.065, 0.55),
     "parallelogram": TablePose(0.235, 0.185, -1.35),
 }
-"""The pieces and where they lie at first; no two touch, none reaches over the table's edge."""
+"""The pieces at their first poses; no two touch, none reaches over the table's edge."""
 
 _ARM = 0.02
 """Half the length of a piece, metres; pixel noise at this distance turns the piece."""

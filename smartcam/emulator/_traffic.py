@@ -60,7 +60,6 @@ class LogEntry(NamedTuple):
             message of a client as received.
         wire: the bytes that really passed, header included, as hex; empty for nothing. None: the
             bytes of the frame.
-            of the frame.
     """
 
     time: float

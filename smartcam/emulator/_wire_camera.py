@@ -106,7 +106,7 @@ class WireCamera(Server):
 
     Args:
         spoken: codec of the messages on the wire.
-        device: the camera behind the wire, whose operator's methods faults call.
+        device: the camera itself, whose operator's methods faults call.
         host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``.
@@ -129,7 +129,7 @@ class WireCamera(Server):
     """The options among ``scenario``, ``dialect``, ``transport``, ``seed``, ``web`` and ``replay``
     that the camera accepts."""
     device: Any
-    """The device behind the wire."""
+    """The camera itself, without the wire."""
     states: ClassVar[frozenset[DeviceState]] = frozenset()
     """The states that the camera can enter, for a timeline."""
 
@@ -215,7 +215,7 @@ class WireCamera(Server):
         """
         return {}
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     @abstractmethod
@@ -273,7 +273,7 @@ class WireCamera(Server):
             "endian": 0,
             "next_number": None,
             "queued_inputs": None,
-            "run_ends": "ResultContainer",  # message that tells a client so
+            "run_ends": "ResultContainer",  # message that reports it to a client
             "applications": [],
             "cells": {},
             "quirks": {},
@@ -340,7 +340,7 @@ class WireCamera(Server):
 
         Args:
             what: a message id, or a message type.
-            count: how many, including those before this call.
+            count: number of messages, including those before this call.
             timeout: seconds.
 
         Raises:
@@ -410,7 +410,7 @@ class WireCamera(Server):
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
         """Add faults after those that wait; faults that wait for no message happen now.
 
-        Call it in the event loop's thread. Before the emulator is started they wait until then.
+        Call it in the event loop's thread. Before the emulator's start they wait for it.
 
         Args:
             faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.

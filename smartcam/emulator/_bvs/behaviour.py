@@ -19,11 +19,11 @@ class Behaviour:
 
     coded: bool = False  # answers have a result code
     acknowledges: bool = False  # every request is answered with a result code
-    tells_bad_messages: bool = False  # also unknown and malformed requests are
+    tells_bad_messages: bool = False  # unknown and malformed requests, too
     answers_disconnect: bool = False  # Disconnect is answered, too
     runs_always: bool = False  # there is no run mode to enter or leave; not Ready is BUSY
     status_with_session: bool = True  # a status comes after Connect
-    reports_changes: bool = True  # a status comes with every change of it
+    reports_changes: bool = True  # every change of the status is reported
     sticky_errors: bool = False  # error bits stay until they are reset
 
     @property

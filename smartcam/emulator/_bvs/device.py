@@ -182,7 +182,7 @@ class Device:
         if running or behaviour.runs_always:
             self._enter_run_mode()
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def applications(self) -> Mapping[int, Application]:
@@ -372,7 +372,7 @@ class Device:
     def switch_application(self, application: int, *, running: bool = False) -> bool:
         """Load another application without the client's knowledge.
 
-        The application is stopped first, whatever the quirks say about a client's switch.
+        The application is stopped first, regardless of quirks of a client's switch.
 
         Args:
             application: id of the application to load.

@@ -83,8 +83,8 @@ class EmulatedInSight(LineCamera):
         options: options of :class:`~smartcam.emulator.LineCamera`.
 
     Attributes:
-        device: the camera behind the wire, to be read only; to make it act, use the methods
-            of the emulator.
+        device: the camera itself, to be read only; to make it act, use the emulator's
+            methods.
         refuse_login: refuse every user.
         silent: carry commands out, but send no answer.
 
@@ -165,7 +165,7 @@ class EmulatedInSight(LineCamera):
             encoding=words.ENCODING,
         )
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def application_ids(self) -> list[int]:
@@ -285,12 +285,12 @@ class EmulatedInSight(LineCamera):
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
         """Wait until clients have sent a command so many times since the beginning.
 
-        When it returns, the camera has begun to carry it out. The timeout runs in real time,
+        On return, the camera has begun to carry the command out. The timeout runs in real time,
         whatever the emulator's clock is.
 
         Args:
             command: the two letters of the command.
-            count: how many times, including those before this call.
+            count: number of times, including those before this call.
             timeout: seconds.
 
         Raises:

@@ -107,7 +107,7 @@ class InSightDevice:
             self.job = self.find(active)
         self._begin_job()
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def online(self) -> bool:
@@ -240,7 +240,7 @@ class InSightDevice:
             self.set_online(running)
         return True
 
-    # ------------------------------------------------------------------ what clients ask for
+    # ------------------------------------------------------------------ requests
 
     def request_online(self, online: bool) -> StatusCode:
         """Go online or offline for a client (``SO``)."""

@@ -51,12 +51,12 @@ class Scenario(EmulatorData):
     builtins: bool = Field(
         default=True, description="have the built-in applications, as far as their ids are free"
     )
-    quirks: Quirks = Field(default=Quirks(), description="what is unknown of real cameras")
+    quirks: Quirks = Field(default=Quirks(), description="unknown behaviour of real cameras")
     seed: int = Field(default=0, description="seed of all chance: the scene's noise, the timeline")
     timeline: tuple[Cue, ...] = Field(
         default=(),
         max_length=MAX_CUES,
-        description="what happens to the camera by itself, and when",
+        description="events of the camera, and their times",
     )
 
     options: dict[str, Any] = Field(
@@ -70,7 +70,7 @@ class Scenario(EmulatorData):
         try:
             known = load_protocol(info.data.get("protocol", BVS.name)).dialects
         except ConfigurationError:
-            return value  # the protocol is what is wrong
+            return value  # the protocol's own check reports it
         if value not in known:
             raise ValueError(f"unknown; known are {', '.join(known)}")
         return value

@@ -172,7 +172,7 @@ class Truncate(CameraWireFault):
 
 
 class Corrupt(WireFault):
-    """One byte of the message is changed; exactly one of ``xor`` and ``value`` says how."""
+    """One byte of the message is changed; exactly one of ``xor`` and ``value`` is given."""
 
     kind: Literal["corrupt"] = "corrupt"
     offset: int = Field(
@@ -473,7 +473,7 @@ class ClearFaults(DeviceFault):
     kind: Literal["clear_faults"] = "clear_faults"
 
 
-# ---------------------------------------------------------------------- any of them
+# ---------------------------------------------------------------------- all faults
 
 _OnMessage: TypeAlias = Delay | Split | Coalesce | Truncate | Corrupt | Drop | Duplicate | Insert
 _OnConnection: TypeAlias = HalfOpen | Reset | Close

@@ -97,7 +97,7 @@ class BaseFault(EmulatorData):
     sender: Literal["camera", "client"] | None = Field(
         default=None,
         description=(
-            "Who sends that message, where a message id or nothing stands in `on`. Default: the "
+            "Sender of that message, if a message id or nothing stands in `on`. Default: the "
             "camera for wire faults, the client for device faults."
         ),
     )
@@ -187,8 +187,8 @@ class EndingFault(WireFault):
     when: Literal["before", "after"] = Field(
         default="before",
         description=(
-            "`before`: in place of the message, which does not pass. `after`: right behind it; a "
-            "message of the client is then heard, and what the camera says to it at once goes out."
+            "`before`: in place of the message, which does not pass. `after`: right after it; a "
+            "message of the client is then received, and the camera's first answer is sent."
         ),
     )
 
@@ -203,6 +203,6 @@ class DeviceFault(BaseFault):
         default="before",
         description=(
             "Before the device handles the client's message, or after it did. On a message of the "
-            "camera: what the camera says because of the fault goes out before it, or behind it."
+            "camera: messages that the fault causes are sent before it, or after it."
         ),
     )

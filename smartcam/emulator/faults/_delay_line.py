@@ -103,7 +103,7 @@ class DelayLine(Generic[T]):
     wake: Callable[[], None]  # called when run() is due
     # gets passing transmissions and the bytes of each, for one write; it may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
-    end: Callable[[Ending], None]  # ends the connection as a transmission says
+    end: Callable[[Ending], None]  # ends the connection after a transmission
     lost: Callable[[T], None]  # called with each transmission that was dropped by close()
     turns: int = 0  # turns of the event loop that a pause of no time takes
 

@@ -115,7 +115,7 @@ class WireMessage(Transmission):
         return index, offset - (ends[index] - len(self.parts[index]))
 
     def drop(self) -> None:
-        """Let no byte of it pass; later faults do not act on it."""
+        """Drop all bytes of the message; later faults do not act on it."""
         self.parts.clear()
         self.pauses.clear()
         self.changeable = False
@@ -131,7 +131,7 @@ class WireMessage(Transmission):
         )
 
 
-# ---------------------------------------------------------------------- one for itself
+# ---------------------------------------------------------------------- single effects
 
 
 def _delay(fault: f.Delay, message: WireMessage) -> None:
