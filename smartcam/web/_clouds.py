@@ -2,7 +2,7 @@
 
 Each viewer has a WebSocket, with one cloud on the way at a time: when the page reports that it has
 shown the last cloud, the newest one is sent. A cloud is sent as it lies in memory, in parts, so
-that the event loop runs meanwhile. A large cloud is thinned for the page, which says so.
+that the event loop runs meanwhile. A large cloud is thinned for the page, with a note.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ class CloudViewer(PageSocket):
             self._site.viewers.discard(self)
 
     async def _show(self) -> None:
-        """Send the newest cloud, and wait until it is shown; TimeoutError: it is not shown."""
+        """Send the newest cloud, and wait until the page shows it; TimeoutError: too late."""
         number = 0
         while True:
             number, cloud = await self._site.newer(number)

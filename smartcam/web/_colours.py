@@ -242,7 +242,7 @@ class RangeBody(CallBody):
 
 
 class LookBody(CallBody):
-    """A picture is wanted."""
+    """The query of a picture."""
 
     viewer: _Viewer
     range: RangeBody
@@ -250,7 +250,7 @@ class LookBody(CallBody):
 
 
 class AroundBody(CallBody):
-    """The colours around a pixel of a picture are wanted."""
+    """The query of the colours around a pixel of a picture."""
 
     viewer: _Viewer
     sequence: int
@@ -275,7 +275,7 @@ def _source(site: ColourSite, _call: CallRequest) -> object:
     f"{API}/look",
     body=LookBody,
     sample='{"viewer": "me", "range": {"hue": [0, 179], "saturation": [0, 255], "value": [0, 60]}}',
-    about="The next frame as a JPEG and the mask of a range as a PNG, behind JSON with the regions;"
+    about="The next frame as a JPEG and the mask of a range as a PNG, after JSON with the regions;"
     ' `"again": true`: of the last frame that this viewer got. The device streams for it.',
 )
 async def _look(site: ColourSite, call: CallRequest) -> web.Response:

@@ -32,8 +32,8 @@ KEEP_ALIVE = 60.0
 """Seconds that a connection stays open without a request, or with an unread answer."""
 
 MAX_HEAD_BYTES = 1 << 15
-"""Largest number of bytes of a request's head: about four times what a browser with many cookies
-sends."""
+"""Largest number of bytes of a request's head: about four times that of a browser with many
+cookies."""
 
 _HEAD_END = b"\r\n\r\n"
 _BUSY = (

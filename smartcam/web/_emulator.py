@@ -142,7 +142,7 @@ class _PartPose(CallBody):
 
 
 class _Place(BaseModel):
-    """The place in the log where a query begins."""
+    """Place in the log at which a query begins."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
@@ -217,7 +217,7 @@ def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", _CAMERA)
 def _state(site: EmulatorSite, call: CallRequest) -> object:
-    """All that one camera's state is."""
+    """The whole state of one camera."""
     name = _name(site, call)
     emulator = site.cameras[name]
     return {
@@ -229,7 +229,7 @@ def _state(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/trigger")
 def _trigger(site: EmulatorSite, call: CallRequest) -> object:
-    """Trigger by the digital input; `taken` tells whether an inspection began."""
+    """Trigger by the digital input; `taken`: whether an inspection began."""
     taken = _operator(site, call, "trigger")()
     return {"taken": taken, "camera": _state(site, call)}
 
@@ -252,7 +252,7 @@ def _stop(site: EmulatorSite, call: CallRequest) -> object:
     "POST", f"{_CAMERA}/application", body=_ApplicationBody, sample='{"id": 7, "running": true}'
 )
 def _application(site: EmulatorSite, call: CallRequest) -> object:
-    """Load another application behind the client's back; 409 while one is loaded."""
+    """Load another application, like an operator; 409 while one is loaded."""
     switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
     if wanted.id not in emulator.application_ids:
@@ -268,7 +268,7 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
-    """Restart the camera, as by its power switch; without a body as the quirk says."""
+    """Restart the camera, as by its power switch; without a body, by the quirk's setting."""
     wanted: _RebootBody = call.body
     _operator(site, call, "reboot")(wanted.seconds)
     return {"camera": _state(site, call)}
@@ -309,7 +309,7 @@ def _faults(site: EmulatorSite, call: CallRequest) -> object:
     "POST", f"{_CAMERA}/faults", body=_FAULTS, sample='{"kind": "drop", "on": "ResultContainer"}'
 )
 def _inject(site: EmulatorSite, call: CallRequest) -> object:
-    """Inject a fault, or a list of them: all or, where one is wrong, none."""
+    """Inject a fault, or a list of them: all, or none if one is wrong."""
     _emulator(site, call).inject(*call.body)
     return _faults(site, call)
 
@@ -323,7 +323,7 @@ def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/commands/{{command}}")
 def _command(site: EmulatorSite, call: CallRequest) -> object:
-    """Let that row of the scenario's timeline happen."""
+    """Run that row of the scenario's timeline."""
     emulator, name = _emulator(site, call), call.path["command"]
     if name not in emulator.commands:
         known = ", ".join(emulator.commands) or "none: its scenario's timeline has no command"
@@ -370,7 +370,7 @@ def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/scene/reset")
 def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
-    """Put all parts back to where they lay at first."""
+    """Put all parts back to their first places."""
     pieces = _table(site, call).pieces
     pieces.clear()
     pieces.update(PIECES)

@@ -205,7 +205,7 @@ def _calls(_site: FleetSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/fleet")
 def _fleet(site: FleetSite, _call: CallRequest) -> object:
-    """The fleet: how many cameras are how, and the outcomes of the last ten minutes."""
+    """The fleet: numbers of cameras by state, and the outcomes of the last ten minutes."""
     about = {"fleet": site.fleet.url, "control": site.control, "agents": sorted(site.view.agents)}
     return {**about, "totals": site.view.totals(), "bars": list(site.view.series)}
 

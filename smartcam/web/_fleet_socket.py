@@ -116,7 +116,7 @@ class FleetSocket(PageSocket):
             await self._socket.send_str(text)
             await self._shown.wait()
 
-    # ------------------------------------------------------------------ what is new
+    # ------------------------------------------------------------------ changes
 
     async def _news(self) -> str:
         """Return a message with the changes since the last one; "" if there are none."""

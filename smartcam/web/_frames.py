@@ -159,7 +159,7 @@ def _calls(_site: FramesSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/sources")
 def _sources(site: FramesSite, _call: CallRequest) -> object:
-    """The sources, how each is and what was counted."""
+    """The sources, with their states and counts."""
     return {"sources": [site.pictures.state(place) for place in range(len(site.sources))]}
 
 
@@ -183,7 +183,7 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
     sample='{"name": "Gain", "value": 6.0}',
 )
 async def _set_feature(site: FramesSite, call: CallRequest) -> object:
-    """Set a feature, where the page may; answers the value that the device has then."""
+    """Set a feature, if the page may; answers the device's new value."""
     place = _changing(site, call)
     with _refused(site, place):
         return {"value": await site.sources[place].features[call.body.name].set(call.body.value)}
@@ -193,7 +193,7 @@ async def _set_feature(site: FramesSite, call: CallRequest) -> object:
     "POST", f"{API}/sources/{{place}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
 )
 async def _command(site: FramesSite, call: CallRequest) -> object:
-    """Execute a command, where the page may; answers when the device has done it."""
+    """Execute a command, if the page may; answers when the device has done it."""
     place = _changing(site, call)
     with _refused(site, place):
         await site.sources[place].features[call.body.name].execute()
@@ -202,7 +202,7 @@ async def _command(site: FramesSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
 async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
-    """Trigger the device, where the page may; answers the picture that this caused, as a JPEG."""
+    """Trigger the device, if the page may; answers the triggered picture as a JPEG."""
     place = _changing(site, call)
     with _refused(site, place):
         return await _as_jpeg(site, place, await site.sources[place].trigger())
@@ -219,7 +219,7 @@ async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
 @CALLS.add(
     "GET",
     f"{API}/sources/{{place}}/pictures",
-    about="A WebSocket: the newest frame after each `next` that one says, as a JPEG behind JSON.",
+    about="A WebSocket: the newest frame after each `next`, as a JPEG after JSON.",
 )
 async def _pictures(site: FramesSite, call: CallRequest) -> web.StreamResponse:
     return await site.pictures.view(_place(site, call), call.request)

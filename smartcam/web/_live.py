@@ -227,7 +227,7 @@ def _image(data: bytes) -> web.Response:
 
 @CALLS.add("POST", f"{API}/picture")
 def _want_picture(site: ShowsCamera, _call: CallRequest) -> object:
-    """Ask the camera for its picture anew, once a second at most; the events tell of it."""
+    """Ask the camera for its picture anew, once a second at most; an event reports it."""
     site.view.want_picture()
     return site.view.state()
 
@@ -257,7 +257,7 @@ def _events(site: ShowsCamera, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
 async def _trigger(site: ShowsCamera, call: CallRequest) -> object:
-    """Trigger; answers when the result is there, which the events tell."""
+    """Trigger; answers after the result, which an event reports."""
     body: _TriggerBody = call.body
     camera = site.view.camera
     result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
@@ -273,7 +273,7 @@ async def _switch(site: ShowsCamera, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/take_back")
 async def _take_back(site: ShowsCamera, _call: CallRequest) -> object:
-    """Have a fleet's agent take the camera back from another client."""
+    """Make a fleet's agent take the camera back from another client."""
     camera = site.view.camera
     take_back = getattr(camera, "take_back", None)
     if take_back is None:

@@ -71,7 +71,7 @@ class WatchedCamera:
         self.frames.start()
 
     async def stop(self) -> None:
-        """Stop following the camera; viewers are told that it ends."""
+        """Stop following the camera; viewers get a last event."""
         self.streams.close()
         await self.frames.stop()
         await self.view.stop()

@@ -46,7 +46,7 @@ class OperationsSite(Server):
 
     Args:
         server: the agent; may be started later.
-        listen: ``HOST:PORT``; None: as the agent's file says, by default ``127.0.0.1:9464``.
+        listen: ``HOST:PORT``; None: as in the agent's file, by default ``127.0.0.1:9464``.
             Port 0 takes a free one.
 
     Raises:

@@ -295,7 +295,7 @@ class Viewer(PageSocket):
     async def _send_picture(
         self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
     ) -> None:
-        """Send a picture after its JSON, and wait until it is shown; TimeoutError: it is not."""
+        """Send a picture after its JSON, and wait until it is shown; TimeoutError: too late."""
         head = json.dumps({"frame": frame, "account": account}).encode()
         self._shown.clear()
         async with asyncio.timeout(SLOW):

@@ -292,7 +292,7 @@ async def _shoot(site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/try", body=ToolsBody, sample=_SAMPLE)
 async def _try(site: TeachSite, call: CallRequest) -> object:
-    """Verdicts and values of the tools for every picture, and what the tools were taught."""
+    """Verdicts and values of the tools for every picture, and the tools' settings."""
     return await site.work(site.try_tools, call.body.tools)
 
 
@@ -300,7 +300,7 @@ async def _try(site: TeachSite, call: CallRequest) -> object:
     "POST", f"{API}/learn", body=LearnBody, sample=_SAMPLE.replace("}}}", '}}, "good": [1]}')
 )
 async def _learn(site: TeachSite, call: CallRequest) -> object:
-    """The tools with tolerances by which the good pictures are good, and what they follow from."""
+    """The tools with tolerances that all good pictures pass, and their reasons."""
     return await site.work(site.learn, call.body.tools, call.body.good)
 
 

@@ -156,22 +156,22 @@ def _calls(_site: WizardSite, _ask: CallRequest) -> object:
 
 @_call("GET", "/calibrations")
 def _state(service: CalibrationService, _body: object) -> object:
-    """Names of the calibrations and of the wizards, and the one that is under way."""
+    """Names of the calibrations and of the wizards, and of the running wizard."""
     return {"calibrations": service.names, "wizards": service.wizards, "name": service.name}
 
 
 @_call("GET", "/listing")
 async def _listing(service: CalibrationService, _body: object) -> object:
-    """A row for each calibration: of when it is, its error, its last check."""
+    """A row for each calibration: its date, its error, its last check."""
     return {"listing": await asyncio.to_thread(lambda: service.listing)}
 
 
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')
 def _start(service: CalibrationService, body: _StartBody) -> object:
-    """Start a wizard under a name, or go on with the one that was broken off; answers its step.
+    """Start a wizard under a name, or continue an interrupted one; answers its step.
 
     `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which look at
-    pictures. With `fresh` begin anew in any case. `resumed` says since when there is one, and its
+    pictures. `fresh` begins anew in any case. `resumed` has the date of a continued wizard, and its
     answers.
     """
     view = service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
@@ -180,13 +180,13 @@ def _start(service: CalibrationService, body: _StartBody) -> object:
 
 @_call("GET", "/step")
 def _step(service: CalibrationService, _body: object) -> object:
-    """The current step: what to show, and the JSON Schema of what is asked for."""
+    """The current step: the texts to show, and the JSON Schema of the answers."""
     return {**service.session.current, "resumed": service.session.resumed}
 
 
 @_call("POST", "/step", writes="journal", body=_Answers, sample='{"token": "...", "answers": {}}')
 def _submit(service: CalibrationService, body: _Answers) -> object:
-    """Answer the step of that token; answers the next one, or the same with `errors`.
+    """Answer the step of that token; returns the next step, or the same with `errors`.
 
     May be made again if its answer was lost.
     """
@@ -207,7 +207,7 @@ def _repeat(service: CalibrationService, body: _StepToken) -> object:
 
 @_call("POST", "/abort", writes="journal", body=_StepToken, sample='{"token": "..."}')
 def _abort(service: CalibrationService, body: _StepToken) -> object:
-    """End the wizard without a result; what was measured stays in the journal."""
+    """End the wizard without a result; the measurements stay in the journal."""
     return service.session.abort(body.token)
 
 
