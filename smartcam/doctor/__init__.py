@@ -170,8 +170,8 @@ async def examine(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield each finding at once.
 
-    Connecting may take the camera from another client: the first finding says so. Nothing is
-    started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
+    Connecting may take the camera from another client: the first finding reports it. Nothing is
+    started, stopped, switched or set, and nothing is triggered without ``trigger``.
 
     Args:
         url: the camera's address; for ``gige://HOST``, a source of frames, the network, the

@@ -53,7 +53,7 @@ class FoundPort:
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """The port's address in each protocol; if it was asked, in the one that it answered."""
+        """The port's address in each protocol; after an answer, in the answered protocol only."""
         if self.answer is not None:
             return (self.answer.url,)
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -175,7 +175,7 @@ def _may_be(protocol: Protocol, opened: Opened) -> bool:
     """Return True if a camera of the protocol may behave like this without a greeting."""
     if opened.received:
         return protocol.greeting is None
-    # an end that closes silently may serve as many clients as it accepts
+    # a device that closes silently may serve as many clients as it accepts
     return opened.ended or not protocol.greeting
 
 

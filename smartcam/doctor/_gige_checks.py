@@ -37,7 +37,7 @@ STANDARD_MTU: Final = 1500
 JUMBO_MTU: Final = 9000
 
 MAX_LINK_LOAD: Final = 0.9
-"""Part of a link's speed above which a stream loses packets, like the switches between."""
+"""Part of a link's speed above which a stream, or a switch between, loses packets."""
 
 SMALL_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer below which a busy machine loses packets of a large picture."""
@@ -107,7 +107,7 @@ async def examine_gige(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield each finding at once.
 
-    The camera is taken only if no other program has it, and streams as the URL says.
+    The camera is taken only if no other program has it, and streams by the URL's settings.
 
     Raises:
         ConfigurationError: the URL is wrong; nothing was tried.
@@ -194,7 +194,7 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
 
 
 async def _ask(exam: _GigEExamination) -> None:
-    """Ask the camera for something that it tells every program."""
+    """Ask the camera for a value that every program may read."""
     try:
         control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
     except FrameSourceError as exc:

@@ -201,7 +201,7 @@ def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: boo
 
 
 def _mapped(span: Span) -> Span:
-    """Return IPv4 addresses for those that are written as IPv6 addresses; others unchanged."""
+    """Return IPv4 addresses in place of those written as IPv6; others unchanged."""
     if span.first.version == 6 and span.first.number >> 32 == span.last.number >> 32 == 0xFFFF:
         first, last = (HostAddress(4, one.number & 0xFFFFFFFF) for one in span)
         return Span(first, last)

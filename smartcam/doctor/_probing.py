@@ -67,7 +67,7 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol is another one than the protocol of the given address.
+        other: whether the protocol differs from that of the given address.
     """
 
     address: Address
@@ -203,7 +203,7 @@ def _greets(protocol: Protocol, received: bytes) -> bool:
 async def locate(host: str, *, timeout: float) -> str:
     """Return the URL of the camera at a bare ``HOST[:PORT]``, in the protocol that it answers.
 
-    The session that showed it is over then. ``timeout``: seconds for all ways together.
+    The session for this is over then. ``timeout``: seconds for all ways together.
 
     Raises:
         ConnectFailedError: the camera answered no protocol; the error has the most telling try, and

@@ -258,7 +258,7 @@ that all lie within two millimetres, or are turned by less than six degrees, loo
 hint only asks."""
 
 NONSENSE = (1e-20, 1e20)
-"""Reals outside of these, except zero, are hardly measurements: they are bytes of other types."""
+"""Reals outside of these limits, except zero, are probably bytes of other types."""
 
 
 def _look_at_values(

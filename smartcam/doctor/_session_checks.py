@@ -74,7 +74,7 @@ async def resolve(exam: Examination) -> None:
 
 
 async def connect(exam: Examination) -> None:
-    """Check ``session``: make one, then some more for the spread of the connect time."""
+    """Check ``session``: make a session, then more for the spread of the connect time."""
     loop = asyncio.get_running_loop()
     pinned = exam.address.dialect is not None
     begin = loop.time()

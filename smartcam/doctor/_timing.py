@@ -18,7 +18,7 @@ class Figures(NamedTuple):
         times: number of times in the series.
         min: shortest time.
         median: median of the times.
-        p99: the 99th percentile by nearest rank: the longest where there are 100 or fewer.
+        p99: the 99th percentile by nearest rank: the longest of 100 or fewer.
         jitter: mean of the absolute differences of successive times; 0 for a single one.
     """
 

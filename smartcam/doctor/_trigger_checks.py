@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 async def look_at_application(exam: Examination) -> None:
-    """Check ``application``: whether the wanted one is active; load it for triggers only.
+    """Check ``application``: whether the expected one is active; load it for triggers only.
 
     The protocol cannot ask whether an application exists without loading it.
     """
