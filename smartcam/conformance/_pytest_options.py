@@ -16,7 +16,7 @@ PROPERTY = "smartcam-client-finding"
 CAMERA: Mapping[str, str] = {
     "--camera-url": (
         "the camera that smartcam.conformance.camera judges, such as bvs://192.168.0.10; "
-        "it is taken from whoever has it"
+        "it is taken from its client"
     ),
     "--camera-application": (
         "id of the application that may be started and triggered (default: the active one)"
@@ -25,16 +25,16 @@ CAMERA: Mapping[str, str] = {
         "id of another application, which may be loaded for a moment (default: none is)"
     ),
     "--camera-allow": (
-        "what may be done to the camera beside run, trigger and switch, which are put back: "
-        "clock, number, input, errors, reboot, all; 'nothing' takes the three away"
+        "changes of the camera that are allowed beside run, trigger and switch, all undone: "
+        "clock, number, input, errors, reboot, all; 'nothing' forbids the three"
     ),
     "--camera-timeout": "seconds that an answer, a status or a result may take (default 5)",
     "--camera-quiet": "seconds of silence that count as no answer (default 0.5)",
     "--camera-switch-timeout": "seconds that loading an application may take (default 30)",
     "--camera-reboot-timeout": "seconds that a restart may take (default 180)",
     "--camera-sequence-offset": (
-        "where in the application's results its sequence number (int32) stands, bytes "
-        "behind the application's id"
+        "offset of the sequence number (int32) in the application's results, bytes "
+        "after the application's id"
     ),
     "--camera-input": "input data that the application takes, as hex",
     "--camera-report": "file to write the report to, as JSON",

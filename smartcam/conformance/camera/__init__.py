@@ -1,4 +1,4 @@
-"""Judge whether a camera is a BVS camera, and how it behaves where the documents are silent.
+"""Judge whether a camera is a BVS camera, and observe behaviour without a document.
 
 On the command line, with the camera's address::
 

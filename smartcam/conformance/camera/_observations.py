@@ -1,4 +1,4 @@
-"""Observe once what several checks need: inspections, switches, a reboot.
+"""Observe events that several checks need: inspections, switches, a reboot.
 
 Each observation is made at most once for a camera, so that a part is not inspected twenty times.
 """

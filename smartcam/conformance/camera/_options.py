@@ -44,7 +44,7 @@ class Allow(enum.Flag):
     CLOCK = enum.auto()
     """Set the clock; restored to the second."""
     NUMBER = enum.auto()
-    """Set the number of the next run; it cannot be read, so it cannot be restored."""
+    """Set the number of the next run, which cannot be read, and so not be restored."""
     INPUT = enum.auto()
     """Send input data; the queue is left empty, or out of step until the application is loaded."""
     ERRORS = enum.auto()

@@ -73,7 +73,7 @@ class CameraUnderTest:
         self._allow = options.allow
         self._dirty = False
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def transport(self) -> str:
@@ -254,7 +254,7 @@ class CameraUnderTest:
         """Return the active application's id.
 
         Raises:
-            Differs: the camera does not tell it.
+            Differs: the camera does not answer with it.
         """
         answer = client.answer(m.Query())
         numbers = self.wire.numbers(answer.body)
@@ -378,7 +378,7 @@ class CameraUnderTest:
         """Restore the active application and whether it runs; never raises.
 
         Bounded: two sessions, in which each wait has its own limit. A state that cannot be restored
-        is named in :attr:`left`. With ``again`` it is tried also if it failed before.
+        is named in :attr:`left`. ``again``: try it even if it failed before.
         """
         before, why = self.before, ""
         if not self._dirty or before is None or (self.left and not again):

@@ -253,7 +253,7 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     documents=("C6",),
 )
 def sequence_number_is_set(camera: CameraUnderTest) -> None:
-    """Set sequence number is the number of the next run; the run behind has one more."""
+    """Set sequence number is the number of the next run; the next run has one more."""
     number = 0x01020304
     no_id(camera)  # raises if the number's place is unknown
     little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")

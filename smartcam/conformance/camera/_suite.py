@@ -133,7 +133,7 @@ class CameraConformance:
 
     @pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.name)
     def test_camera(self, camera_report: CameraReport, item: Item) -> None:
-        """The camera does what is documented; where nothing is, a quirk's setting describes it."""
+        """The camera follows the documents; without one, a quirk's setting describes it."""
         finding = judge_item(camera_report.camera, item)
         camera_report.add(finding)
         if finding.failed:

@@ -230,7 +230,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         expects="a container begins with the id of the application that made it",
         source="SC-B33, SC-C45, published",
     ),
-    # ------------------------------------------------------------------ whose result it is
+    # ------------------------------------------------------------------ owners of results
     ClientCheck(
         name="takes_no_earlier_result",
         scene=SCENES["inspection_under_way"],
@@ -254,7 +254,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         source="inferred",
         grade=Grade.SHOULD,
     ),
-    # ------------------------------------------------------------------ what never comes
+    # ------------------------------------------------------------------ missing answers
     ClientCheck(
         name="fails_where_triggers_are_dropped",
         scene=SCENES["overtriggered"],

@@ -83,7 +83,7 @@ def gives_results(run: ClientRun) -> str | None:
 
 
 def sends_whole_messages(run: ClientRun) -> str | None:
-    """Everything that the client says is a message of the dialect."""
+    """The client sends only messages of the dialect."""
     for _, one in run.requests:
         if one.error is not None and "came in state" in one.error:
             continue  # a message, at the wrong time
@@ -93,7 +93,7 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 
 
 def connects_first(run: ClientRun) -> str | None:
-    """The client says nothing but Connect, and Disconnect before it, until it is answered."""
+    """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
     answered: set[str] = set()
     for one in run.messages:
         if isinstance(one.message, m.ConnectAnswer):
@@ -122,7 +122,7 @@ def disconnects(run: ClientRun) -> str | None:
 
 
 def asks_one_at_a_time(run: ClientRun) -> str | None:
-    """The client has one request of a kind open at a time: answers do not say whose they are.
+    """The client has one request of a kind open at a time: answers do not name their request.
 
     A trigger may stand between two Queries, or two Get status: their answers come in order.
     """
@@ -142,7 +142,7 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
 
 
 def triggers_as_told(run: ClientRun) -> str | None:
-    """The client sends as many triggers as its task says."""
+    """The client sends the number of triggers in its task."""
     count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
     if count != run.scene.wanted:
         return f"it sent {count} triggers, {run.scene.wanted} were asked for"

@@ -38,7 +38,7 @@ class WireMessage(NamedTuple):
     message: Message | None  # decoded message; None for bytes that are no message of the dialect
     text: str  # the message with its fields, ``?`` for none
     hex: str  # the frame as it passed, or the bytes
-    error: str | None = None  # reason why the camera ignored it; None if it did not
+    error: str | None = None  # reason why the camera ignored it, if it did
     lost: bool = False  # whether the message was lost on the way
 
     def __str__(self) -> str:

@@ -40,7 +40,7 @@ SHOWN_LENGTH = 2000
 """Largest number of characters of a command's output that a report shows."""
 
 DYING = 2.0
-"""Seconds that a client has to end after it was told to."""
+"""Seconds that a client has for its end, after the request to end."""
 
 Verb = Literal["trigger", "switch", "watch"]
 
