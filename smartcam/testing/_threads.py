@@ -141,7 +141,7 @@ class ThreadedCamera(_InLoop):
     def __repr__(self) -> str:
         return f"<ThreadedCamera {self.name} {self.url}>"
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:
@@ -185,7 +185,7 @@ class ThreadedCamera(_InLoop):
 
     @property
     def device(self) -> Device:
-        """The camera behind the wire; its methods and properties work in any thread."""
+        """The camera itself; its methods and properties work in any thread."""
         return cast("Device", _InThread(self._thread, self._emulator.device))
 
     @property

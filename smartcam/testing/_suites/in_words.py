@@ -1,4 +1,4 @@
-"""Failures of the suites as text: a check's name and docstring say what was expected."""
+"""Failures of the suites as text: a check's name and docstring give the expectation."""
 
 from __future__ import annotations
 

@@ -141,14 +141,14 @@ class InterpreterSuite(SaysWhatWasExpected):
     # ------------------------------------------------------------------ values
 
     def test_value_is_as_expected(self, sample: ContainerSample) -> None:
-        """And so is the value of the same bytes that come a second time."""
+        """Check the value, and that the same bytes give it a second time."""
         interpreter = self.make(sample.layout)
         for _ in range(2):
             value = interpret(interpreter, sample.data)
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """Check that it is that of the layout's field, or None, or an error."""
+        """Check that the number is that of the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
         found = interpreter.sequence(reader)
@@ -162,7 +162,7 @@ class InterpreterSuite(SaysWhatWasExpected):
                 assert number is None or isinstance(number, int), f"{data!r}: number {number!r}"
 
     def test_value_is_the_same_each_time(self, sample: ContainerSample) -> None:
-        """Whatever came in between, and of a new interpreter too; values share nothing."""
+        """Check this after other containers, and with a new interpreter; values share nothing."""
         interpreter = self.make(sample.layout)
         first = interpret(interpreter, sample.data)
         between = [one for one in self.samples if one.layout == sample.layout]
@@ -176,7 +176,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert _same(other, first), f"first {first!r}, of another interpreter {other!r}"
 
     def test_nothing_is_kept(self, sample: ContainerSample) -> None:
-        """Neither bytes nor anything else; the bytes stay what they are."""
+        """Keeps neither bytes nor anything else; the bytes stay unchanged."""
         interpreter = self.make(sample.layout)
         outcome(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
@@ -191,7 +191,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert sys.getrefcount(data) <= before or len(data) < 2, "the container's bytes are kept"
 
     def test_value_can_be_written_as_json(self, sample: ContainerSample) -> None:
-        """``--json`` and monitoring tools write it."""
+        """Check the value's JSON, which ``--json`` and monitoring tools write."""
         value = interpret(self.make(sample.layout), sample.data)
         text = json.dumps(jsonable(value), allow_nan=False)
         nameless = _ADDRESS.search(text)
@@ -210,10 +210,10 @@ class InterpreterSuite(SaysWhatWasExpected):
         value = interpret(interpreter, big, byte_order="big")
         assert _like(value, sample.value), f"{big!r}: expected {sample.value!r}, got {value!r}"
 
-    # ------------------------------------------------------------------ what does not fit
+    # ------------------------------------------------------------------ bytes that do not fit
 
     def test_cut_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
-        """At each length: a value, or an InterpretationError that says what was expected."""
+        """Check each length: it gives a value, or an InterpretationError with the expectation."""
         interpreter = self.make(sample.layout)
         for data in (b"", *_cuts(sample.data)):
             see(interpreter, data)
@@ -239,7 +239,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         strategies.each_drawn(check)
 
     def test_poses_are_of_finite_numbers(self, sample: ContainerSample) -> None:
-        """NaN or infinity, wherever they come, are an error where a robot would move to them."""
+        """NaN or infinity at any place are an error if a robot would move to them."""
         interpreter = self.make(sample.layout)
         size = len(sample.data)
         for number in NOT_FINITE:
@@ -250,7 +250,7 @@ class InterpreterSuite(SaysWhatWasExpected):
                     see(interpreter, data, byte_order=order)
 
     def test_any_context_is_borne(self, sample: ContainerSample) -> None:
-        """Names, numbers and options of the client's."""
+        """Check unusual names, numbers and options of the client."""
         interpreter = self.make(sample.layout)
         for options in (
             {"camera": "é " * 100, "application": -1, "number": 1 << 40, "received_at": _AT},
@@ -260,7 +260,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             for data in (sample.data, sample.data[:-1], b"\x01" * len(sample.data)):
                 see(interpreter, data, **options)
 
-    # ------------------------------------------------------------------ what it says of itself
+    # ------------------------------------------------------------------ self-description
 
     def test_containers_of_a_burst_are_read_as_one_by_one(self, sample: ContainerSample) -> None:
         """Check that a PlainInterpreter's ``read_all`` and ``interpret`` do what ``read`` does."""
@@ -282,7 +282,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert context.empty_slots == empty, f"empty_slots: {context.empty_slots}, not {empty}"
 
     def test_layout_is_taken_or_refused(self, sample: ContainerSample) -> None:
-        """Whatever the user writes behind the name, or if nothing: a ConfigurationError at most."""
+        """Any text after the name, or none, raises a ConfigurationError at most."""
         for layout in (None, *LAYOUTS):
             try:
                 interpreter = self.make(layout)
@@ -292,7 +292,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             see(interpreter, sample.data)
 
     def test_entry_point_gives_the_interpreter(self, sample: ContainerSample) -> None:
-        """``interpret_as="name"`` finds it: the package is installed."""
+        """Check that ``interpret_as="name"`` finds the interpreter: its package is installed."""
         if not self.name:
             pytest.skip(f"{type(self).__name__}.name is empty: it has no entry point")
         try:

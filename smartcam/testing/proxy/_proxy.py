@@ -1,7 +1,7 @@
 """A proxy between a client and a camera that changes their bytes by rules.
 
-It knows no messages. Both sides are real sockets, so both see what a bad network would show
-them: segments, resets, silence, a full send buffer.
+It knows no messages. Both sides are real sockets, so both see the effects of a bad network:
+segments, resets, silence, a full send buffer.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class LinkProxy:
         """Return a camera's URL with the proxy's address in place of its own."""
         return urlunsplit(urlsplit(of)._replace(netloc=f"{self.host}:{self.port}"))
 
-    # ------------------------------------------------------------------ what happened
+    # ------------------------------------------------------------------ events
 
     @property
     def open_connections(self) -> int:

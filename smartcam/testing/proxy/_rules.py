@@ -7,11 +7,11 @@ one connection or for every one. On TCP there are two kinds of place:
   connection is made, a message's size right after its last byte.
 - A *range* begins with byte ``at``, counted from 0, and is ``count`` bytes long.
 
-Offsets count the sender's bytes, whatever other rules do to them. Rules at one place act in the
+Offsets count the sender's bytes, before the effects of other rules. Rules at one place act in the
 order of the list. On UDP a rule picks datagrams: one by its number, or each with a probability.
 
 The emulator's :mod:`~smartcam.emulator.faults` act on messages; rules know none. If a fault has
-the same verb, the rule's name says what it acts on.
+the same verb, the rule's name includes its object.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class ResetConnection(PointRule, name="reset"):
 
 @dataclass(frozen=True, kw_only=True)
 class Stall(PointRule):
-    """Keep both sides open and pass nothing any more, until the proxy is told to resume.
+    """Keep both sides open and pass nothing any more, until ``resume`` is called.
 
     Args:
         both: stop the other direction, too, like a dead peer. Ends of the stalled sides are not
@@ -299,7 +299,7 @@ class DatagramRule(Rule):
 
     Args:
         number: number of the datagram in its direction and connection, from 1; None lets the
-            the probability decide.
+            probability decide.
         probability: probability for each datagram, 0 to 1.
         seed: seed of the random numbers; the same seed picks the same datagrams.
     """

@@ -71,7 +71,7 @@ class ProxiedConnection(Proxied):
         self._loop.add_writer(self._target, self._connected)
         self._timer = self._loop.call_later(CONNECT_TIMEOUT, self._refused)
 
-    # ------------------------------------------------------------------ what happens to it
+    # ------------------------------------------------------------------ its end
 
     @property
     def settled(self) -> bool:

@@ -35,7 +35,7 @@ class LiveCamera:
     """An open camera, with ``COUNTER`` active and ready to run.
 
     A subclass has ``url`` and the actions that its camera supports. A check that needs an action
-    that the subclass leaves out is skipped, and says so.
+    that the subclass leaves out is reported as skipped.
     """
 
     @property
@@ -93,7 +93,7 @@ class CameraKind:
         foreign_request: an id of another kind than the protocol's.
         silent_request: id of a request that the camera leaves without an answer, None if there is
             none; unused if there are result codes.
-        datagrams: True if messages may be lost, and clients are not told that the camera is gone.
+        datagrams: True if messages may be lost, and no message reports that the camera is gone.
         exclusive: True if a second client takes the camera from the first.
         has_zero: True if an application may have the id 0.
     """

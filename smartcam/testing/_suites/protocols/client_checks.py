@@ -106,7 +106,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 async def refused(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
-    """Check that a call is unsupported, that the error says so, and that the session continues."""
+    """Check that a call is an UnsupportedError, and that the session continues."""
     dialect = re.escape(camera.capabilities.dialect)
     abilities = re.escape(", ".join(camera.capabilities.names))
     with pytest.raises(UnsupportedError, match=rf"dialect {dialect} .*{abilities}"):

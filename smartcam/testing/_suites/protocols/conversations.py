@@ -45,7 +45,7 @@ class Came(NamedTuple):
         data: the bytes.
         events: the machine's events for them: messages, and at the end possibly the type of the
             error that ends the link.
-        wire: bytes that the machine writes in reply by itself.
+        wire: bytes that the machine writes in reply, without a call.
     """
 
     data: bytes
@@ -101,7 +101,7 @@ def flat(events: Iterable[Event]) -> list[Any]:
 
 
 class Player:
-    """Runs a machine through a conversation, and checks that it follows it."""
+    """Runs a machine through a conversation, and checks each step."""
 
     def __init__(
         self, protocol: Protocol, conversation: Conversation, trace: Trace | None = None

@@ -59,7 +59,7 @@ class DialectChecks(Parameters):
     # ------------------------------------------------------------------ the protocol
 
     def test_protocol_describes_itself(self) -> None:
-        """Scheme, port, models and dialects are such that a URL can name them."""
+        """Check that a URL can name schemes, port, models and dialects."""
         protocol = self.protocol
         assert _is_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
         assert protocol.schemes, "schemes: expected at least one"
@@ -78,7 +78,7 @@ class DialectChecks(Parameters):
             assert _is_line(about), f"parameter {name!r}: expected a line that says what it is"
 
     def test_entry_point_gives_the_protocol(self) -> None:
-        """``connect()`` finds it: the package is installed and the names agree."""
+        """Check that ``connect()`` finds the protocol: it is installed, and the names agree."""
         name = self.protocol.name
         try:
             loaded = PROTOCOLS.load(name)
@@ -225,7 +225,7 @@ class DialectChecks(Parameters):
             assert isinstance(body, bytes), f"body({other}): expected bytes, got {body!r}"
 
     def test_unknown_quirk_is_a_mistake(self, dialect: Dialect) -> None:
-        """None is no change; one that nobody knows is a ConfigurationError."""
+        """Check that known quirks change nothing, and an unknown one is a ConfigurationError."""
         same = dialect.with_quirks(dialect.quirks)
         assert same.label == dialect.label, f"with its own quirks it is {same.label!r}"
         assert dialect.with_parameters({}).name == dialect.name

@@ -189,7 +189,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ requests
 
     def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
-        """Check that it is a LocalProtocolError; then the conversation goes as written."""
+        """Check that a request is a LocalProtocolError; then the conversation goes as written."""
         player = Player(self.protocol, conversation)
         dialect = player.machine.dialect
         for kind in REQUESTS:
@@ -198,7 +198,7 @@ class MachineChecks(Parameters):
         player.play()
 
     def test_disconnect_before_the_session_is_harmless(self, conversation: Conversation) -> None:
-        """Check Disconnect as the first word: it ends a session that a dead client left."""
+        """Check Disconnect as the first message: it ends a session that a dead client left."""
         player = Player(self.protocol, conversation)
         player.machine.send(m.Disconnect())
         player.written()
@@ -257,7 +257,7 @@ class MachineChecks(Parameters):
                         message = example(kind, machine.dialect)
                         see_refused(player, message, f"at step {place}, after Disconnect")
 
-    # ------------------------------------------------------------------ what it says of itself
+    # ------------------------------------------------------------------ self-description
 
     def test_machine_says_what_it_is(self, conversation: Conversation) -> None:
         """Check dialect, transport and state, which the client uses, and that lists are copies."""

@@ -214,7 +214,7 @@ class TriggerChecks(Parameters):
 
     @in_a_loop
     async def test_switch_to_id_0_is_refused(self, camera_kind: CameraKind) -> None:
-        """Check that the client refuses id 0 where none may have it, and else the camera."""
+        """Check that the client refuses id 0 if no application may have it, else the camera."""
         async with visiting(camera_kind) as (_, camera):
             if not camera.capabilities.switch:
                 return
@@ -243,7 +243,7 @@ class TriggerChecks(Parameters):
     async def test_next_result_is_the_next_one_whoever_triggers(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that it is, and that a wait for a result that does not come ends in time."""
+        """Check the next result, and that a wait without a result ends in time."""
         async with visiting(camera_kind) as (live, camera):
             waiting = asyncio.create_task(camera.next_result(timeout=SOON_TIMEOUT))
             await asyncio.sleep(0)
