@@ -49,7 +49,7 @@ class OwnContext(click.Context):
 
 
 class WithParts(click.Command):
-    """The default command, whose help also lists the other commands."""
+    """The default command; its help also lists the other commands."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, and the commands."""
@@ -59,7 +59,7 @@ class WithParts(click.Command):
 
 
 class WithFiles(ListedGroup):
-    """A group of commands with a default one, which takes arguments without a name."""
+    """A group of commands; arguments without a command go to the default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
@@ -111,13 +111,13 @@ def distance_option(function: Any) -> Any:
 
 
 @click.command(
-    help="Compare two calibrations of one lens, or of one pair: by how much they differ in where "
-    "they project, after the small motion of the camera that makes up for most, beside what the "
-    "noise of both leads to. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
+    help="Compare two calibrations of one lens, or of one pair: the difference of their "
+    "projections, after the small motion of the camera that cancels most of it, beside the effect "
+    "of noise. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
     "camera_info of ROS, camchains of Kalibr, files of OpenCV or of others whose format is known; "
-    "what noise leads to is known of calibrations of a lens alone. "
-    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also where "
-    "there is no verdict."
+    "the effect of noise is only known for calibrations of a lens. "
+    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also "
+    "without a verdict."
 )
 @click.argument("a", type=click.Path(dir_okay=False))
 @click.argument("b", type=click.Path(dir_okay=False))
@@ -174,8 +174,8 @@ async def compare(
 
 @click.command(
     help="Draw the calibration in a file as SVG: the errors of its views as bars (views), targets "
-    "and cameras in space (scene), how sure a lens is over its field (uncertainty), a plane with "
-    "its touches (plane)."
+    "and cameras in space (scene), a lens' uncertainty over its field (uncertainty), a "
+    "plane with its touches (plane)."
 )
 @click.argument("file", type=click.Path(dir_okay=False))
 @click.option(

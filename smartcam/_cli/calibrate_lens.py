@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
 
 MAX_STILL_MOTION_PX: Final = 1.0
-"""Pixels by which the points of a still target may move from one frame to the next."""
+"""Largest motion of the points of a still target between two frames, in pixels."""
 
 MIN_NEW_VIEW_SHARE: Final = 0.05
-"""Share of the image's width by which points must have moved, on average, for a new view."""
+"""Least mean motion of the points for a new view, as a share of the image's width."""
 
 MAX_VIEWS: Final = 200
 
@@ -36,13 +36,13 @@ MAX_DESCRIPTION_BYTES: Final = 65_536
 
 @dataclass(slots=True)
 class Collecting:
-    """Takes views of a target that is moved before a camera, whenever it is held still."""
+    """Collects views of a moved target, whenever it is held still."""
 
     views: list[TargetView] = field(default_factory=list["TargetView"])
     _last: TargetView | None = None
 
     def offer(self, view: TargetView) -> bool:
-        """Take a view if the target stands still at a place where it was not seen before."""
+        """Add a view if the target is still, and at a new place; return whether it was added."""
         last, self._last = self._last, view
         still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
         far = MIN_NEW_VIEW_SHARE * view.size[0]
@@ -74,9 +74,9 @@ def _output(_context: object, _option: object, file: str) -> str:
 
 
 @click.command(
-    help="Calibrate a lens from pictures of a printed target: of files, of a folder's files, or of "
-    "a source of frames (see smartcam frames). Of a source a view is taken whenever the target is "
-    "held still where it was not seen before, and what comes next is suggested; it ends after "
+    help="Calibrate a lens from pictures of a printed target: from files, from a folder, or from a "
+    "source of frames (see smartcam frames). A source's view is taken whenever the target is held "
+    "still at a new place, and the next place is suggested; the command ends after "
     "--count views, or with --seconds. Pictures without the target are named and left out."
 )
 @click.argument("pictures", metavar="FILE...|FOLDER|URL", nargs=-1, required=True)
@@ -115,7 +115,7 @@ def _output(_context: object, _option: object, file: str) -> str:
     type=click.IntRange(3, MAX_VIEWS),
     help="Number of views of a source.  [default: 15]",
 )
-@option("--seconds", help="Calibrate after so many seconds from the views of a source so far.")
+@option("--seconds", help="Calibrate after this time with the views so far.")
 @option("--timeout", help="Longest wait for a frame.  [default: 5]")
 @runs(*OUTPUT)
 async def lens(
@@ -153,7 +153,7 @@ async def lens(
 
 
 def read_target(path: str) -> Target:
-    """Return the target that a file describes; ConfigurationError: it does not."""
+    """Return the target that a file describes; ConfigurationError: a wrong file."""
     from smartcam.calibration import target_from_data
 
     try:
@@ -164,7 +164,7 @@ def read_target(path: str) -> Target:
     except (ValueError, RecursionError) as exc:
         raise ConfigurationError(f"--target {path}: not valid JSON: {exc}") from exc
     if not isinstance(data, dict):
-        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+        raise ConfigurationError(f"--target {path}: expected a file of smartcam sheet --describe")
     described: dict[str, Any] = data
     try:
         return target_from_data(described)
@@ -222,7 +222,7 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
 
 
 async def _from_source(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
-    """Return the views that are taken while the target is moved."""
+    """Return the views collected from a source while the target is moved."""
     from smartcam.calibration import find_target
     from smartcam.calibration._inside import LOOKS, suggestion
 
@@ -255,7 +255,7 @@ async def _from_source(source: FrameSource, target: Target, options: Options) ->
 
 
 def _report_once(error: CalibrationError, reported: set[str]) -> None:
-    """Report why frames give no view; raise an error that no frame can cure."""
+    """Report once why a frame gives no view; raise an error that no frame can cure."""
     from smartcam.geometry import Code
 
     if error.code == Code.SHAPE:

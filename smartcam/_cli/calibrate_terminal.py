@@ -101,7 +101,7 @@ def _done_text(done: Mapping[str, Any]) -> str:
 
 
 def _ago(at: str | None) -> str:
-    """Return a time and how long ago it was."""
+    """Return a time, and its age."""
     if at is None:
         return "at an unknown time"
     minutes = (datetime.now(UTC) - datetime.fromisoformat(at)).total_seconds() / 60

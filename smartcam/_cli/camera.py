@@ -125,8 +125,8 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
 
 
 @click.command(
-    help="Load another application by its id, or by the name of its file where the camera can do "
-    f"that; returns when the camera is ready. It runs if the one before ran. {CONNECTS}"
+    help="Load another application by its id, or by its file's name if the camera can do that; "
+    f"returns when the camera is ready. It runs if the previous one ran. {CONNECTS}"
 )
 @click.argument("url")
 @click.argument("id_or_file", metavar="ID|FILE", type=application)

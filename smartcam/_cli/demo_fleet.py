@@ -204,7 +204,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps
 
 
 async def _drain(events: Any) -> None:
-    """Take the events that are there already: agents and cameras of the beginning."""
+    """Read the waiting events: agents and cameras that were there at the start."""
     while events.statistics().queued:
         await anext(events)
 

@@ -274,7 +274,7 @@ class Placed(NamedTuple):
 
 
 class TableRobot:
-    """A robot beside a level table, whose place it does not know; a pallet stands beside it.
+    """A robot beside a level table at an unknown place, with a pallet.
 
     Args:
         table: the table.

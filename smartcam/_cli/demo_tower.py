@@ -63,7 +63,7 @@ MIN_FULLNESS: Final = 0.8
 """Least share of its rectangle that a block fills."""
 
 RIM: Final = 2
-"""Pixels at a region's rim, whose depth is a mixture."""
+"""Width of a region's rim, in pixels; depths there are mixed from two surfaces."""
 
 TOLERANCE: Final = (2e-3, math.radians(1.0), 1e-3)
 """Largest errors of a found block: metres in the plane, radians, and metres of height."""
@@ -146,8 +146,8 @@ class Seen(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
-    reached: list[BlockPose]  # blocks of these that the gripper can grip
-    block: BlockPose  # block that it takes
+    reached: list[BlockPose]  # those within reach of the gripper
+    block: BlockPose  # block to take
     top: BlockPose  # block on top of the tower
 
 

@@ -64,8 +64,8 @@ _UNIT = click.option(
 
 @depth.command(
     help="Serve a page that shows a cloud until Ctrl-C: turn it with mouse or finger, zoom with "
-    "wheel or two fingers. The page's address goes to stdout. Above a million points it is thinned "
-    'for the page, which says so. Needs the extra "web".'
+    "wheel or two fingers. The page's address goes to stdout. A cloud above a million points "
+    'is thinned for the page, with a note. Needs the extra "web".'
 )
 @click.argument("file")
 @click.option(

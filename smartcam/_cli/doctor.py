@@ -20,7 +20,7 @@ MAX_BROKEN = 4
 
 
 @click.command(
-    help="Say what is wrong, in plain words and with the cure: name, session, status, application, "
+    help="Report each problem with its cure, in plain words: name, session, status, application, "
     "round trip, run state, results, clock. Changes nothing on the camera and triggers nothing, "
     f"unless --trigger is given. Exit code: that of the worst finding. {CONNECTS}"
 )

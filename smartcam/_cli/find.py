@@ -45,9 +45,9 @@ _EVIDENCE = {
 
 
 @click.command(
-    help="Find what listens in networks where cameras do: opens the protocols' ports, sends "
-    "nothing, and tells what comes by itself. NETWORK: 192.168.0.0/24, 192.168.0.10-20, an "
-    "address, a host's name; several may be given. A camera that speaks UDP cannot be found so."
+    help="Find cameras in networks: opens the protocols' ports, sends nothing, and shows "
+    "greetings. NETWORK: 192.168.0.0/24, 192.168.0.10-20, an address, a host's name; several "
+    "may be given. Cameras that speak UDP are not found."
 )
 @click.argument("networks", metavar="NETWORK...", nargs=-1, required=True)
 @click.option(
@@ -204,7 +204,7 @@ def _ms(found: FoundPort) -> str:
 
 
 def evidence(found: FoundPort) -> str:
-    """Return a line about the end that answers, or may answer, at an open port."""
+    """Return a line about the device that answers, or may answer, at an open port."""
     if found.answer is not None:
         return f"a camera answers: {found.answer.url}"
     if found.evidence == "other":
@@ -229,7 +229,7 @@ def summary(search: CameraSearch) -> str:
 
 
 def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
-    """Return lines for a fleet file; ends that are no camera, or did not answer, are comments.
+    """Return lines for a fleet file; devices that are no camera, or did not answer, are comments.
 
     ``taken``: names that the fleet uses already.
     """

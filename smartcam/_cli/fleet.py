@@ -42,9 +42,9 @@ _READING = ("--interpret-as", "--y-down", "--calibration", "--units")
 @click.group(
     cls=ListedGroup,
     help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
-    "file: then agent and cameras are in this process, for this command only. PATTERN means "
-    "cameras by their names: * is one part of a name, ** any number of them; default all. Needs "
-    'the extra "fleet", but for a file.',
+    "file, whose agent and cameras then run in this process, for this command only. PATTERN "
+    "selects cameras by their names: * is one part of a name, ** any number of them; default "
+    'all. Needs the extra "fleet", but for a file.',
 )
 def fleet() -> None:
     """Register the commands of a fleet."""
@@ -167,9 +167,9 @@ def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result:
 
 
 @fleet.command(
-    help="Have the agents of a fleet read their fleet files again. Cameras that did not change go "
-    "on; a file that is wrong leaves all as it was. Prints what has changed, one line per agent. "
-    "Exit code: 0 if all did it, else that of the first error."
+    help="Have the agents of a fleet read their fleet files again. Unchanged cameras go on; a "
+    "wrong file changes nothing. Prints the changes, one line per agent. Exit code: 0 if all "
+    "agents succeed, else that of the first error."
 )
 @click.argument("url")
 @click.option("--agent", metavar="NAME", help="Only this agent.")
@@ -195,8 +195,8 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
 
 @fleet.command(
     help="Show the accounts of outlets: results = delivered + spooled + dropped. PLACE is a "
-    "fleet's URL, whose agents are asked, or a fleet file: then its spools are read, whether an "
-    "agent runs or not."
+    "fleet's URL, whose agents are asked, or a fleet file, whose spools are read, with or "
+    "without a running agent."
 )
 @click.argument("place", metavar="URL|FLEET.yaml")
 @runs("--timeout", *OUTPUT)
@@ -269,8 +269,8 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 
 @fleet.command(
     help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
-    "and a page for each. The page's address goes to stdout. A fleet of which no agent is there is "
-    'awaited. Needs the extra "web", too.'
+    "and a page for each. The page's address goes to stdout. A fleet without a running agent "
+    'is awaited. Needs the extra "web", too.'
 )
 @click.argument("url")
 @click.option(

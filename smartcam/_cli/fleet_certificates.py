@@ -28,10 +28,10 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
 @click.command(
     cls=JsonErrors,
     help="Make certificates for a fleet over TLS, each with a role: agents share cameras, viewers "
-    "look, operators command, too, and a router of Zenoh's passes on. DIR gets an authority the "
-    "first time, whose key stays there, and a folder for each name, with a text how to use it. "
-    "Run it again to add names, and to renew what ends within 30 days; all else stays as it is. "
-    'Needs the extra "fleet".',
+    "read, operators also command, and a router of Zenoh's forwards. DIR gets an authority "
+    "the first time, with its key, and a folder for each name, with instructions for its "
+    "use. Run it again to add names, and to renew certificates that end within 30 days; the "
+    'rest stays. Needs the extra "fleet".',
 )
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
 @_names("--agent", "agents", "An agent, by its name in fleet.yaml.")

@@ -26,7 +26,7 @@ LINGER: Final = 3.0
     help="Serve a page that picks a range of colours in a camera's live picture, until Ctrl-C: the "
     "picture beside the mask, sliders for hue, saturation and value, a click that takes a colour "
     "from the picture, and the range to copy. The page's address goes to stdout. The device "
-    'streams while somebody looks. Needs the extras "web" and "depth".'
+    'streams while the page is open. Needs the extras "web" and "depth".'
 )
 @click.argument("url")
 @click.option(

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     name="features",
     help="Read and set the features of a source's device: exposure time, gain, trigger and so on, "
     "by their names in GenICam's SFNC, of a GigE camera, a V4L2 device or a fleet's camera. "
-    "Without a name, all are listed with value, range and unit. NAME shows one, NAME=VALUE sets "
-    "it. They are done in their order; then come --load, --execute and --save.",
+    "Without a name, all are listed with value, range and unit. NAME shows one, NAME=VALUE "
+    "sets it, in the given order; then come --load, --execute and --save.",
 )
 @click.argument("url")
 @click.argument("features", nargs=-1, metavar="[NAME[=VALUE]]...")
@@ -62,9 +62,9 @@ async def features_command(
 @click.command(
     name="force-address",
     help="Give a GigE camera an IP address until it is switched off. MAC is its hardware address, "
-    "ADDRESS is like 192.168.0.20/24. It works where the camera's own address is of no network "
-    "here; `frames list` finds such a camera. Nobody may have the camera open. It asks before, "
-    "unless there is --yes.",
+    "ADDRESS is like 192.168.0.20/24. It also works if the camera's own address is outside "
+    "of all networks here; `frames list` finds such a camera. No program may have the camera "
+    "open. It asks first, unless there is --yes.",
 )
 @click.argument("mac")
 @click.argument("address")

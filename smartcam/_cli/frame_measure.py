@@ -72,7 +72,7 @@ class _Stamps:
     _task: asyncio.Task[None] | None = None
 
     def offer(self, frame: Frame, now: float) -> None:
-        """Look for the stamp of some of the frames; this one came at ``now``."""
+        """Look for the stamp of some frames; ``now``: arrival of this frame."""
         if now - self._last < STAMP_PERIOD or not (self._task is None or self._task.done()):
             return
         self._last = now

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource, RtpSender, RtspServer
 
 RTSP_USER = "smartcam"
-"""Name of the RTSP user where a password is set."""
+"""Name of the RTSP user, if a password is set."""
 
 MAX_NAME_LETTERS = 60
 """Largest number of letters of a source's name in a URL, before its number."""

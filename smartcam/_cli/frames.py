@@ -38,8 +38,8 @@ MAX_GRABBED = 100_000
     cls=ListedGroup,
     help="Pictures of any camera. URL is v4l2:///dev/video0, gige://HOST, rtsp://HOST/PATH, "
     "http://HOST/PATH, insight://HOST, synthetic:// (which needs no camera), or the path of a "
-    "video; ?format=YUYV&size=640x480&fps=30 and the like say how it is to stream. A device "
-    "streams while somebody reads.",
+    "video; ?format=YUYV&size=640x480&fps=30 and the like set the stream. A device streams "
+    "while there is a reader.",
 )
 def frames() -> None:
     """Register the commands of frames."""
@@ -58,7 +58,7 @@ frames.add_command(force_address_command)
 @frames.command(
     name="list",
     help="List the devices that are found on this machine and its network: the URL that opens "
-    "each, its formats, and what keeps it from being opened.",
+    "each, its formats, and the reason why it cannot be opened.",
 )
 @click.option("--scheme", metavar="SCHEME", help="Only search for this scheme, such as v4l2.")
 @option("--timeout", help="Longest time of the search.  [default: 5]")
@@ -160,10 +160,10 @@ def _suffix(_context: object, _option: object, file: str) -> str:
 
 
 @frames.command(
-    help="Write the newest frame to a file, or several. What the file is, its suffix says: .png "
-    "and .jxl (JPEG XL) lose nothing, with 16 bits where the camera sends more than 8; .jpg; .npy "
-    "(the array of numpy) and .raw have the pixels as the camera sends them. A camera that sends "
-    'JPEGs has them written as they come. Needs the extra "frames", but for .npy and .raw.'
+    help="Write the newest frame to a file, or several. The suffix sets the format: .png and .jxl "
+    "(JPEG XL) lose nothing, with 16 bits if the camera sends more than 8; .jpg; .npy (the "
+    "array of numpy) and .raw have the pixels as the camera sends them. JPEGs of a camera "
+    'are written unchanged. Needs the extra "frames", but for .npy and .raw.'
 )
 @click.argument("url")
 @option("--output", required=True, callback=_suffix)
@@ -290,10 +290,10 @@ def _write(file: str, data: bytes) -> None:
 
 @frames.command(
     name="measure",
-    help="Read a source for some seconds and tell its rate and jitter, the age of a frame when it "
-    "is here, what was lost and skipped, and this process' part of a core. The latency is that of "
-    "pictures with a stamp, as synthetic:// draws it, seen by any camera or through any codec; "
-    "the clock must be this machine's.",
+    help="Read a source for some seconds and report its rate and jitter, the age of arriving "
+    "frames, lost and skipped frames, and this process' part of a core. The latency is that "
+    "of pictures with a stamp, as synthetic:// draws it, seen by any camera or through any "
+    "codec; the clock must be this machine's.",
 )
 @click.argument("url")
 @option("--seconds", default=5.0, show_default=True, help="Seconds from the first frame on.")

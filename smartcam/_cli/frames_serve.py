@@ -81,9 +81,9 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
 
 @click.command(
     help=f"Serve pictures of one source, or of up to {MAX_SHOWN}, until Ctrl-C or SIGTERM: a page "
-    "with all of them side by side, and for players and recorders RTSP or RTP. What is served "
-    "goes to stdout, who looks, on a terminal, to stderr. A device streams while somebody looks; "
-    'one that is not there is awaited, and the others go on. Needs the extras "web" and "frames", '
+    "with all of them side by side, and for players and recorders RTSP or RTP. The addresses "
+    "go to stdout, the readers, on a terminal, to stderr. A device streams while it has readers; "
+    'a missing device is awaited, and the others go on. Needs the extras "web" and "frames", '
     'for RTSP and RTP "video".'
 )
 @click.option(
@@ -129,9 +129,9 @@ async def serve(
 
 @click.command(
     help=f"Show one source, or up to {MAX_SHOWN} side by side, on a page until Ctrl-C: the newest "
-    "frame of each, its age, rates, what was skipped and lost. It is serve, with nothing but the "
-    "page: its address goes to stdout. A device streams while somebody looks; one that is not "
-    'there is awaited, and the page says so. Needs the extras "web" and "frames".'
+    "frame of each, its age, rates, skipped and lost frames. It is serve, with only the page: its "
+    "address goes to stdout. A device streams while the page is open; a missing device is "
+    'awaited, and the page shows that. Needs the extras "web" and "frames".'
 )
 @_serves(terminated=143)
 async def show(

@@ -65,9 +65,9 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @click.command(
     help="Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C. A "
-    "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each answer. "
-    "CAMERA is a URL, or a YAML file that says all that the options say. --demo has an emulated "
-    f'camera behind it. Needs the extra "calibration". {CONNECTS}'
+    "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each "
+    "answer. CAMERA is a URL, or a YAML file with all the options. --demo uses an emulated "
+    f'camera. Needs the extra "calibration". {CONNECTS}'
 )
 @click.argument("camera", metavar="[URL|FILE.yaml]", required=False)
 @click.option("--demo", is_flag=True, help="Use an emulated camera instead of CAMERA.")

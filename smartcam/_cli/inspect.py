@@ -28,10 +28,10 @@ PAGE: Final = "index.html"
 
 
 @click.command(
-    help="Try an application of a software camera on pictures in files, and draw what it saw. CELL "
-    "is a cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
-    "PICTURES files, or folders of them. Prints the results; with --output, draws what the tools "
-    "saw."
+    help="Try an application of a software camera on pictures, and draw its findings. CELL is a "
+    "cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
+    "PICTURES files, or folders of them. Prints the results; --output also draws the tools' "
+    "findings."
 )
 @click.argument("cell")
 @click.argument("camera")

@@ -29,8 +29,8 @@ DIALECTS = ("handbook", "thesis", "b16", "bid")
 F = TypeVar("F", bound="Callable[..., Any]")
 
 CONNECTS = (
-    "Connecting takes the camera from another client, where it serves one: the newcomer wins. One "
-    "of a fleet is shared."
+    "Connecting takes the camera from another client, if it serves one: the newcomer wins. A "
+    "camera of a fleet is shared."
 )
 
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 @click.command(
     help="Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C. "
-    "What a far end does not take waits in a spool beside the file, also for the next start. The "
-    "file has the section outlets: of a fleet file. Prints a line when an outlet has trouble, and "
-    f"the accounts at the end. {CONNECTS}"
+    "Undelivered results wait in a spool beside the file, also for the next start. The file "
+    "has the section outlets: of a fleet file. Prints a line for each trouble, "
+    f"and the accounts at the end. {CONNECTS}"
 )
 @click.argument("url")
 @click.argument("file", metavar="FILE.yaml")

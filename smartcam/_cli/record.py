@@ -61,9 +61,9 @@ _camera = click.option(
 
 @click.command(
     help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
-    "frames, results, events, errors; of a fleet's camera no frames, and the results of every "
-    "program's triggers. With --bag also, or only, as a rosbag2 for ROS 2. A lost link is made "
-    "again, and the recording goes on. "
+    "frames, results, events, errors; of a fleet's camera no frames, and the results of "
+    "every program's triggers. --bag writes a rosbag2 for ROS 2, too, or instead. After a "
+    "lost link the recording goes on. "
     f"{CONNECTS}"
 )
 @click.argument("url")
@@ -81,9 +81,9 @@ _camera = click.option(
 @click.option(
     "--pictures",
     metavar="judged|none|SOURCE",
-    help="judged: of each result the picture that it was made of, of software cameras (as usual) "
-    "and of a fleet's cameras with frames. none: no pictures. SOURCE: beside the results those of "
-    "a source of frames, such as gige://HOST.",
+    help="judged: each result's own picture, for software cameras (the default) and a fleet's "
+    "cameras with frames. none: no pictures. SOURCE: also the pictures of a source of "
+    "frames, such as gige://HOST.",
 )
 @click.option(
     "--read-images",
@@ -314,7 +314,7 @@ async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str)
 
 
 async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: int) -> None:
-    """Record a result's picture; after another trigger it would be a wrong one."""
+    """Record a result's picture, before another trigger replaces the picture."""
     try:
         image = await camera.read_image()
     except CommandRejectedError:  # it has none, as the recorded frames show
@@ -401,11 +401,11 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 
 @click.command(
     help="Emulate the recorded cameras: each trigger gets the recorded containers, byte for byte "
-    "and after the same time, and what came by itself comes again. Prints one line per camera, its "
-    "URL. When a recording is over its triggers get no result, unless --loop. A folder that an "
-    "agent recorded (record: in its fleet file) is played as a fleet: its cameras under their "
-    "names, through an agent, whose fleet URLs are printed; --port is the agent's then. A TIME is "
-    "2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
+    "and after the same time, and unasked messages come again. Prints one line per camera, "
+    "its URL. After the end of a recording triggers get no result, unless --loop. A folder "
+    "that an agent recorded (record: in its fleet file) is played as a fleet: its cameras "
+    "under their names, through an agent, with their fleet URLs; --port is the agent's then. "
+    "A TIME is 2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
 )
 @click.argument("recording", metavar="RUN.mcap|FOLDER", type=click.Path())
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
@@ -518,8 +518,8 @@ async def pcap(
 
 @click.command(
     help="Make a rosbag2 of a recording: an MCAP file with ROS 2 messages in a folder, in the "
-    "recorded order and with the recorded times. Values are as recorded; with --interpret-as or "
-    "--calibration each result's bytes are read again, and those that do not fit go in with why."
+    "recorded order and with the recorded times. Values are as recorded; --interpret-as or "
+    "--calibration interprets each result's bytes again, and keeps the errors."
 )
 @click.argument("recording", metavar="RUN.mcap", type=click.Path())
 @click.option(

@@ -35,11 +35,11 @@ def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
 
 
 @click.command(
-    help="Show the results in a store: those of a shift, those that failed. PLACE is the file that "
-    "an outlet of the kind sqlite writes, or a fleet's URL: then the fleet's agents are asked what "
-    "their stores have. The oldest result comes first. With --failed those that did not pass, by "
-    "the names of their truth values, with errors and gaps. The last line of a store counts all of "
-    "the time."
+    help="Show the results in a store: those of a shift, those that failed. PLACE is the file of "
+    "an outlet of the kind sqlite, or a fleet's URL, whose agents then show their stores. "
+    "The oldest result comes first. --failed shows the results that did not pass, by the "
+    "names of their truth values, with errors and gaps. The last line of a store counts all "
+    "of the time."
 )
 @click.argument("place", metavar="FILE|URL")
 @click.option("--since", metavar="AGE|TIME", callback=_since, help="8h, 30min, 2d, or a time.")

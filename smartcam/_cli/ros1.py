@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    help="Have cameras seen in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
-    'services that "smartcam ros2" has, without what ROS 1 has not. A fleet file is served as by '
-    '"smartcam serve", and a fleet\'s URL, fleet://HOST, means the cameras of a fleet that is '
-    "served already. Prints one line per camera, its node. A bridge that is not there, or is lost, "
-    "is tried on, which is told on stderr, with --json on stdout, by the same object again. Needs "
-    'the extras "ros2" and "web", and no ROS on this machine.'
+    help="Show cameras in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
+    'services of "smartcam ros2", without those that ROS 1 cannot have. A fleet file is '
+    'served as by "smartcam serve"; a fleet\'s URL, fleet://HOST, means the cameras of a '
+    "running fleet. Prints one line per camera, with its node. A missing or lost bridge is "
+    "tried again, which is reported on stderr, with --json as the same object on stdout. "
+    'Needs the extras "ros2" and "web", and no ROS on this machine.'
 )
 @click.argument("place", metavar="FLEET")
 @click.option(

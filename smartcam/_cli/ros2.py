@@ -35,13 +35,12 @@ class RosCommand(click.Command):
 
 @click.command(
     cls=RosCommand,
-    help="Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C or "
-    "SIGTERM; with --rmw native through the rclpy that is installed, over any middleware, and what "
-    "follows --ros-args is ROS' then. "
-    'A fleet file is served as by "smartcam serve", and a fleet\'s URL, fleet://HOST, '
-    "means the cameras of a fleet that is served already. Prints one line per camera, its node. "
-    'What "ros2" in a fleet file says counts where an option says nothing. Needs the extra "ros2", '
-    "and no ROS but for --rmw native.",
+    help="Show cameras in ROS 2, as nodes for programs that use rmw_zenoh, until Ctrl-C or "
+    "SIGTERM; with --rmw native through the installed rclpy, over any middleware, and "
+    'options after --ros-args are those of ROS then. A fleet file is served as by "smartcam '
+    "serve\"; a fleet's URL, fleet://HOST, means the cameras of a running fleet. Prints one "
+    'line per camera, with its node. Options win over "ros2" in a fleet file. Needs the '
+    'extra "ros2", and ROS only for --rmw native.',
 )
 @click.argument("place", metavar="FLEET")
 @click.option(

@@ -98,7 +98,7 @@ def run(
     if debug:
         logging.basicConfig(level=logging.DEBUG, stream=sys.stderr)
     else:
-        # without a handler Python prints warnings by itself, beside our one line
+        # without a handler Python would print warnings beside our one line
         logging.getLogger("smartcam").addHandler(logging.NullHandler())
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a camera's texts may have letters that the terminal's encoding lacks
@@ -160,7 +160,7 @@ def _one_line(error: Exception) -> str:
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
     """Let the first SIGINT or SIGTERM cancel ``main``; a second one ends the program as usual.
 
-    The handlers are set here and not left to asyncio, which sets none where SIGINT was ignored at
+    The handlers are set here and not left to asyncio, which sets none if SIGINT was ignored at
     the start, as it is for a job in a shell script's background.
     """
     loop = asyncio.get_running_loop()

@@ -34,12 +34,12 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
 
 
 @click.command(
-    help="Have the sessions with the cameras of a fleet file, and share them with any number of "
-    "programs, until Ctrl-C or SIGTERM. Prints one line per camera, its fleet URL, which every "
-    "command takes that takes a camera's. A camera that is not there says so on its line, and is "
-    "tried on; what comes and goes later is told on stderr, with --json on stdout, by the same "
-    "object again. SIGHUP has the file read again, but where stdin is a terminal. Needs the extra "
-    '"fleet"; with operations: in the file "operations", too.'
+    help="Connect to the cameras of a fleet file, and share them with any number of programs, "
+    "until Ctrl-C or SIGTERM. Prints one line per camera, with its fleet URL, which every "
+    "command accepts as a camera. A missing camera has the reason on its line, and is tried "
+    "again. Later changes are reported on stderr, with --json as the same object on stdout. "
+    'SIGHUP reads the file again, unless stdin is a terminal. Needs the extra "fleet"; with '
+    'operations: in the file "operations", too.'
 )
 @click.argument("file", required=False, metavar="FLEET.yaml")
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of fleet files, and end.")
@@ -184,7 +184,7 @@ class Serving:
 
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
-        """Serve health and metrics while the block runs, if the file says so."""
+        """Serve health and metrics while the block runs, if the file has ``operations``."""
         section = self._server.file.operations
         if section is None or section.place is None:
             yield

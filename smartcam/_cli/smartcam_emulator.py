@@ -254,7 +254,7 @@ def _scenarios(
 
 
 def _plain(protocol: str, *, shown: bool) -> Scenario:
-    """Return a camera without a scenario; with a page, one that has results to show."""
+    """Return a camera without a scenario; with a page, an application runs on it."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
