@@ -98,7 +98,7 @@ class GatewaySettings(BaseModel):
         description="address that robots connect to, tcp/HOST:PORT; port 0 takes a free one",
     )
     robot: Literal["plain", "ur", "kuka", "fanuc", "siemens"] = Field(
-        default="plain", description="the make of the controller, which says what is not said below"
+        default="plain", description="make of the controller, with defaults of other options"
     )
     form: Literal["text", "brackets", "xml"] | None = Field(
         default=None,
@@ -106,18 +106,18 @@ class GatewaySettings(BaseModel):
         "socket_read_ascii_float; xml: for EthernetKRL",
     )
     pose: Literal["ur", "abb", "kuka", "fanuc", "meca500"] | None = Field(
-        default=None, description="convention of poses: which numbers say how a part is turned"
+        default=None, description="convention of poses: the numbers for a part's orientation"
     )
     length: Literal["m", "mm"] | None = Field(default=None, description="unit of lengths")
     angle: Literal["rad", "deg"] | None = Field(default=None, description="unit of angles")
     decimals: Annotated[int, Field(ge=0, le=9)] | None = Field(
-        default=None, description="digits behind the decimal point"
+        default=None, description="digits after the decimal point"
     )
     separator: Annotated[str, AfterValidator(_separator)] | None = Field(
-        default=None, description="between two values of a text"
+        default=None, description="text between two values"
     )
     line_end: Literal["lf", "crlf", "cr", "none"] | None = Field(
-        default=None, description="behind each answer; a request may end with any of them"
+        default=None, description="end of each answer; a request may end with any of them"
     )
     width: Annotated[int, Field(ge=0, le=1000)] | None = Field(
         default=None, description="bytes of each answer, filled with blanks; 0: as many as it needs"
