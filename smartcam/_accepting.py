@@ -13,8 +13,8 @@ deadlines.
 - Some file descriptors of the process are left to others. If only those are left, the connection
   without a session for longest, of any server on this event loop, is closed.
 
-Connections are not accepted by ``asyncio.Server``. A connection that it has accepted but not yet
-wrapped when it is closed stays open until the garbage collector finds it, and a client would wait
+Connections are not accepted by ``asyncio.Server``. A connection that the server has accepted, but
+not yet wrapped at its end, stays open until the garbage collector finds it, and a client would wait
 forever. And if no file descriptor is left, it writes a traceback for each place of its backlog,
 every second.
 """
@@ -41,8 +41,8 @@ if sys.platform != "win32":
     import resource
 
 ACCEPT_PAUSE = 1.0
-"""Seconds until the next attempt if the system has no socket left, and no connection can make
-room."""
+"""Seconds until the next attempt if the system has no socket left, and no connection can be
+closed."""
 
 BACKLOG: Final = 128
 """Number of connections that the system may queue before they are accepted."""
@@ -129,9 +129,7 @@ class Places(Generic[G]):
         self.most = most
         self.crowded_out = 0
         self._within, self._what, self._own = within, what, own
-        self._places: dict[
-            G, _TakenPlace
-        ] = {}  # the one without a session for longest stands first
+        self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
         return len(self._places)
@@ -178,7 +176,7 @@ class Places(Generic[G]):
             self._places[occupant] = place
 
     def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
-        """Set within how many seconds a connection must have a session; None: no limit.
+        """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
@@ -204,7 +202,7 @@ class Places(Generic[G]):
             self._send_away(found[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """End connections whose time is over; for one with a session the time begins again."""
+        """End connections whose time is over; a connection with a session gets new time."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
@@ -235,8 +233,8 @@ _here = _OnThisThread()
 class Acceptor(Generic[G]):
     """Gives each connection on a listening socket a protocol, which takes a place.
 
-    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when that is
-    lost.
+    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when it
+    is lost.
 
     Args:
         make: function that returns a new protocol. One made after :meth:`close` is for a connection
@@ -323,7 +321,7 @@ class Acceptor(Generic[G]):
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
     def expect(self, occupant: G, within: float | None, what: str) -> None:
-        """Set within how many seconds a connection must have a session; None: no limit.
+        """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
@@ -428,7 +426,7 @@ class Acceptor(Generic[G]):
         self._scarce = False
         connection.setblocking(False)
         with contextlib.suppress(OSError):  # the connection is gone again
-            # asyncio does so only where the listening socket was made with the protocol's number
+            # asyncio does so only if the listening socket was made with the protocol's number
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.adopt(connection)
 

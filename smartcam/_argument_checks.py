@@ -79,7 +79,7 @@ def a_finite_number(value: Any, what: str, who: str) -> Any:
 
 
 def an_integer(value: Any, what: str, who: str) -> Any:
-    """Return a plain integer of at most 64 bits, whichever it is; ``bool`` is not one."""
+    """Return a plain integer of at most 64 bits; ``bool`` is not one."""
     number = plain(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number

@@ -2,10 +2,10 @@
 
 Each function returns the plain value, and only that value is used: an ``int`` or ``str`` of a
 subclass may compare, hash and print as it likes. A value that cannot work is a
-:exc:`~smartcam.ConfigurationError` that says which argument it is, what was expected, and what
-came. Nothing is searched, sent or waited for.
+:exc:`~smartcam.ConfigurationError` that names the argument, the expected value, and the given
+value. Nothing is searched, sent or waited for.
 
-``who`` names whose argument it is, such as a camera; "" if the argument's name says it all.
+``who`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_SECONDS = 1e9
 """Seconds that a time may have at most, about 31 years: more would overflow a loop's timer."""
 
 MAX_TEXT_LENGTH = 10_000
-"""Largest number of characters that a text may have, where no smaller bound is given."""
+"""Largest number of characters that a text may have, if no smaller bound is given."""
 
 MAX_DATA_BYTES = 1 << 30
 """Largest number of bytes that a byte string may have; the largest payload that a client may

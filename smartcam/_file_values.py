@@ -36,7 +36,7 @@ _PATTERN = re.compile(r"[a-z0-9_*-]+(?:/[a-z0-9_*-]+)*", re.ASCII)
 
 
 def _amount(units: Mapping[str, int], least: float, most: float, example: str) -> Any:
-    """Return the validator of a number with a unit, in any case of letters, or without a unit."""
+    """Return a validator of numbers, with or without a unit, in upper or lower case."""
     known = {unit.lower(): factor for unit, factor in units.items()}
     text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
 

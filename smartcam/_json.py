@@ -1,6 +1,6 @@
-"""Values as JSON's text: that of ``json.dumps(jsonable(value))`` without white space, but faster.
+"""Write values as JSON, like ``json.dumps(jsonable(value))`` without white space, but faster.
 
-Values of types that a client does not make go through :func:`smartcam.models.jsonable`.
+Values of other types than the client's go through :func:`smartcam.models.jsonable`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 MIN_HEX_CHARACTERS = 1024
-"""Least number of characters of a text that is first tested for being only hex. Hex needs no
-quoting, which takes most of the time of a large container."""
+"""Least number of characters of a text that may be hex. Hex needs no quoting, which takes most of
+the time of a large container."""
 
 NULL = "null"
 
@@ -33,10 +33,10 @@ _FORMS = {"i": "%d", "u": "%d", "f": "%r", "S": "%s"}
 """Forms of the values in a table's columns, by the columns' kinds."""
 
 MAX_FLOAT_BYTES = 8
-"""Bytes of a float that numpy gives as one of Python's."""
+"""Largest size of numpy's floats that become Python's floats, in bytes."""
 
 _COLUMNS = frozenset("iufbS")
-"""Kinds of a table's columns whose values numpy gives as Python's."""
+"""Kinds of a table's columns whose values become Python's own."""
 
 _quoted: Callable[[str], str] = encode_basestring_ascii
 _encode = json.JSONEncoder(separators=(",", ":")).encode
@@ -75,7 +75,7 @@ def text_of(value: object) -> str:
 
 
 _latest: list[tuple[datetime, str]] = [(_EPOCH, f'"{_EPOCH.isoformat()}"')]
-"""The time that was written last, and its text: a result and its parts have the same one."""
+"""The time written last, and its text, since a result and its parts share a time."""
 
 
 def _time_text(at: datetime) -> str:
@@ -110,7 +110,7 @@ def _container_text(value: object) -> str:
             return text
     try:
         return _encode_finite(plain(value))
-    except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not
+    except (TypeError, ValueError):  # NaN, infinity, or a type of numpy
         return _encode(jsonable(value))
 
 

@@ -1,6 +1,6 @@
 """Lock open files; the system releases a lock when its process ends, however it ends.
 
-They hold among processes and among open files of one process.
+A lock excludes other processes, and other open files of the same process.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 CALL_TIMEOUT = 10.0
-"""Seconds for a call into the thread that has no deadline of its own. A call normally takes well
+"""Seconds for a call into the thread without its own deadline. A call normally takes well
 under a millisecond; a longer one means that a function in the thread does not return, such as a
 generator of an application."""
 
@@ -98,7 +98,7 @@ class _Mailbox:
 class _ThreadCall:
     """A call into the thread: begun there, awaited in another.
 
-    A lock and one wake-up each way: half of what ``asyncio.run_coroutine_threadsafe`` takes.
+    A lock and one wake-up each way: half as many as ``asyncio.run_coroutine_threadsafe`` takes.
     """
 
     __slots__ = (
@@ -129,7 +129,7 @@ class _ThreadCall:
         """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
 
         Args:
-            timeout: seconds; None if what is called has deadlines of its own.
+            timeout: seconds; None if the called function has its own deadlines.
         """
         try:
             self._mailbox.post(self._begin)
@@ -276,7 +276,7 @@ class LoopThread:
         return self._thread is not None and threading.get_ident() == self._thread.ident
 
     def forked(self) -> None:
-        """Note that this process is a fork of the one that has the thread, if there is one."""
+        """Note that this process is a fork; the thread, if any, belongs to its parent."""
         self._forked = self._thread is not None
 
     def call(
@@ -299,7 +299,7 @@ class LoopThread:
         return cast("T", self._call(function, timeout))
 
     def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in the thread and return what it returns; errors as of :meth:`call`."""
+        """Call a function in the thread and return its value; errors as of :meth:`call`."""
         return cast("T", self._call(lambda: function(*args, **kwargs), CALL_TIMEOUT))
 
     def _call(self, function: Callable[[], object], timeout: float | None) -> Any:

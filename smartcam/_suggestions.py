@@ -1,4 +1,4 @@
-"""Suggest the known word that was probably meant by an unknown one."""
+"""Suggest a known word in place of an unknown one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_KNOWN_WORDS = 10_000
 """Largest number of known words that are compared; a file or a camera may list many more."""
 
 MAX_PARTS = 8
-"""Largest number of parts of a word that are compared each for itself; what follows them counts as
+"""Largest number of parts of a word that are compared separately; the rest of the word counts as
 unexplained."""
 
 MAX_CANDIDATES = 20
@@ -31,8 +31,7 @@ LETTERS_PER_EDIT = 3
 """Letters of a word for each edit that is allowed: one edit in three letters, two in six."""
 
 MIN_PREFIX_LETTERS = 3
-"""Least number of letters of a part that may stand for a longer one which begins with it, as
-``int`` does."""
+"""Least number of letters of a part that may abbreviate a longer one, as ``int`` does."""
 
 MIN_EXPLAINED_SHARE = 0.6
 """Share of a word's letters that the parts of a known one have to explain."""
@@ -50,7 +49,7 @@ MAX_NAMED_WORDS = 30
 def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | None = None) -> str:
     """Return the end of an error text, with the known word that is closest; empty if none is.
 
-    ``meant``: known words by other names for them, such as ``float`` for ``real32``.
+    ``meant``: known words by their other names, such as ``float`` for ``real32``.
     """
     found = (meant or {}).get(word) or closest(word, known)
     return f"; did you mean {found!r}?" if found else ""
@@ -77,7 +76,7 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
 
 
 def hint(item: ErrorDetails, known: Iterable[str]) -> str:
-    """Return an end for pydantic's error that names the field or word that was meant; "" for none.
+    """Return an end of pydantic's error with the field or word probably meant; "" for none.
 
     ``known``: names of the fields, for an error about an unknown field.
     """
@@ -104,7 +103,7 @@ def _quoted(text: str) -> list[str]:
 
 
 def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
-    """Return the known words that a few edits make of a word, with their scores."""
+    """Return the known words that are a few edits away, with their scores."""
     by_fold: dict[str, str] = {}
     for one in known:
         by_fold.setdefault(one.lower(), one)

@@ -43,8 +43,8 @@ _threads: dict[str, LoopThread] = {}  # at most one
 def _started_thread() -> LoopThread:
     """Return the thread of all cameras; the first camera starts it.
 
-    Each process has one thread; a fork has its own. No lock is held, since a fork might inherit
-    it: of two threads that are started at once one is ended again.
+    Each process has one thread; a fork has its own. No lock is held, since a fork
+    might inherit it. If two threads are started at once, one of them is ended again.
     """
     known = _threads.get(_NAME)
     if known is not None and known.running:
@@ -164,7 +164,7 @@ class SyncCameraBase(Generic[ValueT]):
     def _wait(
         self, function: Callable[P, Coroutine[Any, Any, T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Run a coroutine in the event loop; it has deadlines of its own."""
+        """Run a coroutine, which has its own deadlines, in the event loop."""
         if _in_event_loop() and not self._thread.inside:
             raise LocalProtocolError(
                 f"{self.name}: smartcam.sync would hold up the event loop that runs here; "
@@ -173,7 +173,7 @@ class SyncCameraBase(Generic[ValueT]):
         return self._thread.call(lambda: function(*args, **kwargs))
 
     def _do(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in the event loop that does not wait."""
+        """Call a function, which does not wait, in the event loop."""
         return self._thread.run(function, *args, **kwargs)
 
     def _subscribed(
@@ -208,7 +208,7 @@ class _Inside(Generic[T]):
     """A context that is entered and left in the loop's thread.
 
     Attributes:
-        entered: whether the object was entered, and leaving it has not begun.
+        entered: True from entering the context until leaving begins.
     """
 
     def __init__(self, context: contextlib.AbstractAsyncContextManager[T]) -> None:
@@ -246,7 +246,7 @@ class SyncSubscription(Generic[ItemT]):
     """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
 
     As :class:`smartcam.streams.Subscription`: it subscribes when it is made, and its account always
-    balances. One thread takes each item.
+    balances. Each item goes to one thread.
     """
 
     def __init__(
@@ -269,7 +269,7 @@ class SyncSubscription(Generic[ItemT]):
         return self._thread.run(self._subscription.statistics)
 
     def close(self) -> None:
-        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        """Unsubscribe; queued items count as dropped. Idempotent."""
         self._thread.run(self._subscription.close)
 
     def get(self, timeout: float) -> ItemT:
@@ -346,7 +346,7 @@ class SyncFrameReaderBase:
 
     Args:
         reader: asynchronous reader that this class wraps.
-        camera: camera that the frames are of.
+        camera: camera of the frames.
     """
 
     def __init__(self, reader: FrameReader, camera: SyncCameraBase[Any]) -> None:

@@ -1,4 +1,4 @@
-"""The thesis' five calibration services: what a request may say, and what is done for it.
+"""The thesis' five calibration services: their requests, and the work for each.
 
 They have the same faces as the six camera services, see :mod:`smartcam._thesis`. The work is done
 by :class:`~smartcam.calibration.wizards._thesis.ThesisCalibration`, one object for each camera,
@@ -56,7 +56,7 @@ class StartRequest(ThesisRequest):
 
 
 class PerformRequest(ThesisRequest):
-    """The answers of a step, or what is done instead of answering."""
+    """The answers of a step, or the action instead of answering."""
 
     repeat_last_step: bool = False
     abort: bool = False
@@ -90,7 +90,7 @@ class RequestHeader(BaseModel):
 
     @property
     def utc(self) -> float | None:
-        """The time in seconds since 1970; None if the header says none.
+        """The time in seconds since 1970; None if the header has none.
 
         Raises:
             ConfigurationError: the stamp is no time.
@@ -109,7 +109,7 @@ class RequestHeader(BaseModel):
 
 
 class TransformRequest(ThesisRequest):
-    """The camera's view, and the frame that the robot's pose is wanted in."""
+    """The camera's view, and the frame for the robot's pose."""
 
     header: RequestHeader = RequestHeader()
     x: _Coordinate
@@ -136,7 +136,7 @@ class CalibrationFace(Protocol):
 
 
 class CalibrationCall(NamedTuple):
-    """A service under way.
+    """A running call of a service.
 
     Attributes:
         face: the camera.
@@ -219,7 +219,7 @@ async def _transform(call: CalibrationCall) -> dict[str, Any]:
 
 
 def own_localizations(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
-    """Return the specification that a camera's localizations are read by, and their unit.
+    """Return the specification for reading a camera's localizations, and their unit.
 
     Args:
         reading: interpretation of the camera's results; None if their contents are not known.

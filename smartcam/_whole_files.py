@@ -108,7 +108,7 @@ def _open_lock(folder: Path) -> int:
 
 
 def _replace(path: Path, body: bytes, backups: int) -> None:
-    """Replace a file; where there are no locks, another one may be at the backups, too."""
+    """Replace a file; without locks, another process may change the backups, too."""
     temporary = _temporary(path, body)
     try:
         if backups > 0:
@@ -131,7 +131,7 @@ def _clear(path: Path) -> None:
 
 
 def _temporary(path: Path, body: bytes) -> Path:
-    """Write a file beside another one, to take its place."""
+    """Write a file beside the path, which will replace the old file."""
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:

@@ -177,7 +177,7 @@ class BusLink:
 
 
 def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
-    """Return endpoints to listen on, with a free port where one has port 0."""
+    """Return endpoints to listen on, with a free port in place of port 0."""
     return tuple(
         f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
         for one in endpoints
@@ -589,7 +589,7 @@ class ZenohSession:
 
 
 class _LoopBell:
-    """Wakes an event loop from any thread; for less than its own ``call_soon_threadsafe``.
+    """Wakes an event loop from any thread; cheaper than its own ``call_soon_threadsafe``.
 
     Args:
         loop: the loop.
@@ -628,7 +628,7 @@ class _LoopBell:
 
 
 class ZenohDeclared:
-    """Something that is declared at the engine until it is closed, or its session is.
+    """A declaration at the engine, until this object or its session is closed.
 
     Args:
         end: the session.
@@ -646,7 +646,7 @@ class ZenohDeclared:
         self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
-        """Declare what ``how`` makes of the engine's session."""
+        """Declare the object that ``how`` makes with the engine's session."""
         self._how = how
         self._it = self._end.declare(self, how)
         return self
@@ -657,7 +657,7 @@ class ZenohDeclared:
         return self
 
     def lose(self) -> Any:
-        """Prepare for the end of the session; return what is to be kept until then."""
+        """Prepare for the end of the session; return the object to keep until then."""
         it, self._it = self._it, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)

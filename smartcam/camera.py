@@ -1,6 +1,6 @@
 """The camera as the user sees it, whether at the wire or in a fleet.
 
-:class:`Camera` says what every camera does. :class:`~smartcam.SmartCamera` does it with a session
+:class:`Camera` has the methods of every camera. :class:`~smartcam.SmartCamera` has a session
 of its own.
 """
 
@@ -129,7 +129,7 @@ class StreamRequest(NamedTuple):
 class Camera(abc.ABC, Generic[ValueT]):
     """A camera, wherever it is; made by :func:`smartcam.connect`.
 
-    It outlives its links: a lost link is made again as ``reconnect`` says. Until then every
+    It outlives its links: a lost link is replaced by the rules of ``reconnect``. Until then every
     method that talks to the camera raises :exc:`~smartcam.ConnectionLostError` at once,
     with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
     ``close()`` the error is :exc:`~smartcam.ConnectionClosedError`.
@@ -154,7 +154,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     def _require_session(self) -> object:
-        """Raise the error that says why there is no session, if there is none."""
+        """Raise the reason why there is no session, if there is none."""
 
     @abc.abstractmethod
     def _deadline(self, timeout: float) -> float:
@@ -249,7 +249,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name} {self.url}>"
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ state
 
     @property
     def name(self) -> str:
@@ -359,7 +359,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
             max_queue_bytes: largest number of bytes of their containers together (``Result.raw``;
                 values may be larger). A larger single container is kept if the queue is empty.
-            overflow: what happens when either limit is reached.
+            overflow: consequence of reaching either limit.
         """
         check_flag(batch, "batch", self.name)
         kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
@@ -575,7 +575,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         is sent before the trigger: containers that arrive before its answer are older. An
         earlier trigger that was given up is settled first: its result is awaited a moment, or
         prevented (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
-        ``@sequence`` a late result can pass for the next trigger's: nothing on the wire tells.
+        ``@sequence`` a late result can pass for the next trigger's: the wire does not show it.
 
         Args:
             application: id, or name in ``application_names``, of the application to run for this
@@ -646,7 +646,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             application: id of the application, its name in ``application_names``, or the name of
-                its file where the camera can load by that.
+                its file if the camera can load by that.
             timeout: seconds for the whole; default ``switch_timeout``.
 
         Raises:
@@ -678,7 +678,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the id of an application's name; anything else as it is.
 
         Args:
-            application: what the user gave.
+            application: the user's value.
             file: whether an unknown name may be the name of a file.
 
         Raises:
@@ -798,7 +798,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         skipped and lost frames. The device streams while there is a reader, and the bus carries
         one frame at a time for each reader.
 
-        Only a camera of a fleet has frames, if its entry in the fleet file says ``frames``.
+        Only a camera of a fleet has frames, if its entry in the fleet file has ``frames``.
 
         Args:
             encoding: ``raw``, as the device gives them; ``jpeg``; or ``png`` and ``jpegxl``,
@@ -991,7 +991,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Send input data for the next inspection; only result codes confirm it.
 
         ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
-        inspections; the Input Container bit says when they are out of step.
+        inspections; the Input Container bit shows that they are out of step.
         """
         await self._set_input(check_bytes(data, "data", self.name))
 
@@ -1040,10 +1040,10 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Send any message; for requests that have no method here.
 
         Args:
-            message_id: id of the message; a command's text where the protocol has commands.
+            message_id: id of the message; a command's text if the protocol has commands.
             payload: body of the message.
-            answered: whether to wait for an answer under the same id; by default what the message
-                table says, True for an unknown id.
+            answered: whether to wait for an answer under the same id; default: as in the
+                message table, True for an unknown id.
             timeout: seconds for the answer.
 
         Returns:
@@ -1107,7 +1107,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         return self.settings.address
 
     def _read_by(self, spec: object) -> None:
-        """Read results by ``spec`` from now on; None: as the settings say.
+        """Read results by ``spec`` from now on; None: by the settings.
 
         Every user of this object gets results that are read so.
 

@@ -91,7 +91,7 @@ def connect(
             pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
             ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
             (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
-            are inspected in this process, as a cell file says (:mod:`smartcam.inspection`).
+            are inspected in this process, by a cell file (:mod:`smartcam.inspection`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
         observers: objects that see frames, events, results and errors:
             :class:`~smartcam.Observer`.

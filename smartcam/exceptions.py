@@ -1,19 +1,19 @@
-"""Every error smartcam raises.
+"""Every error that smartcam raises.
 
 ::
 
     SmartCamError
-    ├── ConfigurationError (ValueError)        what the user gave cannot work
+    ├── ConfigurationError (ValueError)        a value of the user cannot work
     │   ├── LayoutError                        a layout text, with the position of the mistake
     │   ├── PluginError                        a plug-in: unknown, twice there, failed to load
     │   └── MissingExtraError                  an optional part is not installed
     ├── LinkError (ConnectionError)            host, port
-    │   ├── ConnectFailedError                 no session; each attempt and what came
+    │   ├── ConnectFailedError                 no session; the attempts and outcomes
     │   ├── ConnectionLostError                the session ended by itself
     │   ├── ConnectionTakenError               another client took the camera
     │   └── ConnectionClosedError              closed by us
     ├── ResponseTimeoutError (TimeoutError)    a wait in a session ran out
-    ├── CommandRejectedError                   the camera said no; what is active now
+    ├── CommandRejectedError                   the camera refused; the active application
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── NotAllowedError (PermissionError)      the role of this program's certificate forbids it
     ├── ReservationLostError               the camera was not this program's alone all the time
@@ -47,8 +47,8 @@
     └── InterpretationError (ValueError)       field, offset, expected, got; the link stays up
         └── WrongApplicationError              the result is another application's: both ids
 
-All of them survive ``pickle``. Texts say what was tried, what came and what was expected; at most
-64 bytes of a peer's data stand in one.
+All of them survive ``pickle``. Texts name the attempt, the received value and the expected one; at
+most 64 bytes of a peer's data stand in a text.
 """
 
 from __future__ import annotations
@@ -128,10 +128,10 @@ def _cut(text: object) -> object:
 class SmartCamError(Exception):
     """Root of all errors of this library.
 
-    Attributes of the subclasses are keyword arguments with defaults, which is what lets
-    ``pickle`` rebuild them from the text and then restore the attributes.
+    Attributes of the subclasses are keyword arguments with defaults, so that ``pickle``
+    can rebuild them from the text and then restore the attributes.
 
-    A text has :data:`MAX_TEXT_CHARACTERS` characters at most; what is longer is cut in its middle.
+    A text has :data:`MAX_TEXT_CHARACTERS` characters at most; longer ones are cut in the middle.
     """
 
     def __init__(self, *args: object) -> None:
@@ -290,7 +290,7 @@ class CalibrationError(SmartCamError, ValueError):
     """Samples, or a calibration, from which no meaningful number can be computed.
 
     Attributes:
-        code: what is wrong, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
+        code: kind of the mistake, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
         expected: what was expected.
         got: what came.
     """
@@ -319,7 +319,7 @@ class FrameSourceError(SmartCamError, OSError):
 
 
 class FrameFormatError(FrameSourceError):
-    """A source has no such pixels, or bytes are no picture of the format that they should have."""
+    """A source has no such pixels, or bytes are no picture of their format."""
 
 
 class FrameFeatureError(FrameSourceError):
@@ -352,7 +352,7 @@ class EntryRefusedError(OutletError):
     """The far end of an outlet will never take one of the entries.
 
     Attributes:
-        place: place of the entry in what was delivered; the entries before it were taken.
+        place: place of the entry among those delivered; the entries before it were taken.
     """
 
     def __init__(self, message: str = "", *, place: int = 0) -> None:
@@ -363,7 +363,7 @@ class EntryRefusedError(OutletError):
 class RecordingError(SmartCamError, OSError):
     """A recording could not be written, or could not be read.
 
-    A full or slow disk ends a recording; what was written before stays and can be read. A file that
+    A full or slow disk ends a recording; the part written before stays and can be read. A file that
     would unpack to more than any recording is not read.
     """
 
@@ -393,7 +393,7 @@ class ServiceTimeoutError(ServiceCallError, TimeoutError):
 
 
 class SubscriberOverflowError(SmartCamError):
-    """A stream with ``overflow="error"`` was full; items after what was queued are lost."""
+    """A stream with ``overflow="error"`` was full; items after the queued ones are lost."""
 
 
 class TriggerError(SmartCamError):
@@ -401,7 +401,7 @@ class TriggerError(SmartCamError):
 
 
 class OvertriggeredError(TriggerError):
-    """The camera dropped a trigger, perhaps another client's: the camera does not say which."""
+    """The camera dropped a trigger, perhaps another client's: the camera does not name it."""
 
 
 class NotRunningError(TriggerError):
@@ -491,7 +491,7 @@ class InterpretationError(SmartCamError, ValueError):
 
 
 class WrongApplicationError(InterpretationError):
-    """A result came from another application than the one it was expected from.
+    """A result came from another application than expected.
 
     ``expected`` and ``got`` are the two application ids.
     """

@@ -1,8 +1,8 @@
-"""Public values: what the camera says and what comes of it.
+"""Public values: the camera's data, and the values made of them.
 
-They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable where many
+They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable if many
 readers share them, and turned to JSON by :func:`jsonable` with their field names.
-Lengths are metres, angles radians, times seconds unless a name says otherwise.
+Lengths are metres, angles radians, times seconds unless a name has another unit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, c
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    # with a default, so that a bare Result or SmartCamera stays what it always was
+    # with a default, so that a bare Result or SmartCamera keeps its meaning
     from typing_extensions import TypeVar
 
     ValueT = TypeVar("ValueT", default=Any)
@@ -126,7 +126,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 
 def as_status(word: int) -> Status:
-    """Return the status of a word; for the receiving path, where ``Status(word)`` is slow."""
+    """Return the status of a word; for the receiving path, since ``Status(word)`` is slow."""
     known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
@@ -192,10 +192,10 @@ class Header(NamedTuple):
 
 
 class PoseSigma(NamedTuple):
-    """The errors that a pose may have: what a robot may expect of it, as standard deviations.
+    """The errors that a robot may expect of a pose, as standard deviations.
 
     Attributes:
-        x: along the frame's x axis, metres; pixels where the position is in pixels.
+        x: along the frame's x axis, metres; pixels if the position is in pixels.
         y: along the frame's y axis, in the unit of ``x``.
         theta: error of the rotation about the pose's z axis, radians.
         correlation_xy: correlation of the errors of x and y, -1 to 1.
@@ -249,7 +249,7 @@ class Pose(NamedTuple):
 
 
 class _EstimatedPose(Pose):
-    """A pose whose errors are known; what is made of it by ``_replace`` has none."""
+    """A pose whose errors are known; a pose made of it by ``_replace`` has none."""
 
     @property
     def sigma(self) -> PoseSigma | None:
@@ -317,8 +317,7 @@ class Result(NamedTuple, Generic[ValueT]):
         application: id of the application that made it.
         sequence: value of the layout's ``@sequence`` field, None without one.
         number: the client's own count of containers, from 1.
-        triggered_at: when the trigger was sent, UTC; None for a result nobody had triggered.
-        triggered_at: when the trigger was sent, UTC; None for a result without a trigger of ours.
+        triggered_at: when the trigger was sent, UTC; None without a trigger of this client.
         received_at: when its last byte arrived, UTC.
         latency: seconds from trigger to arrival (monotonic clock); None without a trigger.
         raw: the container's bytes after the application id.
@@ -360,10 +359,10 @@ class Capabilities:
         load_file: load an application by the name of its file.
         start_stop: enter and leave run mode; otherwise the camera always runs.
         reboot: restart.
-        get_clock: tell the time.
-        set_clock: have the clock set.
+        get_clock: return the camera's time.
+        set_clock: set the camera's clock.
         input_data: take input data for an inspection.
-        sequence_number: have the number of the next run set.
+        sequence_number: set the number of the next run.
         result_codes: commands are acknowledged, or refused with a code.
         status_by_itself: the status comes with the session and at every change.
         get_status: the status can be asked for.
@@ -396,7 +395,7 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraEvent:
-    """Something happened to a camera.
+    """An event of a camera.
 
     Attributes:
         camera: name of the camera.
@@ -423,7 +422,7 @@ class Reconnected(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnected(CameraEvent):
-    """The session ended; ``reason`` says why, ``expected`` is True if this side ended it."""
+    """The session ended; ``reason`` is the cause, ``expected`` is True if this side ended it."""
 
     reason: str
     expected: bool
@@ -468,7 +467,7 @@ class SubscriberStatistics:
 
     Attributes:
         name: kind of the subscribed items: ``results``, ``statuses`` or ``events``.
-        policy: what happens when the queue is full: ``drop_oldest`` or ``error``.
+        policy: consequence of a full queue: ``drop_oldest`` or ``error``.
         offered: items that came while it was subscribed.
         taken: items that the subscriber took.
         dropped: items lost to the policy or to ``min_interval``.

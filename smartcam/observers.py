@@ -34,7 +34,7 @@ class TraceEntry(NamedTuple):
         camera: name of the camera.
         direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
             unfinished frame when the link ended.
-        message_id: id on the wire, None for broken bytes and where there are no such ids.
+        message_id: id on the wire, None for broken bytes, and if the protocol has no ids.
         message: name of the message, or the error's text for broken bytes.
         fields: decoded body, None if it cannot be decoded.
         hex: the bytes.
@@ -86,7 +86,7 @@ class Observer:
     """Base of classes that observe a client; override the methods of interest.
 
     Give one or more to :func:`smartcam.connect` (``observers=[...]``). They are called in the
-    event loop, in order, and must return at once; what one raises is logged and goes no further.
+    event loop, in order, and must return at once; errors that one raises are only logged.
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
@@ -230,7 +230,7 @@ class Observers:
         return tuple(hook for hook in hooks if hook is not None)
 
     def _looking_at(self, first: str, other: str) -> Iterator[tuple[Callable[..., None], bool]]:
-        """Yield, per observer that overrides one of two methods, it and whether it is ``first``.
+        """Yield the overridden one of two methods of each observer, and whether it is ``first``.
 
         The method that is overridden last counts; ``first`` if one class overrides both.
         """

@@ -90,7 +90,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     """An emulated camera over real TCP or UDP, on a free port of this machine.
 
     It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
-    tests, and programs that a test starts. The marker ``smartcam`` says what it is.
+    tests, and programs that a test starts. The marker ``smartcam`` sets its options.
     """
     from smartcam.emulator._inside import emulated_class
     from smartcam.testing import ThreadedCamera
@@ -124,7 +124,7 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
 
 
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
-    """Return a camera of a fleet, with a running application where the camera can have one."""
+    """Return a camera of a fleet, with a running application if the camera can have one."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 

@@ -77,7 +77,7 @@ class Registry:
         """Register a plug-in for this process, without a package that provides it.
 
         Raises:
-            PluginError: the name is taken by another one.
+            PluginError: the name is taken by another object.
         """
         if self._registered.get(name) is plugin:
             return
@@ -98,7 +98,7 @@ class Registry:
         return self._loaded[name]
 
     def refresh(self) -> None:
-        """Forget plug-ins that were found or loaded, but not registered ones; later calls look."""
+        """Forget found and loaded plug-ins, but not registered ones; later calls search again."""
         self._found = None
         self._loaded.clear()
 
@@ -171,7 +171,7 @@ def _points(group: str) -> Iterator[EntryPoint]:
 
 
 def _entry_points_text(found: Distribution) -> str | None:
-    """Return the text of a distribution's entry points, None if it cannot be told like this."""
+    """Return the text of a distribution's entry points, None if it cannot be read in this way."""
     try:
         return found.read_text("entry_points.txt") or ""
     except Exception:  # noqa: BLE001 - anything may stand in other people's files
@@ -186,7 +186,7 @@ def _distributions() -> Iterator[Distribution]:
 
 
 def _key(found: Distribution) -> str:
-    """Return a distribution's normalized name; its folder's name is fastest, where it is known."""
+    """Return a distribution's normalized name; its folder's name is fastest, if known."""
     known: str | None = getattr(found, "_normalized_name", None)
     return known or _name_of(found).lower()
 

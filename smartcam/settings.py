@@ -45,7 +45,7 @@ Flag = Annotated[bool, Field(strict=True), PLAIN]
 
 
 class Address(NamedTuple):
-    """The address of a camera, and what is known of its protocol.
+    """The address of a camera, and the known facts about its protocol.
 
     Attributes:
         protocol: name of the protocol.
@@ -56,7 +56,7 @@ class Address(NamedTuple):
         quirks: pinned deviations from the dialect.
         parameters: other parts of the URL by name, which the protocol interprets. They include
             ``user`` and ``password`` if the protocol has a login.
-        path: part of the URL behind the host: a camera's name in a fleet.
+        path: part of the URL after the host: a camera's name in a fleet.
     """
 
     protocol: str
@@ -108,11 +108,11 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
 
     Args:
-        url: a URL, or a bare ``HOST[:PORT]``: BVS over TCP, unless ``model`` says otherwise.
+        url: a URL, or a bare ``HOST[:PORT]``: BVS over TCP, unless ``model`` has another protocol.
         model: camera model; picks the protocol of a bare host.
 
     Raises:
-        ConfigurationError: says which part is wrong and what is accepted.
+        ConfigurationError: names the wrong part, and the accepted values.
     """
     url = check_text(url, "camera address")
     if model is not None:
@@ -266,7 +266,7 @@ def known_protocols() -> Iterator[Protocol]:
 
 
 class OtherOptions(TypedDict, total=False):
-    """The options of ``connect()``, except for those that say how to read results."""
+    """The options of ``connect()``, except for the interpretation of results."""
 
     name: str
     application: int | str | None
@@ -308,12 +308,12 @@ class CameraSettings(BaseModel):
     application_names: dict[Text, ApplicationId] = Field(
         {},
         max_length=1000,
-        description="names of applications and their ids; a name stands wherever an id may",
+        description="names of applications and their ids; a name may replace any id",
     )
-    interpret_as: Any = Field(None, description="what result containers hold")
+    interpret_as: Any = Field(None, description="interpretation of result containers")
     calibration: Any = Field(
         None,
-        description="what brings localizations into the robot's frame: one for all applications, "
+        description="transforms localizations into the robot's frame: one for all applications, "
         "or a mapping from application id to one, or to None to leave its values as they are",
     )
     y_down: Flag = Field(
@@ -345,7 +345,7 @@ class CameraSettings(BaseModel):
     def make(
         cls, url: str, model: str | None, options: CameraOptions | dict[str, Any]
     ) -> CameraSettings:
-        """Validate what ``connect()`` was given.
+        """Validate the options of ``connect()``.
 
         Raises:
             ConfigurationError: names the option, what came and what was expected.
@@ -422,7 +422,7 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
 
 
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """Return pydantic's findings as one line: where, what was expected, what came.
+    """Return pydantic's findings as one line: field, expected value, given value.
 
     ``known``: names of the fields at the top, of which one may have been meant.
     """

@@ -1,4 +1,4 @@
-"""Bounded streams: what a camera says, to any number of subscribers side by side."""
+"""Bounded streams: a camera's items for any number of independent subscribers."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Overflow(enum.Enum):
     """The treatment of a new item when a subscriber's queue is full."""
 
     DROP_OLDEST = "drop_oldest"
-    """The oldest item makes room; it is counted."""
+    """The oldest item is dropped and counted."""
     ERROR = "error"
-    """The stream ends with :exc:`~smartcam.SubscriberOverflowError`, after what is
-    queued."""
+    """The stream ends with :exc:`~smartcam.SubscriberOverflowError`, after the queued
+    items."""
 
 
 _OVERFLOWS = [one.value for one in Overflow]
@@ -46,9 +46,9 @@ class Queue(Generic[T]):
     """Base of both kinds of subscription: a bounded queue that counts what it drops.
 
     Args:
-        name: name of what is subscribed to.
+        name: kind of the subscribed items.
         max_queue: number of items kept for a slow reader.
-        overflow: value of :class:`Overflow` that says what happens beyond ``max_queue``.
+        overflow: value of :class:`Overflow`, the consequence of a full queue.
         min_interval: seconds after a kept item in which further items are dropped.
         max_queue_bytes: largest number of bytes of all kept items. A larger single item is kept if
             the queue is empty: otherwise it could never be delivered.
@@ -127,7 +127,7 @@ class Queue(Generic[T]):
         )
 
     def close(self) -> None:
-        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        """Unsubscribe; queued items count as dropped. Idempotent."""
         self._dropped += len(self._items)
         self._evicted += len(self._items)
         self._items.clear()
@@ -214,7 +214,7 @@ class Queue(Generic[T]):
             self._missed += count
 
     def end(self, error: SmartCamError | None) -> None:
-        """End the stream after what is queued; the first reason stays."""
+        """End the stream after the queued items; the first reason stays."""
         if not self._ended:
             self._ended = True
             self._end_error = error
@@ -261,7 +261,7 @@ class Queue(Generic[T]):
         parcels.append((self._taken + self._evicted + queued, count, size))
 
     def _subtract_gone(self) -> int:
-        """Forget parcels of which nothing is queued; return how many items were ever gone."""
+        """Forget parcels without queued items; return the number of all items gone so far."""
         parcels, gone = self._parcels, self._taken + self._evicted
         while parcels and parcels[0][0] <= gone:
             self._bytes -= parcels.popleft()[2]
@@ -271,7 +271,7 @@ class Queue(Generic[T]):
         """Recount the bytes of all parcels from the items that are queued."""
         gone, parcels = self._subtract_gone(), self._parcels
         if parcels and parcels[0][0] - parcels[0][1] < gone:
-            # partly taken: from now on each item that is left of it is a parcel
+            # partly taken: from now on each of its other items is a parcel
             last, _, size = parcels.popleft()
             left = cast("list[T]", list(itertools.islice(self._items, last - gone)))
             sizes = [self._size_of(item) for item in left]

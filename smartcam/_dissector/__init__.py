@@ -1,7 +1,7 @@
 """A Wireshark dissector for every dialect of ``bvs``, made from the message tables.
 
 The tables become Lua tables, with which ``engine.lua`` beside this file reads frames. So a new
-message in ``protocols/_bvs.py`` is known to Wireshark, too, and no fact of the wire stands twice.
+message in ``protocols/_bvs.py`` is known to Wireshark, too.
 """
 
 from __future__ import annotations
