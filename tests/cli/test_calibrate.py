@@ -305,7 +305,7 @@ def test_calibrate_with_wrong_usage_says_what_is_wrong(
     calibrating("bvs://127.0.0.1:9", tmp_path, lines, *options).failed(2, text)
 
 
-def test_calibrate_with_results_that_are_no_localizations_says_so(url: str, tmp_path: Path) -> None:
+def test_calibrate_with_results_that_are_no_localizations_fails(url: str, tmp_path: Path) -> None:
     lines = [*as_lines(ABOUT, {}), '{"do": "abort"}']
     done = calibrating(url, tmp_path, lines, "--json", "--interpret-as", "raw")
     assert done.lines[2]["errors"] == {

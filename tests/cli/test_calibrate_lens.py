@@ -110,7 +110,7 @@ def test_lens_of_files_has_its_views_in_json(tmp_path: Path, target: str) -> Non
         (("synthetic://?size=5x5", "-o", "x.yaml"), "room for the stamp"),
     ],
 )
-def test_lens_with_wrong_use_is_told(
+def test_lens_with_wrong_use_is_reported(
     target: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -196,7 +196,7 @@ def test_lens_of_a_source_ends_with_its_seconds_and_says_what_lacks(
         ({}, 4, "expected the next frame, got none in time"),
     ],
 )
-def test_lens_of_a_source_that_dies_or_is_silent_says_so(
+def test_lens_of_a_source_that_dies_or_is_silent_reports_it(
     tmp_path: Path, target: str, table: Any, other: dict[str, Any], code: int, text: str
 ) -> None:
     table(**other)

@@ -72,7 +72,7 @@ def test_convert_filters(ply: str, tmp_path: Path, options: list[str], points: i
         (["show", "{ply}", "--up", "w"], 2, "--up"),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_what_cannot_be_done_is_reported(
     ply: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

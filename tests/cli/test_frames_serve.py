@@ -188,7 +188,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
         ((LEFT, "--rtsp", "192.0.2.1:0"), "RTSP: cannot listen on 192.0.2.1"),
     ],
 )
-def test_wrong_use_is_told(
+def test_wrong_use_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], text: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -239,7 +239,7 @@ def test_help_names_every_command_and_exit_code() -> None:
     assert "Usage: smartcam-emulator " in run_emulator("--help").done().out
 
 
-def test_version_is_told() -> None:
+def test_version_is_reported() -> None:
     assert run("--version").done().out == f"smartcam, version {smartcam.__version__}\n"
     assert smartcam.__version__ in run_emulator("--version").done().out
 

@@ -396,7 +396,7 @@ async def test_few_file_descriptors_are_enough() -> None:
     assert len(found) == 12
 
 
-async def test_no_file_descriptor_at_all_is_told() -> None:
+async def test_no_file_descriptor_at_all_is_reported() -> None:
     resource = pytest.importorskip("resource", reason="this system has no such limit")
     with socket.socket() as last:
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)

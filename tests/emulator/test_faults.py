@@ -269,7 +269,8 @@ def test_clear_forgets_all_and_keeps_the_record() -> None:
     )
     queue.clear()
     assert queue.waiting == []
-    assert not (queue.on_camera or queue.on_client or queue.device_on_client or queue.at_once())
+    rows = [*queue.on_camera, *queue.on_client, *queue.device_on_client, *queue.at_once()]
+    assert rows == []
 
 
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

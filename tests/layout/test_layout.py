@@ -320,7 +320,7 @@ def test_text_that_is_no_utf8_names_the_bad_byte() -> None:
     )
 
 
-def test_first_of_two_mistakes_is_told() -> None:
+def test_first_of_two_mistakes_is_reported() -> None:
     with pytest.raises(InterpretationError) as caught:
         Layout("(code: string[1], a: bool)*").parse(b"a\x02\xff\xff")
     assert caught.value.offset == 1
@@ -531,7 +531,7 @@ def test_dtype_is_the_wires() -> None:
 
 @pytest.mark.skipif(sys.byteorder != "little", reason="the view is of the machine's byte order")
 @pytest.mark.parametrize("kind", [bytes, bytearray])
-def test_table_is_a_view_where_nothing_is_converted(kind: type) -> None:
+def test_table_is_a_view_if_nothing_is_converted(kind: type) -> None:
     payload = kind(b"\2\0\1\0\2\0\3\0")
     table = Layout("n: int16, (a: int16)[n]").parse_table(payload)
     assert table["a"].tolist() == [1, 2]

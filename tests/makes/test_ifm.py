@@ -264,7 +264,7 @@ async def test_version_without_lengths_has_no_binary_results() -> None:
 
 
 @pytest.mark.asyncio
-async def test_result_of_another_layout_is_told_and_not_read() -> None:
+async def test_result_of_another_layout_is_reported_and_not_read() -> None:
     async with by_hand(interpret_as="n: int32") as (peer, camera):
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         ticket, _ = await peer.requests.get()

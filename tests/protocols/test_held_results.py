@@ -108,7 +108,7 @@ ACTIONS = ("result", "remark", "trigger", "answer trigger", "answer", "answer", 
 
 
 @given(st.lists(st.sampled_from(ACTIONS), max_size=60))
-def test_each_result_is_told_once_in_order_and_of_its_own_application(actions: list[str]) -> None:
+def test_each_result_is_reported_once_in_order_of_its_application(actions: list[str]) -> None:
     station = Station()
     for action in actions:
         station.step(action)

@@ -195,7 +195,7 @@ def test_login_after_a_disconnect_without_a_session_goes_on() -> None:
         GREETING + b"Password: Password: ",
     ],
 )
-def test_login_refused_is_told_once_and_nothing_is_said_again(said: bytes) -> None:
+def test_login_refused_is_reported_once_and_nothing_is_said_again(said: bytes) -> None:
     talk = Talk()
     talk.send(m.Connect())
     assert talk.hear(said).count(b"admin\r\n") == 1

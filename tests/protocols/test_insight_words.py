@@ -251,7 +251,7 @@ def test_answer_is_read_at_every_split_point(
 
 
 @each
-def test_answer_is_told_in_pieces_with_their_ends(
+def test_answer_is_reported_in_pieces_with_their_ends(
     form: AnswerForm, heard: bytes, answer: CommandAnswer
 ) -> None:
     pieces = Pieces()
@@ -262,7 +262,7 @@ def test_answer_is_told_in_pieces_with_their_ends(
 
 
 @each
-def test_answer_leaves_what_stands_behind_it(
+def test_answer_leaves_what_stands_after_it(
     form: AnswerForm, heard: bytes, answer: CommandAnswer
 ) -> None:
     reader = Pieces().reader
@@ -347,7 +347,7 @@ def test_image_is_the_same_in_pieces_of_any_size_broken_or_not(
     assert read[0] == read[1] == read[2]
 
 
-def test_image_with_a_broken_line_behind_thousands_is_told_up_to_it() -> None:
+def test_image_with_a_broken_line_after_thousands_is_told_up_to_it() -> None:
     pieces = Pieces()
     pieces.reader.expect(AnswerForm.HEX)
     header = (b"BM" + struct.pack("<I", 1 << 20)).hex().encode()

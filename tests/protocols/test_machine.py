@@ -319,7 +319,7 @@ def test_client_second_connect_answer_is_counted_only() -> None:
 # ---------------------------------------------------------------------- the camera's policy
 
 
-def test_camera_requests_behind_a_connect_in_the_same_bytes_are_heard_in_order() -> None:
+def test_camera_requests_after_a_connect_in_the_same_bytes_are_heard_in_order() -> None:
     made = Machine(HANDBOOK, Role.CAMERA, Transport.TCP)
     requests = [m.Connect(), m.Query(), m.Connect(), m.Trigger()]
     assert feed(made, b"".join(HANDBOOK.encode(one) for one in requests)) == requests
@@ -738,7 +738,7 @@ def test_status_that_was_asked_for_by_its_id_is_its_answer_though_it_came_before
     made.send(request, answered=True)
 
 
-def test_status_that_came_before_is_refused_where_none_may_come() -> None:
+def test_status_that_came_before_is_refused_if_none_may_come() -> None:
     made = client()
     feed(made, STATUS * 2)
     made.send(m.Disconnect())
@@ -769,7 +769,7 @@ ANSWERS = [
     ANSWERS,
     ids=[f"{dialect.label}-{label(answer)}" for dialect, answer in ANSWERS],
 )
-def test_answer_that_came_before_is_told_once_a_request_and_else_counted(
+def test_answer_that_came_before_is_reported_once_a_request_and_else_counted(
     dialect: FramedDialect, answer: m.Message
 ) -> None:
     request = request_for(answer, dialect)
@@ -793,7 +793,7 @@ def test_message_that_another_link_knows_is_refused_where_it_is_above_the_limit(
     assert "announces 8 bytes of payload; 0 to 7 are accepted" in str(failure(made.events()))
 
 
-def test_answer_that_came_before_is_refused_where_none_may_come() -> None:
+def test_answer_that_came_before_is_refused_if_none_may_come() -> None:
     made = client()
     made.send(m.Query())
     assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
@@ -869,7 +869,7 @@ def test_result_as_there_was_one_before_waits_for_its_last_byte() -> None:
         assert feed(made, other[cut:] + STATUS) == [result(b"efgh"), STATUS_MESSAGE]
 
 
-def test_result_as_there_was_one_before_is_refused_where_none_may_come() -> None:
+def test_result_as_there_was_one_before_is_refused_if_none_may_come() -> None:
     made, frame = client(), HANDBOOK.encode(result(b"abcd"))
     feed(made, frame, frame)
     made.send(m.Disconnect())
@@ -897,7 +897,7 @@ def test_results_of_many_kinds_are_all_told() -> None:
 
 
 @pytest.mark.parametrize("dialect", [one for one in DIALECTS if one is not NO_ID], ids=label)
-def test_burst_is_of_containers_of_one_application_right_behind_one_another(
+def test_burst_is_of_containers_of_one_application_right_after_one_another(
     dialect: FramedDialect,
 ) -> None:
     said = [*(result(one) for one in (b"a", b"", b"ccc")), STATUS_MESSAGE, result(b"d")]

@@ -203,7 +203,7 @@ def test_page_shows_tests_that_pass(pytester: pytest.Pytester) -> None:
     )
 
 
-def test_suite_without_what_it_needs_says_so(pytester: pytest.Pytester) -> None:
+def test_suite_without_what_it_needs_reports_it(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         from smartcam.testing import ProtocolSuite

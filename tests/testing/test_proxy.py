@@ -94,7 +94,7 @@ async def test_rule_of_the_other_transport_is_refused_from_now() -> None:
             proxy.from_now(Lose())
 
 
-async def test_port_is_free_again_behind_it() -> None:
+async def test_port_is_free_again_after_it() -> None:
     async with target() as camera:
         async with LinkProxy(HOST, camera.port) as proxy:
             pass

@@ -127,7 +127,7 @@ async def test_cloud_is_packed_once_and_in_a_thread(monkeypatch: pytest.MonkeyPa
     assert not any(one.name.startswith("smartcam.web.cloud") for one in threading.enumerate())
 
 
-async def test_cloud_that_cannot_be_packed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cloud_that_cannot_be_packed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(cloud: Cloud, most: int) -> Any:
         raise MemoryError("no room for it")
 

@@ -140,7 +140,7 @@ async def test_click_in_the_picture_takes_the_colour_there(page: Page) -> None:
         await see(page, "#part", "87.5 %")
 
 
-async def test_range_is_tried_on_the_picture_where_no_other_comes(page: Page) -> None:
+async def test_range_is_tried_on_the_picture_if_no_other_comes(page: Page) -> None:
     async with shown(page, colours=ColourRange(value=(0, 60))) as (camera, _):
         await see(page, LIVE)
         await see(page, "#part", "12.5 %")

@@ -112,7 +112,7 @@ async def test_streams_and_calls_that_wait_leave_places_free() -> None:
         assert world.site._waiting == 0
 
 
-async def test_where_every_place_is_taken_the_newcomer_is_told(
+async def test_where_every_place_is_taken_the_newcomer_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 1)

@@ -384,7 +384,7 @@ async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> 
         assert (told["totals"]["failures"], told["bars"]) == (8, [list(b) for b in view.series])
 
 
-async def test_parts_are_told_as_they_lie_and_long_results_by_their_length() -> None:
+async def test_parts_are_reported_as_they_lie_and_long_results_by_their_length() -> None:
     async with served(2) as world, world.looking() as looker:
         header = Header(1, AT, "line01/cam000")
         pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(1.5))

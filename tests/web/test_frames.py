@@ -190,7 +190,7 @@ async def test_looker_that_says_something_else_is_disconnected(word: str) -> Non
         await all_of.driver.rests()
 
 
-async def test_looker_is_told_the_account_where_no_frame_comes() -> None:
+async def test_looker_is_told_the_account_if_no_frame_comes() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
         await all_of.driver.streams()
@@ -234,7 +234,7 @@ async def test_source_that_is_not_open_is_awaited_with_the_reason() -> None:
                 pass
 
 
-async def test_frame_that_is_broken_is_told_and_the_next_is_shown() -> None:
+async def test_frame_that_is_broken_is_reported_and_the_next_is_shown() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
         await all_of.driver.streams()
@@ -335,7 +335,7 @@ async def test_websocket_of_another_site_is_refused() -> None:
         ("/api/sources/x/picture", 404, "0 to 0"),
     ],
 )
-async def test_wrong_call_is_told(path: str, status: int, text: str) -> None:
+async def test_wrong_call_is_reported(path: str, status: int, text: str) -> None:
     async with world() as all_of:
         answer = await all_of.caller.call("GET", path)
     assert answer.status == status
@@ -382,7 +382,7 @@ async def test_picture_is_the_newest_frame() -> None:
         await all_of.driver.rests()
 
 
-async def test_picture_of_a_source_without_frames_says_so() -> None:
+async def test_picture_of_a_source_without_frames_reports_it() -> None:
     async with world() as all_of:
         answer = await all_of.caller.call("GET", "/api/sources/0/picture")
         assert answer.status == 409

@@ -128,7 +128,7 @@ async def test_device_that_is_not_there_says_why_and_comes() -> None:
                 assert (await next_picture(socket))[0]["sequence"] == 5
 
 
-async def test_agent_that_goes_and_comes_is_said() -> None:
+async def test_agent_that_goes_and_comes_is_reported() -> None:
     async with FramePlant() as plant, shown(plant) as world:
         await world.seen()
         async with world.looking() as socket:
