@@ -612,8 +612,8 @@ class _LoopBell:
         return None
 
     def ring(self) -> None:
-        """Make the loop call the function once, however often the bell is rung before."""
-        with contextlib.suppress(ValueError, OSError):  # the bell is closed
+        """Have the loop call; once, however often it is rung before."""
+        with contextlib.suppress(ValueError, OSError):  # closed: nobody hears any more
             self._file.write(_ONE)
 
     def _on_ring(self) -> None:

@@ -73,9 +73,9 @@ class Address(NamedTuple):
         """The address as a URL, with everything pinned that is known; never with a password."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         user = "".join(quote(value, safe="") + "@" for key, value in self.parameters if key == USER)
-        values = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
+        said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
         query = urlencode(
-            [(key, value) for key, value in values if value and key not in {USER, PASSWORD}],
+            [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
             safe=",:",
         )
         place = f"{user}{host}:{self.port}" if host else ""

@@ -1,4 +1,4 @@
-"""Applications whose results come from inspected pictures."""
+"""Applications of an emulated camera whose results come from inspected pictures."""
 
 from __future__ import annotations
 
