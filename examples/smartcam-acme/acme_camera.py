@@ -20,7 +20,7 @@ def program(line: str) -> m.QueryAnswer:
 
 
 def measured(line: str) -> m.ResultContainer:
-    """Return the result of a trigger: each word is a cell."""
+    """Return the result of a trigger: its words are the cells."""
     cells = tuple(m.CellValue(str(i), text) for i, text in enumerate(line.split()))
     return m.ResultContainer(data=line.encode(), cells=cells)
 

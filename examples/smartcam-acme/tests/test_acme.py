@@ -1,4 +1,4 @@
-"""The Acme camera in smartcam's suite, and in its own tests."""
+"""The Acme camera in smartcam's suite, and in tests of one's own."""
 
 import contextlib
 from collections.abc import AsyncIterator
@@ -37,24 +37,24 @@ class LiveAcme(LiveCamera):
 
     @property
     def url(self) -> str:
-        """The camera's address."""
+        """Its address."""
         return f"{self.emulator.url}?dialect=lines"
 
     @property
     def has_session(self) -> bool:
-        """True if the camera serves a client."""
+        """Whether it serves a client."""
         return self.emulator.has_session
 
 
 @contextlib.asynccontextmanager
 async def put_up() -> AsyncIterator[LiveCamera]:
-    """Start a camera."""
+    """Put one up that counts."""
     async with AcmeCamera(parts=[str(number) for number in range(1000)]) as emulator:
         yield LiveAcme(emulator)
 
 
 class TestAcme(ProtocolSuite):
-    """All tests of the suite."""
+    """Everything that the suite checks."""
 
     protocol = ACME
     conversations = (
