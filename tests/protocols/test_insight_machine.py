@@ -440,7 +440,7 @@ BROKEN: list[tuple[m.Message, bytes, str]] = [
     (Command(line="EV a"), b"1\r\n4294967296\r\n", "a text of 4294967296 bytes comes; 0 to 1000"),
     (Command(line="EV a"), b"1\r\n-1\r\n", "a text of -1 bytes comes; 0 to 1000"),
     (Command(line="EV a"), b"1\r\n\r\n", "'' came, a length was expected"),
-    (Command(line="EV a"), b"1\r\n2\r\nabc\r\n", "'c' came behind a text of 2 bytes, its end was"),
+    (Command(line="EV a"), b"1\r\n2\r\nabc\r\n", "'c' came after a text of 2 bytes, its end was"),
 ]
 
 

@@ -129,7 +129,7 @@ class AnswerReader(LineReader):
             yield
         self._on_pieces((data,), False)
         if end := (yield from self._line()):
-            raise FrameError(f"{end[:64]!r} came behind a text of {size} bytes, its end was due")
+            raise FrameError(f"{end[:64]!r} came after a text of {size} bytes, its end was due")
         return data.decode(ENCODING)
 
     def _image(self) -> Generator[None, None, bytes]:

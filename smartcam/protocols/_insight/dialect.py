@@ -241,10 +241,10 @@ INSIGHT = Protocol(
     dialects={NATIVE.name: NATIVE},
     machine=InSightMachine,
     parameters={
-        "user": "who logs in; default admin",
+        "user": "user to log in; default admin",
         "password": "the user's; default none",
         "cells": "cells that are a result's values, such as B2,C2,D4:F6",
-        "counter": "a cell that counts runs: values of several runs are told by it",
+        "counter": "a cell that counts runs, which shows whether values are of one run",
     },
     emulator="smartcam.emulator._insight.camera:EmulatedInSight",
     greeting=WELCOME.encode(ENCODING),
