@@ -229,7 +229,7 @@ class Interpreter(ABC):
         if layout is None and self.layout_use == "required":
             raise ConfigurationError(
                 f"interpreter {name}: expected a layout, got none; "
-                f'write one behind the name, as in "{name}: x: real32 mm, y: real32 mm"'
+                f'write one after the name, as in "{name}: x: real32 mm, y: real32 mm"'
             )
         self.layout: Layout | None = layout
 

@@ -322,7 +322,7 @@ class _Parser:
     def _repeat(self, head: tuple[Field, ...]) -> str | int:
         if self._take_mark("*"):
             return "*"
-        self._expect("[", "'*', '[number]' or '[name]' behind the group")
+        self._expect("[", "'*', '[number]' or '[name]' after the group")
         token = self._take()
         repeat: str | int
         if token.kind == "number":
@@ -350,7 +350,7 @@ class _Parser:
 
     def _field(self, what: str) -> Field:
         name = self._name(what)
-        self._expect(":", f"':' and a type behind {name!r}")
+        self._expect(":", f"':' and a type after {name!r}")
         type_, length = self._type()
         unit = self._unit(type_)
         return Field(name, type_, length, unit, self._sequence(type_, unit))
@@ -405,7 +405,7 @@ class _Parser:
             self._fail(f"expected '@{SEQUENCE}', got '@' and {self._peek()}", at)
         self._take()
         if not TYPES[type_].is_integer or unit is not None:
-            self._fail(f"expected '@{SEQUENCE}' only behind an integer without a unit", at)
+            self._fail(f"expected '@{SEQUENCE}' only after an integer without a unit", at)
         if self._has_sequence:
             self._fail(f"expected one '@{SEQUENCE}', got a second", at)
         self._has_sequence = True
