@@ -127,8 +127,8 @@ class ScenarioFile(Scenario):
         default=(),
         max_length=1000,
         description=(
-            "several cameras: what stands beside this is what they have in common, and each adds "
-            "its own or puts it in the place of that"
+            "several cameras: the fields beside this one are common to all, and each camera adds "
+            "its own fields, or replaces common ones"
         ),
     )
 

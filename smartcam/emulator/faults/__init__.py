@@ -189,7 +189,7 @@ class Corrupt(WireFault):
     @model_validator(mode="after")
     def _check_change(self) -> Corrupt:
         if (self.xor is None) is (self.value is None):
-            raise ValueError("exactly one of xor and value says what stands there")
+            raise ValueError("expected exactly one of xor and value")
         return self
 
 
@@ -228,7 +228,7 @@ class Insert(CameraWireFault):
         description="The message's fields: all without a default; `data` as hex digits.",
     )
     where: Literal["before", "after", "instead"] = Field(
-        default="before", description="Where it stands: beside the message or in place of it."
+        default="before", description="Its place: beside the message or in place of it."
     )
 
     @field_validator("message")
