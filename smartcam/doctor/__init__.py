@@ -58,19 +58,19 @@ __all__ = [
 NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="connecting takes the camera from another client, where it serves one: the newcomer wins",
+    text="connecting takes the camera from another client, if it serves one: the newcomer wins",
     cure="A program that uses smartcam takes it back by itself.",
 )
 
 SHARED = Finding(
     check="notice",
     severity="ok",
-    text="the camera is an agent's, which shares it: this examination takes it from nobody",
+    text="the camera's agent shares it: this examination takes it from no program",
 )
 SEVERAL = Finding(
     check="notice",
     severity="ok",
-    text="the camera serves several clients: this examination takes it from nobody",
+    text="the camera serves several clients: this examination takes it from none",
 )
 
 

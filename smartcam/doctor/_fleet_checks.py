@@ -197,7 +197,7 @@ async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, 
     """Return fleet, agent and name of all cameras, including those that have just appeared."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
-        raise LookupError("there is no bus; what uses it comes behind what reaches it")
+        raise LookupError("there is no bus; checks that use it run after the check that reaches it")
     end = loop.time() + LOOKS_WITHIN
     pattern = Keys(address.fleet or "*").camera("*", "**")
     while True:

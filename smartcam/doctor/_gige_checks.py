@@ -276,7 +276,7 @@ async def _register_or_0(control: ControlChannel, address: int) -> int:
 async def _look_at_control(exam: _GigEExamination) -> None:
     """Take control, which was free a moment ago, and read the camera's description."""
     async with _session(exam) as features:
-        exam.add("ok", f"{exam.label}: nobody controlled it, and it lets us")
+        exam.add("ok", f"{exam.label}: no program controlled it, and this one may")
         exam.payload = int(await _number(features, "PayloadSize") or 0)
         exam.rate = await _number(
             features, "AcquisitionResultingFrameRate", "ResultingFrameRate", "AcquisitionFrameRate"

@@ -183,7 +183,7 @@ def _say_misfit(
     exam.fail(
         text,
         'Compare it with the "send results" tool, field by field: which one is missing, of another '
-        "type, or of another width? All fields behind a wrong one are shifted.",
+        "type, or of another width? All fields after a wrong one are shifted.",
         exit_code=Exit.UNREADABLE,
         **details,
     )
@@ -287,7 +287,7 @@ def _look_at_values(
         exam.say(
             "hint",
             f"{name} has values such as {value:g}, which nothing measures",
-            "A field before it is missing or has another type, so that all behind it are shifted; "
+            "A field before it is missing or has another type, so that all after it are shifted; "
             "or the camera sends no real number there.",
             check="values",
             field=name,

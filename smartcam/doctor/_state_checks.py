@@ -302,5 +302,5 @@ def _rounded(off: timedelta) -> str:
 
 _SET_CLOCK = (
     "await camera.set_clock(datetime.now()) after each restart of the camera, or an NTP server in "
-    "its settings where it has them. Results of smartcam carry this machine's time."
+    "its settings if it has them. Results of smartcam carry this machine's time."
 )

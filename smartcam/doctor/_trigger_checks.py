@@ -131,7 +131,7 @@ def _say_failed(exam: Examination, error: SmartCamError, done: int) -> None:
     if not isinstance(error, TriggerTimeoutError):
         exam.fail(
             f"{which} gave no result: {error}",
-            "docs/troubleshooting.md has what stands behind this error.",
+            "docs/troubleshooting.md explains this error.",
             exit_code=Exit.REFUSED,
             error=type(error).__name__,
         )

@@ -314,7 +314,7 @@ def last(findings: list[dict[str, Any]], check: str) -> dict[str, Any]:
 def test_camera_of_others_is_examined(namespace: list[str]) -> None:
     findings = there(namespace, "well")
     assert [one for one in findings if one["severity"] in ("warning", "error")] == []
-    assert "nobody controlled it" in last(findings, "control")["text"]
+    assert "no program controlled it" in last(findings, "control")["text"]
 
 
 @pytest.mark.long

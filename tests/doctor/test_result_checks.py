@@ -248,7 +248,7 @@ async def test_value_of_shifted_bytes_gets_a_hint() -> None:
     found = of(findings, "values")
     assert found.details["value"] == tiny
     assert "which nothing measures" in found.text
-    assert "all behind it are shifted" in found.cure
+    assert "all after it are shifted" in found.cure
 
 
 def test_limits_say_why() -> None:
