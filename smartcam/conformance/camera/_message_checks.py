@@ -43,7 +43,7 @@ def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
         came = [one for one in client.heard[mark:] if one.message_id != MessageId.STATUS]
         results = of_kind(came, MessageId.RESULT_CONTAINER)
         if len(came) - len(results) != 1:
-            raise Differs(f"no answer to {what}, one to the Query behind it", client.words(mark))
+            raise Differs(f"no answer to {what}, one to the Query after it", client.words(mark))
 
 
 @check(_IGNORED, dialects=SMART)

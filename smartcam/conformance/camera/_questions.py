@@ -196,7 +196,7 @@ def switch_answer(camera: CameraUnderTest) -> str:
             was_busy = True
         elif was_busy:
             return "after_status" if answered > place else "before_status"
-    raise NotObserved("no status with BUSY came during the switch, and one without it behind")
+    raise NotObserved("no status with BUSY came during the switch, and one without it after")
 
 
 @question(_OPEN, needs=Allow.RUN | Allow.SWITCH, dialects=SMART)

@@ -290,7 +290,7 @@ class RawClient:
             self.say(m.GetStatus())
         self.fence()
         if self.status is None:
-            raise NotObserved("the camera has told no status")
+            raise NotObserved("the camera has sent no status")
         return self.status
 
     def wait_status(self, fits: Callable[[int], object], within: float, expected: str) -> int:

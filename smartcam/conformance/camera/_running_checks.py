@@ -131,7 +131,7 @@ def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
         client.until(
             MessageId.STATUS,
             camera.options.timeout,
-            f"a status behind the answer ({client.words(mark)})",
+            f"a status after the answer ({client.words(mark)})",
             mark=behind,
         )
 

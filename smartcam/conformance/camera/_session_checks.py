@@ -53,7 +53,7 @@ def connect_is_answered(camera: CameraUnderTest) -> None:
     size = len(expected) * camera.wire.word
     if numbers != expected or len(answer.body) != size:
         raise Differs(
-            f"the version 1{' behind the code 0' if coded else ''}, {size} bytes",
+            f"the version 1{' after the code 0' if coded else ''}, {size} bytes",
             camera.wire.spell(answer),
         )
 

@@ -71,7 +71,7 @@ def switch_loads_the_application(camera: CameraUnderTest) -> str:
         raise Differs(f"the code 0 and the id {seen.application}", camera.wire.spell(seen.answer))
     if seen.active != seen.application:
         raise Differs(
-            f"application {seen.application} is active", f"Query tells application {seen.active}"
+            f"application {seen.application} is active", f"Query reports application {seen.active}"
         )
     return f"{seen.seconds:.3f} s"
 
@@ -84,12 +84,12 @@ def busy_during_a_switch(camera: CameraUnderTest) -> None:
     words = camera.wire.statuses(seen.came)
     if not any(word & busy for word in words) or words[-1] & busy:
         shown = "; ".join(map(camera.wire.spell, seen.came))
-        raise Differs("a status with BUSY during the switch, and one without it behind", shown)
+        raise Differs("a status with BUSY during the switch, and one without it after", shown)
 
 
 @check(
     {"": "no document, inferred", "bid": "ID-a 229, ID-b 216, published"},
-    about="during a switch a second one is not answered and Query tells the old application; "
+    about="during a switch a second one is not answered and Query reports the old application; "
     "a BVS ID answers both with Busy",
     needs=Allow.SWITCH,
 )
@@ -235,7 +235,7 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     offset = camera.options.sequence_offset
     if offset is None:
         raise NotObserved(
-            "it is not known where the sequence number stands in a result: --camera-sequence-offset"
+            "the place of the sequence number in a result is not known: --camera-sequence-offset"
         )
     camera.once_waiting(client)
     result = client.trigger()
@@ -267,7 +267,7 @@ def sequence_number_is_set(camera: CameraUnderTest) -> None:
     following = (number + 1).to_bytes(4, "little")
     if (first, second) != (little, following):
         raise Differs(
-            f"{little.hex(' ')} and, in the run behind, {following.hex(' ')}",
+            f"{little.hex(' ')} and, in the next run, {following.hex(' ')}",
             f"{first.hex(' ')} and {second.hex(' ')}",
         )
 

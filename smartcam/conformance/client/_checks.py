@@ -301,7 +301,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_nothing_listens",
         scene=SCENES["nothing_listens"],
         rule=rules.fails,
-        expects="a restart takes about 30 s, in which nobody listens",
+        expects="a restart takes about 30 s, in which nothing is received",
         source="MV31, published",
     ),
     # ------------------------------------------------------------------ broken links
@@ -337,7 +337,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_garbage_comes",
         scene=SCENES["garbage"],
         rule=rules.fails,
-        expects="behind bytes that make no frame nothing can be trusted; " + _BOUND,
+        expects="after bytes that make no frame nothing can be trusted; " + _BOUND,
         source="inferred",
     ),
     ClientCheck(

@@ -28,7 +28,7 @@ def _wrong_results(run: ClientRun) -> str | None:
         what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
         if content is None:
-            return f"{what} is {len(data)} bytes long; the containers have 8 behind the id"
+            return f"{what} is {len(data)} bytes long; the containers have 8 after the id"
         application, turn = content
         if application != scene.application:
             return f"{what} is of application {application}, not of {scene.application}"
@@ -201,7 +201,7 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
             busy = Status.BUSY in one.message.status
             since = None if not busy else one.time if since is None else since
         elif since is not None and _is_command(one) and one.time - since > GRACE:
-            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was told"
+            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was sent"
     return None
 
 

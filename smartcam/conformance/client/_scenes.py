@@ -236,7 +236,7 @@ SCENES: Mapping[str, Scene] = {
         ),
         Scene(
             name="unknown_messages",
-            about="messages with an id that nobody knows come in between",
+            about="messages with an unknown id come in between",
             faults=_unknown_messages,
         ),
         Scene(
