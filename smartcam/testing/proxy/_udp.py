@@ -232,7 +232,7 @@ class DatagramRelay(Relay[_Peer]):
             return None
         self.members[address] = peer
         if self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time()):
-            peer.turn_away("everybody else was answered lately")
+            peer.turn_away("all other clients were answered recently")
             return None
         self.log.note("connect", self._number)
         return peer

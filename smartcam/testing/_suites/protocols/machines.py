@@ -67,7 +67,7 @@ class MachineChecks(Parameters):
         """Check that each request is the written bytes, and each answer the written message."""
         Player(self.protocol, conversation).play()
         kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
-        assert m.Connect in kinds, f"{conversation}: nobody sends Connect"
+        assert m.Connect in kinds, f"{conversation}: no step sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
         """Check any cut of a stream: each piece may come alone, or with the next."""
@@ -235,7 +235,7 @@ class MachineChecks(Parameters):
             player = Player(self.protocol, conversation).play(place)
             events = [event for one in data for event in player.deliver(one)]
             found = [one for one in events if isinstance(one, answer)]
-            assert not found, f"at step {place}, nobody had asked, but it told {found}"
+            assert not found, f"at step {place}, no request was open, but it reported {found}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
         """Check that Disconnect can be sent in any session, and that nothing is sent after it."""
@@ -370,7 +370,7 @@ class _Judge:
             self._look()
             self.machine.receive_data(b"too late\r\n\0")
             self._look()
-        assert self.over, "the link's end was not told"
+        assert self.over, "the link's end was not reported"
         wanted = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
         assert self.machine.state in wanted, f"at the end it is {self.machine.state}"
 
@@ -413,7 +413,7 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
     else:
         pytest.fail(f"{where}: {message} was taken")
     events, wire = machine.events(), player.written()
-    assert not events, f"{where}: {message} was refused, but it told {events}"
+    assert not events, f"{where}: {message} was refused, but it reported {events}"
     assert not wire, f"{where}: {message} was refused, but it said {wire!r}"
     assert machine.state is state, f"{where}: {message} was refused, but it is {machine.state}"
 

@@ -128,7 +128,7 @@ class TriggerChecks(Parameters):
     async def test_trigger_dropped_while_ours_is_under_way_is_an_overtrigger(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check an overtrigger while somebody else's trigger comes in between."""
+        """Check an overtrigger while the trigger of another program comes in between."""
         async with visiting(camera_kind, application=SLOW) as (live, camera):
             if not camera.capabilities.unasked_results:
                 return  # it knows no triggers but the client's
