@@ -70,7 +70,7 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 @click.option(
     "--wizard",
     type=click.Choice(WIZARDS),
-    help="What to calibrate: a plane from what the camera localizes, a plane from a picture of a "
+    help="Kind of calibration: a plane from localizations, a plane from a picture of a "
     "printed sheet, or a camera on a robot or beside it.  [default: plane]",
 )
 @click.option(
@@ -350,7 +350,7 @@ class _Sources:
                 if camera.settings.y_down != options.y_down:  # a fleet's agent knows it
                     raise ConfigurationError(
                         f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
-                        "what is calibrated is mirrored"
+                        "the calibration is mirrored"
                     )
                 result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
         found = result.value
@@ -383,8 +383,8 @@ class _Sources:
             async with unopened as camera:
                 if not camera.capabilities.read_image:
                     raise UnsupportedError(
-                        f"{camera.name}: its protocol sends no pictures; expected one that does, "
-                        "or --pictures FOLDER, where the camera writes them by FTP"
+                        f"{camera.name}: its protocol sends no pictures; expected one with them, "
+                        "or --pictures FOLDER, to which the camera writes them by FTP"
                     )
                 await camera.trigger(timeout=wait)
                 data = await camera.read_image(timeout=wait)

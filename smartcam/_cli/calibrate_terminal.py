@@ -291,7 +291,7 @@ def _errors_text(view: Mapping[str, Any]) -> str:
 
 def _end_text(view: Mapping[str, Any]) -> str:
     if view["type"] == "abort":
-        return "\naborted; what was measured stands in the journal"
+        return "\naborted; the measurements stay in the journal"
     result = dict(view["result"])
     use, remarks = result.pop("use", {}), result.pop("remarks", [])
     rows = [f"  {name}: {_result_text(value)}" for name, value in result.items()]
@@ -366,8 +366,8 @@ class Lines:
         line = await future
         if not line:
             raise ConfigurationError(
-                "the input has ended before the calibration has; what was done is kept: "
-                "the same command goes on with it"
+                "the input ended before the calibration; the finished steps are kept: "
+                "the same command continues with them"
             )
         return line.strip()
 

@@ -62,7 +62,7 @@ async def decode(
     if interpreter is None:
         raise ConfigurationError(
             f"decode: {hex_excerpt(payload[:8])} begins no frame (no magic number), so "
-            "--dialect must say whose frames they are, or --interpret-as what the container holds"
+            "--dialect must name their dialect, or --interpret-as the container's contents"
         )
     value = _interpret(payload, interpreter, byte_order)
     options.show({"value": value}, options.value_text(value))

@@ -243,4 +243,4 @@ def _write(path: str, calibration: PlaneCalibration, parts: list[Localization], 
     text = draw(calibration, parts, title="smartcam demo --pick")
     with naming(f"--picture {path}"):
         Path(path).write_text(text, encoding="utf-8", newline="\n")
-    say.step(f"What was touched, how well it fits and how good it is: {path}", picture=path)
+    say.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)

@@ -41,7 +41,7 @@ FRAMES_PER_SECOND: Final = 8.0
 """Pictures a second while there is a reader."""
 
 DARK, CONTRAST, NOISE = 60.0, 130.0, 2.0
-"""Grey levels: of the table, from the table to the parts, and of the noise (standard deviation)."""
+"""Grey level of the table, its distance to the parts', and standard deviation of the noise."""
 
 BLUR_PX: Final = 0.8
 """Standard deviation of the lens' blur."""

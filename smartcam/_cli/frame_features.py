@@ -79,7 +79,7 @@ async def force_address_command(
     checked_mac(mac)
     if not yes:
         if not sys.stdin.isatty():
-            raise click.UsageError("it changes the camera's address: say --yes")
+            raise click.UsageError("it changes the camera's address: confirm with --yes")
         click.confirm(f"give the camera {mac} the address {address}?", abort=True, err=True)
     found = await force_address(mac, address, gateway=gateway)
     value: dict[str, Any] = {"url": found.url, "name": found.name, "remark": found.remark}

@@ -90,9 +90,9 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
     "--rtsp",
     metavar="HOST:PORT",
     callback=address,
-    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. Where the page has a token, "
-    f"that is the password, and {RTSP_USER} the user; on an address that others can reach, one is "
-    "made.",
+    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. The page's token is "
+    f"the password of the user {RTSP_USER}; without a token, an address that other machines can "
+    "reach gets a password.",
 )
 @click.option(
     "--rtp",
@@ -121,7 +121,7 @@ async def serve(
     if rtp is not None and len(urls) != 1:
         raise click.UsageError(f"--rtp sends one source: expected one URL, got {len(urls)}")
     if rtp is not None and not rtp[1]:
-        raise click.UsageError("--rtp: expected the port of who receives it, got 0")
+        raise click.UsageError("--rtp: expected the receiver's port, got 0")
     if sdp is not None and rtp is None:
         raise click.UsageError("--sdp needs --rtp")
     await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options, changes=changes)

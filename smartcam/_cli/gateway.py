@@ -39,7 +39,7 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--pose",
             type=click.Choice(["ur", "abb", "kuka", "fanuc", "meca500"]),
-            help="Make whose convention for orientations is used.",
+            help="Make with the convention for orientations.",
         ),
         click.option("--length", type=click.Choice(["m", "mm"])),
         click.option("--angle", type=click.Choice(["rad", "deg"])),

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 @click.command(
     help="Serve a page of a camera until Ctrl-C: results as they come, status, account. The page's "
-    "address goes to stdout. A camera that is not there, or is lost, is awaited, and the page says "
-    f'so. Needs the extra "web". {CONNECTS}'
+    "address goes to stdout. A missing or lost camera is awaited, with a note on the "
+    f'page. Needs the extra "web". {CONNECTS}'
 )
 @click.argument("url")
 @click.option(

@@ -18,7 +18,7 @@ MAX_HEX = 128
 
 
 @click.command(
-    help="Find out how a camera speaks; HOST or URL. Tries what the URL says, then every protocol, "
+    help="Find out how a camera speaks; HOST or URL. Tries the URL's options, then every protocol, "
     f"transport and dialect, the most probable first, until one is answered. {CONNECTS}"
 )
 @click.argument("host_or_url")

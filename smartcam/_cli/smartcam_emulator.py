@@ -28,7 +28,7 @@ PROTOCOL = "bvs"
 SHOWN = 7
 """The application that runs for a page without a scenario."""
 
-_SAID = {
+_OPTION_NAMES = {
     "scenario": "scenario",
     "dialect": "--dialect",
     "transport": "--transport",
@@ -228,7 +228,7 @@ def _scenarios(
 ) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
-    Raises ConfigurationError: the file is wrong, or copies are asked of several cameras;
+    Raises ConfigurationError: the file is wrong, or ``copies`` is given for several cameras;
     MissingExtraError: PyYAML is not installed.
     """
     from smartcam.emulator import load_scenarios
@@ -281,10 +281,10 @@ def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
     from smartcam.emulator._inside import emulated_class
 
     takes = emulated_class(plan.protocol).takes
-    for name, text in _SAID.items():
+    for name, text in _OPTION_NAMES.items():
         given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         if given and name not in takes:
-            able = ", ".join(text for name, text in _SAID.items() if name in takes)
+            able = ", ".join(text for name, text in _OPTION_NAMES.items() if name in takes)
             raise click.UsageError(f"--protocol {plan.protocol} takes no {text}; it takes {able}")
 
 

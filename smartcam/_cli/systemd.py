@@ -101,7 +101,7 @@ class Notifier:
                 self._status = ""  # to be sent again
             del self._unsent[:-MAX_UNSENT]
             if not self._failed:
-                logger.warning("systemd cannot be told by NOTIFY_SOCKET: %s", exc)
+                logger.warning("reports to systemd by NOTIFY_SOCKET fail: %s", exc)
             self._failed = True
 
     @contextlib.contextmanager
@@ -139,7 +139,7 @@ def _address(given: str) -> str | None:
     if given.startswith("/"):
         return given
     if given:
-        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nobody is told", given)
+        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nothing is reported", given)
     return None
 
 

@@ -219,7 +219,7 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
     first = calibrating(url, tmp_path, lines[:5], "--json")
     first_lines, last = first.lines, first.lines[-1]
     assert first.code == 2
-    assert "the same command goes on with it" in first.err
+    assert "the same command continues with them" in first.err
     second = calibrating(url, tmp_path, lines[5:], "--json").done()
     (going_on, *_) = second.lines
     resumed = going_on.pop("resumed")
@@ -276,7 +276,7 @@ def test_calibrate_aborted_has_its_exit_code_and_no_file(url: str, tmp_path: Pat
     done = calibrating(url, tmp_path, [":repeat", ":abort"])
     assert (done.code, done.err) == (130, "")
     assert "! :repeat: expected one of :abort" in done.out
-    assert done.out.endswith("aborted; what was measured stands in the journal\n")
+    assert done.out.endswith("aborted; the measurements stay in the journal\n")
     assert [one.name for one in tmp_path.iterdir()] == ["plane.journal"]
 
 

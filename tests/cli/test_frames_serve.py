@@ -180,7 +180,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
         ((LEFT,) * 5, "expected 4 URLs at most, got 5"),
         ((LEFT, "nothing://"), "unknown scheme 'nothing'"),
         ((LEFT, "--rtsp", "8554"), "'8554': expected HOST:PORT"),
-        ((LEFT, "--rtp", "127.0.0.1:0"), "expected the port of who receives it"),
+        ((LEFT, "--rtp", "127.0.0.1:0"), "expected the receiver's port"),
         ((LEFT, RIGHT, "--rtp", "127.0.0.1:5004"), "--rtp sends one source"),
         ((LEFT, "--sdp", "x.sdp"), "--sdp needs --rtp"),
         ((LEFT, "--rtp", "127.0.0.1:9", "--sdp", "nowhere/x.sdp"), "--sdp nowhere/x.sdp: No such"),
