@@ -110,7 +110,7 @@ def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits
 
 
 def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
-    """Return places in a pattern, with the places after parts that may match nothing."""
+    """Add to places in a pattern the places after parts that may match nothing."""
     for place, one in enumerate(pattern):
         if place in places and one == many:
             places = places | {place + 1}

@@ -1,8 +1,8 @@
 """Files that are written whole or not at all.
 
-A temporary file in the same folder is written and synced; the present file is kept under ``NAME.1``
-if backups are wanted (the one before as ``NAME.2``, ...); the new one takes its place in one step;
-the folder is synced. If the process is killed at any step, the name leads to the whole old or the
+A temporary file in the same folder is written and synced. If backups are wanted, the present file
+is kept as ``NAME.1``, older ones as ``NAME.2``, ... The new file replaces it in one step, and the
+folder is synced. If the process is killed at any step, the name leads to the whole old or the
 whole new file, and the next writer removes the leftovers. One process writes in a folder at a time:
 the one that has its lock.
 """
@@ -67,7 +67,7 @@ def keep_backup(path: Path, count: int) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Write a folder's names to the disk, if the system can."""
+    """Write a folder's list of names to the disk, if the system can."""
     flags = getattr(os, "O_DIRECTORY", None)
     if flags is None:  # Windows: folders cannot be opened
         return

@@ -337,7 +337,7 @@ class ZenohSession:
                     await asyncio.sleep(0.02)
                 return
         logger.warning(
-            "%s ! no router at %s yet: who is to be met there will be when it is there",
+            "%s ! no router at %s yet: ends behind it can be reached once it runs",
             self._what,
             self._link.place,
         )
