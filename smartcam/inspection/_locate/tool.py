@@ -84,7 +84,7 @@ class Locate(Tool[LocateSettings]):
                 )
             )
         for model in self.models:  # worked out now, for the same reason
-            _ = model.bands, model.coarse, model.contours
+            _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
         self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS

@@ -3,12 +3,12 @@
 A :class:`CameraKind` is one kind of camera; a :class:`LiveCamera` is an open camera. Neither knows
 the checks. The client knows what a camera can do in its dialect: ``camera.capabilities``.
 
-Each camera has the same applications, by their ids:
+On each camera stand the same applications, by their ids:
 
 * ``COUNTER`` and ``OTHER`` wait for a trigger and send the number of the run, from 0, at once;
 * ``SLOW`` does so after ``SLOW_TIME``;
-* ``ECHO`` sends the number in its input data, if the camera takes any;
-* ``FREE`` runs free, some 200 times per second, and sends the number of the run, if the camera
+* ``ECHO`` sends the number that it was given as input data, where the camera takes any;
+* ``FREE`` runs free, some 200 times per second, and sends the number of the run, where the camera
   sends unasked.
 """
 
@@ -32,10 +32,10 @@ SLOW_TIME = 0.15
 
 
 class LiveCamera:
-    """An open camera, with ``COUNTER`` active and ready to run.
+    """A camera that is up, with ``COUNTER`` active and ready to run.
 
-    A subclass has ``url`` and the actions that its camera supports. A check that needs an action
-    that the subclass leaves out is reported as skipped.
+    A subclass has ``url`` and what else can be done with the camera. A check that needs what a
+    subclass leaves out is skipped, and says so.
     """
 
     @property
