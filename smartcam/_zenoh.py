@@ -278,7 +278,7 @@ class ZenohSession:
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
-        # bytes that came, and those of them that were taken; all threads count the first ones
+        # bytes received, counted by all threads; and those of them that were handled
         self._bytes = self._patient_bytes = 0
         self._taken_bytes = self._taken_patient_bytes = 0
         self._woken = False
@@ -621,10 +621,10 @@ class _LoopBell:
         return None
 
     def ring(self) -> None:
-        """Have the loop call; once, however often it is rung before."""
+        """Make the loop call the function once, however often the bell is rung before."""
         try:  # noqa: SIM105 - each message does this, and suppress() costs as much as the rest
             self._file.write(_ONE)
-        except (ValueError, OSError):  # closed: nobody hears any more
+        except (ValueError, OSError):  # the bell is closed
             pass
 
     def _on_ring(self) -> None:

@@ -39,7 +39,7 @@ PLAIN = BeforeValidator(plain)
 """Lets a strict type take numbers and texts of any class, such as numpy's."""
 
 MAX_NAME_CHARACTERS = 200
-"""Largest number of characters of a camera's name that a user gives."""
+"""Largest number of characters of a camera's name from a user."""
 
 Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
 Integer = Annotated[int, Field(strict=True), PLAIN]
@@ -114,7 +114,7 @@ def is_software(url: str) -> bool:
 
 
 MAX_KNOWN_ADDRESSES = 256
-"""Largest number of URLs whose address is kept, so that a camera opened again reads none anew."""
+"""Largest number of URLs whose address is kept, for cameras that are opened again."""
 
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
@@ -130,14 +130,14 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     url = check_text(url, "camera address")
     if model is not None:
         model = check_text(model, "camera model", least=1, most=200)
-    if "@" in url:  # before it stands a password, which is kept nowhere else
+    if "@" in url:  # with a password, which must not be kept
         return _read_address(url, model)
     return _known_address(url, model, PROTOCOLS.revision)
 
 
 @functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
 def _known_address(url: str, model: str | None, revision: int) -> Address:
-    """Return what a URL says; ``revision`` is that of the protocols it is read with."""
+    """Return the address of a URL; ``revision``: that of the protocols that read it."""
     return _read_address(url, model)
 
 

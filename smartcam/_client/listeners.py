@@ -102,7 +102,7 @@ class Listeners:
         """Return True if an observer or the log needs events, even without a subscriber."""
         return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ delivery
 
     def publish(self, event: CameraEvent) -> None:
         """Pass an event to its subscribers."""

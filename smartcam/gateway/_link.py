@@ -24,7 +24,7 @@ MAX_UNSENT_BYTES: Final = 1 << 16
 """Largest number of bytes that a robot which reads nothing may leave unsent."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
-"""Seconds without a byte until the system checks that the robot is there, and how often."""
+"""Seconds without a byte until the system checks the connection, and the repetitions."""
 
 _log = logging.getLogger("smartcam.gateway")
 
@@ -156,7 +156,7 @@ class RobotLink(asyncio.Protocol):
     def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            self._account.abandoned += 1  # another request's answer would seem to be its
+            self._account.abandoned += 1  # the robot would take another request's answer for its
             return
         self._account.errors += 1
         self._write(answer, tag)

@@ -246,8 +246,8 @@ def _cloud(site: CloudSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/clouds",
-    about="A WebSocket: the newest cloud after each `next`. JSON, which says how "
-    "many bytes follow; then these in parts: x, y, z as float32, red, green, blue as uint8.",
+    about="A WebSocket: the newest cloud after each `next`. JSON with the number of "
+    "bytes; then these in parts: x, y, z as float32, red, green, blue as uint8.",
 )
 async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)

@@ -232,8 +232,8 @@ async def _cameras(site: FleetSite, call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/table",
-    about="A WebSocket: what changed of the rows in sight, five times a second at most, the next "
-    "after each `next`; it is told as JSON, as in `/api/cameras`, which rows are in sight.",
+    about="A WebSocket: the changes of the rows in sight, five times a second at most, the next "
+    "after each `next`; the page sends the query for the rows as JSON, as in `/api/cameras`.",
 )
 async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)
@@ -255,8 +255,8 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     "GET",
     f"{API}/stored",
     query=StoredRows,
-    about="What agents' stores of results have: the query may have `hours`, `failed` (errors, "
-    "gaps, what did not pass), `camera` (a pattern), `most`.",
+    about="The contents of agents' stores of results: the query may have `hours`, `failed` "
+    "(errors, gaps, failures), `camera` (a pattern), `most`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
     return {"stores": [one._asdict() for one in await site.outlets.stored(call.query)]}
