@@ -47,7 +47,7 @@ def process(url: str, folder: Path, *options: str) -> Process:
 
 
 def touch(name: str) -> tuple[float, float, float]:
-    """Return where the robot touches a piece, metres."""
+    """Return the robot's position when it touches a piece, metres."""
     x, y, _ = PIECES[name]
     return (
         OFFSET[0] + x * math.cos(YAW) - y * math.sin(YAW),

@@ -195,7 +195,7 @@ class Sheet(ShowingDriver):
 
 @pytest.fixture
 def sheet_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have ``sheet://``."""
+    """Register ``sheet://``."""
     monkeypatch.setattr(FRAMES, "_registered", {"sheet": Sheet})
     monkeypatch.setattr(FRAMES, "_loaded", {})
 

@@ -88,7 +88,7 @@ Puts = Callable[..., None]
 
 @pytest.fixture
 def shelf(monkeypatch: pytest.MonkeyPatch) -> Puts:
-    """Have ``shelf://``; gives what puts frames there."""
+    """Register ``shelf://``; yield the function that puts frames there."""
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})
 

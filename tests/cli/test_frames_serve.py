@@ -54,7 +54,7 @@ class Shelf(ScriptedDriver):
 
 @pytest.fixture
 def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, BaseException]:
-    """Have ``shelf://NAME``; what is put here by a name is why that cannot be opened."""
+    """Register ``shelf://NAME``; yield the reasons, by name, why sources cannot be opened."""
     reasons: dict[str, BaseException] = {}
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})
@@ -68,7 +68,7 @@ def get(url: str) -> Any:
 
 
 def described(url: str) -> str:
-    """Return what an RTSP server answers to DESCRIBE, without a password."""
+    """Return an RTSP server's answer to DESCRIBE, without a password."""
     match = re.fullmatch(r"rtsp://(?:[^@]+@)?([^:/]+):(\d+)/.+", url)
     assert match is not None, url
     with socket.create_connection((match[1], int(match[2])), PATIENCE) as peer:

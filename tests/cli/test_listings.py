@@ -1,4 +1,4 @@
-"""Commands that need no camera: lists, help, the demo, and what is said without the extra."""
+"""Commands that need no camera: lists, help, the demo, and errors without the extra."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_dialects_of_options_are_those_of_the_protocol() -> None:
 
 
 def imported_for(python: str) -> set[str]:
-    """Return what lines of Python import, run by themselves; ``main`` runs without an end."""
+    """Return the imports of lines of Python in a new process; ``main`` runs without an end."""
     run_main = "def main(run):\n    try: run()\n    except SystemExit: pass\n"
     told = "print('imported:', *sorted(sys.modules))"
     shown = printed_by(f"import sys, smartcam._cli as cli\n{run_main}{python}\n{told}")

@@ -32,7 +32,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def read_by_the_library(path: Path) -> int:
-    """Return how many messages the mcap library reads of a file without an end."""
+    """Return the number of messages that the mcap library reads of a file without an end."""
     count = 0
     with path.open("rb") as stream:
         try:
@@ -152,7 +152,7 @@ def test_record_of_a_camera_that_sends_nothing_asks_for_every(tmp_path: Path) ->
 
 @contextlib.contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """Have files of this process refused to grow beyond ``size`` bytes."""
+    """Refuse that files of this process grow beyond ``size`` bytes."""
     resource = pytest.importorskip("resource", reason="a limit of POSIX")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))

@@ -252,7 +252,7 @@ def _serve_everybody(emulator: Any) -> None:
 
 
 def _stuck(_: Any, link: Any, data: bytes) -> bytes:
-    """Hear nothing more after a wrong magic number."""
+    """Receive nothing more after a wrong magic number."""
     link.stuck = getattr(link, "stuck", False) or data.startswith(b"\xaf")
     return b"" if link.stuck else data
 

@@ -32,7 +32,7 @@ BY_NAME = {check.name: check for check in CHECKS}
 async def findings(
     client: Client, dialect: str = "handbook", transport: str = "tcp", *, room: asyncio.Semaphore
 ) -> list[str]:
-    """Return what all checks find."""
+    """Return the findings of all checks."""
     checks = [check for check in CHECKS if check.applies(dialect, transport)]
 
     async def one(name: str) -> ClientRun:
@@ -140,7 +140,7 @@ SINS: dict[str, tuple[str, str]] = {
     "fails_where_garbage_comes": ("waits for ever", HANGS),
     "fails_where_a_length_is_impossible": ("waits for ever", HANGS),
 }
-"""For each check a client that fails it: its sin, and what is said of it."""
+"""For each check a client that fails it: its sin, and the text of the finding."""
 
 
 class Convictions:

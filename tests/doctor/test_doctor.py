@@ -43,7 +43,7 @@ def camera(active: int = 2, **options: Any) -> EmulatedCamera:
 
 
 def sent(emulator: EmulatedCamera) -> set[type[m.Message]]:
-    """Return what clients said."""
+    """Return the messages of clients."""
     return {type(e.message) for e in emulator.log if e.direction == "in" and e.message is not None}
 
 

@@ -1,4 +1,4 @@
-"""Asking an address in every registered protocol: what is tried, in which order, what is told."""
+"""Asking an address in every registered protocol: the tries, their order, and the report."""
 
 from __future__ import annotations
 

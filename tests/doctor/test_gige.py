@@ -98,7 +98,7 @@ MODE, MODE_TRIGGER, TRIGGER_SOURCE, LINK_SPEED = 0x12000, 0x12004, 0x12008, 0x12
 
 
 def described(*features: str) -> bytes:
-    """Return a description that has further features, where it has not got them."""
+    """Return a description with further features, if they are missing."""
     missing = [one for one in features if one.split('"')[1] not in DESCRIPTION]
     return DESCRIPTION.replace(
         '<Port Name="Device"/>', f'{"".join(missing)}<Port Name="Device"/>'
@@ -292,7 +292,7 @@ def namespace() -> list[str]:
 
 
 def there(namespace: list[str], situation: str) -> list[dict[str, Any]]:
-    """Return what is found of Aravis' fake camera in a situation, worst last."""
+    """Return the findings about Aravis' fake camera in a situation, worst last."""
     done = subprocess.run(  # noqa: S603
         [*namespace, sys.executable, "-m", "tests.doctor.gige_in_namespace", situation],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""Asking an address how it speaks: the order, what is kept of a try, what is left behind."""
+"""Asking an address for its language: the order, the record of a try, and no leftovers."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from tests.doctor.inside import Exit
 
 
 async def read(layout: str, values: Any, interpret_as: str | None, **more: Any) -> list[Finding]:
-    """Return what is found about a camera that sends ``values`` in ``layout``."""
+    """Return the findings about a camera that sends ``values`` in ``layout``."""
     application = Application(
         id=2, layout=layout, constant=values, load_time=0, processing_time=0.001
     )

@@ -41,7 +41,7 @@ class Line:
         self.delayed.put([Transmission(parts, faults=[text], **changes)])
 
     def at(self, seconds: float) -> list[str]:
-        """Return what has happened by ``seconds``, and forget it."""
+        """Return the events until ``seconds``, and forget them."""
         self.delayed.run()
         self.clock.advance(seconds - self.clock.now)
         seen, self.seen = self.seen, []

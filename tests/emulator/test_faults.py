@@ -269,8 +269,7 @@ def test_clear_forgets_all_and_keeps_the_record() -> None:
     )
     queue.clear()
     assert queue.waiting == []
-    rows = [*queue.on_camera, *queue.on_client, *queue.device_on_client, *queue.at_once()]
-    assert rows == []
+    assert [*queue.on_camera, *queue.on_client, *queue.device_on_client, *queue.at_once()] == []
 
 
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

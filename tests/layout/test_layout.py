@@ -840,7 +840,7 @@ def containers(draw: st.DrawFn) -> tuple[Layout, bytes]:
 
 
 def error_of(call: Callable[..., object], *args: object) -> Exception | None:
-    """Return what a call raises, None where it does not."""
+    """Return the error of a call, None without one."""
     try:
         call(*args)
     except Exception as exc:  # noqa: BLE001  the tests look at which it is

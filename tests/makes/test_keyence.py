@@ -239,7 +239,7 @@ async def test_bytes_of_a_code_come_as_they_are() -> None:
 
 
 async def scanned(emulator: EmulatedSr, times: int, **options: Any) -> list[str | None]:
-    """Return what vention-barcode-scanner reads."""
+    """Return the codes that vention-barcode-scanner reads."""
     keyence = pytest.importorskip("barcode_scanner.scanners.keyence")
     scanner = keyence.KeyenceScanner("left", "127.0.0.1", emulator.port, **options)
     assert await scanner.connect()

@@ -29,7 +29,7 @@ FIXED = [
 
 
 def read(made: Machine, data: bytes, now: float) -> list[Event]:
-    """Have it read bytes as a transport does, all at one time."""
+    """Make it read bytes as a transport does, all at one time."""
     events: list[Event] = []
     while data and made.state is not State.FAILED:
         room = made.room()

@@ -71,7 +71,7 @@ class Station:
         self.listen()
 
     def listen(self) -> None:
-        """Take what the client says, and what its machine tells."""
+        """Handle the client's messages, and the machine's events."""
         said = b"".join(self.machine.data_to_send())
         for ticket, what in re.findall(rb"(\d+)>(\w+)\n", said):
             if what == b"JOB":

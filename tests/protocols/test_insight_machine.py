@@ -1,4 +1,4 @@
-"""In-Sight native mode, the client's machine: to the byte, in pieces, and with what nobody says."""
+"""In-Sight native mode, the client's machine: to the byte, in pieces, and with wrong bytes."""
 
 from __future__ import annotations
 
@@ -493,7 +493,7 @@ REQUESTS: list[m.Message] = [one for one, _, _ in CONVERSATIONS] + [m.Connect(),
 
 
 def converse(requests: list[m.Message], pieces: list[bytes], *, login: bool) -> tuple[Any, ...]:
-    """Say and hear by turns; return all that was written and told."""
+    """Send and receive by turns; return all written bytes and events."""
     talk = Talk(CELLS, max_length=100)
     if login:
         talk.logged_in()

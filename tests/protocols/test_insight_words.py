@@ -226,7 +226,7 @@ each = pytest.mark.parametrize(("form", "heard", "answer"), FORMS)
 
 
 class Pieces:
-    """A reader and the pieces that it told of."""
+    """A reader and the pieces that it reported."""
 
     def __init__(self, max_length: int = 100) -> None:
         self.told: list[tuple[str, bool]] = []

@@ -473,7 +473,7 @@ def test_client_one_open_request_per_id(request_: m.Request, answer: m.Message) 
 @pytest.mark.parametrize("trace", [None, lambda *_: None], ids=["plain", "traced"])
 @pytest.mark.parametrize("together", [True, False])
 def test_client_query_that_is_sent_again_is_answered_twice(*, together: bool, trace: Any) -> None:
-    """One stands in front of a trigger and one behind it; a third one is refused."""
+    """One stands before a trigger and one after it; a third one is refused."""
     made = client(trace=trace)
     for turn in range(1, 4):  # what came before is known by its bytes
         made.send(m.Query(), again=True)
@@ -682,7 +682,7 @@ def test_camera_hears_a_chunk_that_came_before_as_one_that_did_not(
 
 
 def _said(made: Machine, message: m.Message) -> list[bytes] | None:
-    """Return the bytes that saying a message makes, None where it may not be said."""
+    """Return the bytes of a sent message, None if it is forbidden."""
     try:
         made.send(message)
     except LocalProtocolError:
@@ -840,7 +840,7 @@ def test_status_that_came_before_is_traced_each_time() -> None:
 
 
 APPLICATION = b"\x15\0\0" + MAGIC[:1]
-"""An id whose first bytes, with the next frame behind them, are read as it."""
+"""An id that the first bytes, with the next frame after them, are read as."""
 
 
 def result(data: bytes, application: int = 21) -> m.ResultContainer:
@@ -991,7 +991,7 @@ def test_containers_without_an_id_come_one_by_one_without_an_application(
 
 @pytest.mark.parametrize("before", [0, 1, 2])
 def test_bid_answer_to_disconnect_may_come_anywhere_and_is_expected(before: int) -> None:
-    """Before the session, while it is made, and behind it; once for each or more often."""
+    """Before the session, while it is made, and after it; once for each or more often."""
     answer = bytes.fromhex("02000200 0000")
     made = machine(Role.CLIENT, dialect=BID)
     steps = (m.Disconnect(), m.Connect(), m.Disconnect())
@@ -1108,7 +1108,7 @@ def test_camera_that_does_not_tell_drops_a_wrong_length() -> None:
 
 
 def asking(transport: Transport = TCP, *, kin: tuple[FramedDialect, ...] = KIN) -> Machine:
-    """Return a client that has said Disconnect and Connect and does not know to whom."""
+    """Return a client that has sent Disconnect and Connect to a camera of unknown dialect."""
     made = Machine(kin[0], Role.CLIENT, transport, kin=kin)
     made.send(m.Disconnect())
     made.send(m.Connect())

@@ -57,7 +57,7 @@ NONSENSE = Conversation(
 
 
 def fails(check: str, protocol: Protocol, **arguments: Any) -> str:
-    """Return what a check says against a protocol; it must say something."""
+    """Return a check's failure for a protocol; there must be one."""
     members = {"protocol": protocol, "conversations": (TALK, NONSENSE)}
     suite = type("TestBad", (WireSuite,), members)
     try:

@@ -1,4 +1,4 @@
-"""The proxy as a test uses it: addresses, rules, what it tells, and a real client behind it."""
+"""The proxy as a test uses it: addresses, rules, its log, and a real client through it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 CONNECT_ANSWER = 16
-"""Bytes of the answer to Connect in the dialect handbook; the status behind it has 20."""
+"""Bytes of the answer to Connect in the dialect handbook; the status after it has 20."""
 
 
 @pytest.mark.parametrize(

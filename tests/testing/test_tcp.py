@@ -51,7 +51,7 @@ from tests.testing.proxykit import (
 )
 
 BEHIND = b"abc"
-"""Bytes that the camera sends behind the message."""
+"""Bytes that the camera sends after the message."""
 
 
 class Write(NamedTuple):

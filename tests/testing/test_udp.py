@@ -31,7 +31,7 @@ class Linked(NamedTuple):
 
 @contextlib.asynccontextmanager
 async def linked(*rules: Rule, echo: bool = True) -> AsyncIterator[Linked]:
-    """An echo behind a proxy, and a client."""
+    """An echo server, a proxy before it, and a client."""
     async with (
         mailbox(echo=echo) as camera,
         LinkProxy(HOST, camera.port, transport="udp", rules=rules) as proxy,

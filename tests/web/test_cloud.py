@@ -35,7 +35,7 @@ class Looker:
         self.socket = socket
 
     async def cloud(self) -> tuple[dict[str, Any], Any, Any]:
-        """Return what is said of the next cloud, its points and colours."""
+        """Return the description of the next cloud, its points and colours."""
         async with asyncio.timeout(2 * SLOW):
             about = json.loads(await self.socket.receive_str())
             body = b""

@@ -88,7 +88,7 @@ async def said(page: Page) -> ColourRange:
 
 
 async def white(page: Page) -> np.ndarray[Any, Any]:
-    """Return which pixels of the mask on the page are white; frames of regions are not."""
+    """Return the white pixels of the mask on the page, without frames of regions."""
     data = await page.eval_on_selector(
         "#mask", "c => Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data)"
     )

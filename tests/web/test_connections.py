@@ -1,4 +1,4 @@
-"""The connections of a site: bounded in number, time and bytes, whoever opens them."""
+"""The connections of a site: bounded in number, time and bytes, for every client."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def places_of(world: World) -> Places[Visitor]:
 
 
 async def ended(raw: Raw) -> bytes:
-    """Return what comes until the site closes the connection."""
+    """Return everything received until the site closes the connection."""
     async with asyncio.timeout(60):
         try:
             return await raw.reader.read()

@@ -1,4 +1,4 @@
-"""The fleet's page at its WebSocket and its calls: what is told, to whom, and how much of it."""
+"""The fleet's page at its WebSocket and its calls: the messages, their readers, their bounds."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ MOST = 64_000
 
 
 class Looker:
-    """A browser's page, as far as it is told things."""
+    """A browser's page, as far as it receives messages."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
@@ -77,7 +77,7 @@ class Looker:
         return text
 
     async def until(self, condition: Any) -> str:
-        """Hear until something is true."""
+        """Receive until a condition is true."""
         while True:
             text = await self.hear()
             if condition():
@@ -102,7 +102,7 @@ class World(NamedTuple):
 
     @contextlib.asynccontextmanager
     async def looking(self, **sight: Any) -> AsyncIterator[Looker]:
-        """Look as the page does; who looks has heard what there is."""
+        """Connect as the page does; the viewer has received the first messages."""
         url = self.caller.url("/api/table")
         async with self.caller.session.ws_connect(url, protocols=[PROTOCOL]) as socket:
             looker = Looker(socket)

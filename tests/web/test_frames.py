@@ -1,4 +1,4 @@
-"""The site of pictures: who looks gets the newest frame, who is slow skips, nobody is no reader."""
+"""The site of pictures: viewers get the newest frame, slow ones skip, without viewers no reader."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Looker:
             return told
 
     async def picture(self) -> Shown:
-        """Return the next picture; it is not said that it was shown."""
+        """Return the next picture, without a report that it was shown."""
         async with asyncio.timeout(60):
             data = await self.socket.receive_bytes()
         end = 4 + int.from_bytes(data[:4], "little")

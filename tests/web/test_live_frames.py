@@ -1,4 +1,4 @@
-"""Frames of a fleet's camera on its live page, where it has some and while somebody looks."""
+"""Frames of a fleet's camera on its live page, if it has some and while there are viewers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class World(NamedTuple):
 
     @contextlib.asynccontextmanager
     async def looking(self, **options: Any) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-        """Look as the page does; what is told first was heard."""
+        """Connect as the page does; the first message was received."""
         url = self.caller.url("/api/frames")
         options = {"protocols": [PROTOCOL], **options}
         async with asyncio.timeout(60), self.caller.session.ws_connect(url, **options) as socket:
@@ -60,7 +60,7 @@ async def shown(plant: Plant, *, token: str | None = None) -> AsyncIterator[Worl
 
 
 async def next_picture(socket: aiohttp.ClientWebSocketResponse) -> tuple[dict[str, Any], Any]:
-    """Return what is said of the next picture, and its pixels."""
+    """Return the description of the next picture, and its pixels."""
     while True:
         message = await socket.receive()
         if message.type is aiohttp.WSMsgType.BINARY:
