@@ -25,6 +25,7 @@ import pytest
 
 from smartcam import exceptions
 from smartcam.camera import Camera
+from smartcam.depth import region_depth
 from smartcam.emulator import InSightQuirks, Quirks, faults
 from smartcam.models import Status
 from smartcam.protocols import BVS, FramedDialect, State
@@ -289,6 +290,13 @@ def test_documents_build_without_warnings(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_reference_tells_the_fields_of_a_returned_class_that_no_module_exports() -> None:
+    lines = ["Return the depth of a region."]
+    module_of("conf")._tell_returned(None, "function", "", region_depth, None, lines)
+    assert "``RegionDepth``: The depth of a region, and its errors." in lines
+    assert any(line.startswith("    sigma: standard deviation of ``median``") for line in lines)
 
 
 # ---------------------------------------------------------------------- promises, troubleshooting

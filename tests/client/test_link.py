@@ -9,16 +9,14 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from smartcam._client import link as connection
-from smartcam._client.doorbell import outlast
-from smartcam._client.link import open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
-from tests.client.inside import Chunk, Link
+from tests.client.inside import Chunk, Link, open_link, outlast
+from tests.client.inside import link as connection
 from tests.handmade import (
     BUSY,
     CONNECT,

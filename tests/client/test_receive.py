@@ -11,13 +11,10 @@ import pytest
 
 import smartcam
 from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
-from smartcam._client import link
-from smartcam._client.doorbell import DirectFuture, Doorbell
-from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
 from tests.client.clientkit import balance, by_hand
-from tests.client.inside import handshake
+from tests.client.inside import LARGEST_CHUNK, DirectFuture, Doorbell, handshake, link
 from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted, until
 
 # ---------------------------------------------------------------------- what comes early

@@ -19,7 +19,6 @@ from smartcam.inspection import (
     PartModel,
     Picture,
     Region,
-    Symmetry,
     TeachingError,
     TeachingTrouble,
     load_cell,
@@ -155,7 +154,7 @@ def test_model_is_the_same_from_its_file(tmp_path: Path) -> None:
     model.write(tmp_path / "bolt.model")
     assert (tmp_path / "bolt.model").stat().st_size < 50_000
     again = PartModel.read(tmp_path / "bolt.model")
-    assert (again.name, again.symmetry) == ("bolt", Symmetry(1))
+    assert (again.name, again.symmetry.fold, again.symmetry.alike) == ("bolt", 1, ())
     part = PlacedPart(PARTS["bolt"], 95.2, 103.7, 1.2)
     first, second = (
         locate(Picture(drawn(part)), [one], PartSearch()).parts[0] for one in (model, again)

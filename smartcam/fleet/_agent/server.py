@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
     from smartcam.inspection import SoftwareDevice
     from smartcam.observers import Observer
-    from smartcam.outlets import OutletState
+    from smartcam.outlets._inside import OutletState
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")

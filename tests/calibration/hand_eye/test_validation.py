@@ -18,7 +18,6 @@ from smartcam.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration._hand_eye.equations import PoseObservations, RobotPoses
 from smartcam.calibration._hand_eye.model_selection import Problem
 from smartcam.calibration._hand_eye.validation import (
     agreement,
@@ -28,7 +27,7 @@ from smartcam.calibration._hand_eye.validation import (
 )
 from smartcam.calibration.simulation import hand_eye_scene
 from smartcam.geometry._inside import Rigid
-from tests.calibration.inside import Setup
+from tests.calibration.inside import PoseObservations, RobotPoses, Setup
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
