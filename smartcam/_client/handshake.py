@@ -360,7 +360,7 @@ async def establish(
                 progress.end(exc, loop.time() - begin)
                 cause = exc
             if progress.hung_up:
-                # perhaps at the Disconnect: the next attempt leaves it out, the one after does not
+                # perhaps because of the Disconnect: attempts are made with and without it by turns
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):

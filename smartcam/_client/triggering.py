@@ -71,7 +71,7 @@ OVERTRIGGERED_GRACE = 1.0
 cannot show that the new trigger was dropped, so no trigger is sent."""
 
 MAX_SHARE_WITHOUT_WAIT = 0.5
-"""Share of a trigger's timeout; if less is left, the trigger had to wait."""
+"""A trigger with less than this share of its timeout left has had to wait."""
 
 MIN_TIMEOUT_SHARE = 0.01
 """Share of its timeout that a trigger which had to wait needs at least."""

@@ -79,9 +79,9 @@ class LineRow(NamedTuple):
         answer: message type of the answer; None for a request without an answer.
         read: function that makes one or several messages of the answer's line; a ValueError
             or LookupError means that the line is no answer.
-        word: word that the answer is matched by, in a dialect that splits answers: by default, and
-            always after the first line of a script, the first word of the line; "" for an answer
-            without a word of its own. A dialect with tickets needs it only for unasked lines.
+        word: word that matches the answer, if the dialect splits answers. Default, and always after
+            the first line of a script: the first word of the line; "" for an answer without its
+            own word. A dialect with tickets needs it only for unasked lines.
         echo: line that comes before the answer.
         until: first words that end an answer of several lines, which ``read`` gets joined by line
             feeds.
