@@ -33,8 +33,7 @@ CAMERA: Mapping[str, str] = {
     "--camera-switch-timeout": "seconds that loading an application may take (default 30)",
     "--camera-reboot-timeout": "seconds that a restart may take (default 180)",
     "--camera-sequence-offset": (
-        "offset of the sequence number (int32) in the application's results, bytes "
-        "after the application's id"
+        "offset of the sequence number (int32) in results, bytes after the application's id"
     ),
     "--camera-input": "input data that the application takes, as hex",
     "--camera-report": "file to write the report to, as JSON",

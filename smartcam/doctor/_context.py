@@ -195,7 +195,7 @@ class Examination:
     # findings that were not handed out yet
     pending: list[Finding] = field(default_factory=list[Finding])
 
-    def say(
+    def report(
         self,
         severity: Severity,
         text: str,
@@ -221,7 +221,7 @@ class Examination:
         self, text: str, cure: str = "", *, exit_code: Exit = Exit.NO_SESSION, **details: Any
     ) -> None:
         """Report an error."""
-        self.say("error", text, cure, exit_code=exit_code, **details)
+        self.report("error", text, cure, exit_code=exit_code, **details)
 
     def take(self) -> list[Finding]:
         """Return the findings since the last call."""

@@ -102,7 +102,7 @@ async def reach(exam: Examination) -> None:
     exam.stack.push_async_callback(end.close)
     exam.bus = end
     taken = 1e3 * (asyncio.get_running_loop().time() - begin)
-    exam.say(
+    exam.report(
         "ok",
         f"the bus at {place} answers, after {taken:.1f} ms",
         url=address._replace(camera="").url,
@@ -131,7 +131,7 @@ async def _certificates(exam: Examination, address: FleetAddress) -> bool:
         )
         return False
     warning = own.warning or ends_soon("the agent's certificate", theirs.ends)
-    exam.say(
+    exam.report(
         "hint" if warning else "ok",
         f"this program is {own}: it may look" + (", and command" if may_command(own.role) else ""),
         warning,
@@ -184,7 +184,7 @@ async def find(exam: Examination) -> None:
     else:
         names = [agent for _, agent in sharing]
         several = len(names) > 1
-        exam.say(
+        exam.report(
             "hint" if several else "ok",
             f"agent{'s' if several else ''} {', '.join(names)} of the fleet {fleets[0]} "
             f"{'have' if several else 'has'} this camera; cameras there: {details['cameras']}",
@@ -230,7 +230,7 @@ async def connect(exam: Examination) -> None:
         )
         return
     exam.camera, exam.connected_at = camera, loop.time()
-    exam.say(
+    exam.report(
         "ok",
         f"the agent has a session with the camera: dialect {camera.capabilities.dialect}, "
         f"protocol version {camera.protocol_version}",
@@ -261,7 +261,7 @@ async def reserve(exam: Examination) -> None:
         )
         return
     exam.wants_trigger = True
-    exam.say("ok", "the camera is reserved, so that no other program's triggers come between")
+    exam.report("ok", "the camera is reserved, so that no other program's triggers come between")
 
 
 def explain_loss(exam: Examination, error: SmartCamError) -> None:

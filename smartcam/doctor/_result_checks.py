@@ -123,14 +123,14 @@ async def look_at_results(exam: Examination) -> None:
             exit_code=Exit.UNREADABLE,
         )
     elif not containers and interpreter is not None:
-        exam.say(
+        exam.report(
             "hint",
             "no result came, so the layout was not compared with one",
             "With --trigger, or while the application runs free, there are results.",
         )
     elif containers and interpreter is None:
         sizes = sorted({len(result.raw) for result in containers})
-        exam.say(
+        exam.report(
             "ok",
             f"{len(containers)} results looked at, of {_listed(sizes)} bytes: "
             f"{hex_excerpt(containers[0].raw)}; --interpret-as compares them with a layout",
@@ -149,7 +149,7 @@ def _compare(exam: Examination, interpreter: Interpreter, containers: list[Resul
             _say_misfit(exam, interpreter, result, reading, reading.error)
             return
     fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
-    exam.say("ok", f"{len(readings)} results {fit}", results=len(readings))
+    exam.report("ok", f"{len(readings)} results {fit}", results=len(readings))
     if interpreter.layout is not None:
         # for localizations, integers are metres and radians, too; elsewhere they may count pixels
         integers = isinstance(interpreter, LocalizationsInterpreter)
@@ -284,7 +284,7 @@ def _look_at_values(
     for unit, magnitudes in converted.items():
         _ask_for_si(exam, unit, magnitudes)
     for name, value in nonsense.items():
-        exam.say(
+        exam.report(
             "hint",
             f"{name} has values such as {value:g}, which nothing measures",
             "A field before it is missing or has another type, so that all after it are shifted; "
@@ -297,7 +297,7 @@ def _look_at_values(
         rule = next((one for one in PLAUSIBLE if one.names.search(name)), None)
         if rule is not None and value > rule.most:
             kind = next(field for field in fields if field.name == name)
-            exam.say(
+            exam.report(
                 "hint",
                 f"{name} goes up to {value:g}: as {_SI[rule.quantity]} that is not plausible, it "
                 f"looks like {rule.text}",
@@ -317,7 +317,7 @@ def _ask_for_si(exam: Examination, unit: str, found: Mapping[str, float]) -> Non
         return
     made, names = UNITS[unit], ", ".join(found)
     symbol = SI_SYMBOLS[made.quantity]
-    exam.say(
+    exam.report(
         "hint",
         f"{names}: no more than {most * made.divide / made.multiply:.4g} {unit}, which looks like "
         f"{rule.text}: {rule.reason}",

@@ -67,7 +67,7 @@ async def resolve(exam: Examination) -> None:
     addresses = sorted({str(info[4][0]) for info in found})
     if addresses != [host]:
         text = f"{host} is {', '.join(addresses)}"
-        exam.say("ok", text, host=host, addresses=addresses)
+        exam.report("ok", text, host=host, addresses=addresses)
 
 
 # ---------------------------------------------------------------------- the session
@@ -115,7 +115,7 @@ def _say_session(
     measured = figures(times)
     link, dialect = exam.address.scheme, exam.address.dialect
     search = "" if first is None else f"; the first, which found the dialect, {1e3 * first:.1f} ms"
-    exam.say(
+    exam.report(
         "ok",
         f"a camera answers by {link}://, dialect {dialect}, protocol version "
         f"{camera.protocol_version}; {measured.times} connects: {measured}{search}",
@@ -125,7 +125,7 @@ def _say_session(
         connect_time=measured._asdict(),
     )
     for remark in remarks(exam.address):
-        exam.say("warning", remark)
+        exam.report("warning", remark)
 
 
 # ---------------------------------------------------------------------- no session
@@ -140,7 +140,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
         return None
     exam.pin(answer.url)
     if exam.address.scheme == own.scheme and own.dialect in {None, exam.address.dialect}:
-        exam.say(
+        exam.report(
             "warning",
             f"no session at first ({failure}), and one a moment later",
             "Once is no harm: the client tries again. If it happens often, look for another "

@@ -30,7 +30,7 @@ async def look_at_application(exam: Examination) -> None:
     active = await camera.query_application()
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     if wanted is None or (wanted == active and not exam.wants_trigger):
-        exam.say("ok", f"{called(active)} is active", **details)
+        exam.report("ok", f"{called(active)} is active", **details)
     elif wanted == 0:
         exam.wants_trigger = False  # triggers would run another application
         exam.fail(
@@ -42,7 +42,7 @@ async def look_at_application(exam: Examination) -> None:
     elif exam.wants_trigger:
         await _borrow(exam, active, wanted)
     else:
-        exam.say(
+        exam.report(
             "warning",
             f"{called(active)} is active, not {wanted}; whether the camera has {wanted} cannot "
             "be known without loading it",
@@ -68,7 +68,7 @@ async def _borrow(exam: Examination, active: int, wanted: int) -> None:
         return
     exam.wants_trigger = True
     text = f"application {wanted} is loaded and runs, for the triggers"
-    exam.say("ok", text, **details)
+    exam.report("ok", text, **details)
 
 
 async def give_back(exam: Examination) -> None:
@@ -78,7 +78,7 @@ async def give_back(exam: Examination) -> None:
     except LinkError:
         raise
     except SmartCamError as exc:
-        exam.say(
+        exam.report(
             "warning",
             f"the camera did not go back to how it was: {exc}",
             "Look with smartcam status, and load or start with smartcam switch and start.",
@@ -115,10 +115,10 @@ async def trigger(exam: Examination) -> None:
     measured = figures(times)
     rate = len(times) / max(ended - begin, sum(times))
     text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
-    exam.say("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
+    exam.report("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
     extra = camera.statistics().extra_results
     if extra:
-        exam.say(
+        exam.report(
             "hint",
             f"{extra} results more than triggers came: the application sends several for each",
             "Tell the client how many: camera.trigger(results_per_trigger=...).",

@@ -36,11 +36,11 @@ def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
     """Check that the camera ignores these bytes and answers a Query after them once."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        came = [one for one in client.heard[mark:] if one.message_id != MessageId.STATUS]
+        came = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
         results = of_kind(came, MessageId.RESULT_CONTAINER)
         if len(came) - len(results) != 1:
             raise Differs(f"no answer to {what}, one to the Query after it", client.words(mark))

@@ -91,11 +91,11 @@ def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
 
 
 def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
-    mark, under_way = len(client.heard), None
+    mark, under_way = len(client.received), None
     waiting, word = camera.wire.bits.waiting, camera.wire.word
-    sent_at = client.say(m.Trigger())
+    sent_at = client.send(m.Trigger())
     if camera.wire.is_bid:
-        client.say(m.GetStatus())
+        client.send(m.GetStatus())
         answer = client.until(
             MessageId.STATUS, camera.options.timeout, "an answer to Get status", mark=mark
         )
@@ -106,23 +106,23 @@ def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
             camera.options.timeout,
             "a status with Waiting for Trigger",
         )
-        return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+        return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
     deadline = sent_at + camera.options.timeout
     while (left := deadline - time.monotonic()) > 0:
-        so_far = ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+        so_far = ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
         if None not in so_far.places():
             break
         inspected = so_far.places()[2] is not None  # a result may still come
         if client.next(min(left, camera.options.quiet) if inspected else left) is None:
             break
-    return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+    return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
 
 
 def _wait_result(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
     """Wait for a result as long as one may take."""
     deadline = time.monotonic() + camera.options.timeout
     while (left := deadline - time.monotonic()) > 0:
-        if of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER):
+        if of_kind(client.received[mark:], MessageId.RESULT_CONTAINER):
             return
         client.next(left)
 
@@ -137,12 +137,12 @@ def unasked(camera: CameraUnderTest) -> ObservedRun:
     inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        sent_at = client.say(m.Trigger())
+        mark = len(client.received)
+        sent_at = client.send(m.Trigger())
         _wait_result(camera, client, mark)
         client.listen(camera.patience)
         seen = ObservedRun(
-            sent_at, client.heard[mark:], None, camera.wire.word, camera.wire.bits.waiting
+            sent_at, client.received[mark:], None, camera.wire.word, camera.wire.bits.waiting
         )
         if not seen.results:
             raise NotObserved(f"no result came of a trigger: {client.words(mark)}")
@@ -206,16 +206,16 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
     bits, rose_at, fell_at = camera.wire.bits, None, None
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger(), m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger(), m.Trigger())
         client.fence()
         deadline, place = time.monotonic() + 2 * takes + camera.options.quiet, mark
         while fell_at is None:
-            if place == len(client.heard):
+            if place == len(client.received):
                 left = deadline - time.monotonic()
                 if left <= 0 or client.next(left) is None:
                     break
-            heard, place = client.heard[place], place + 1
+            heard, place = client.received[place], place + 1
             if heard.message_id != MessageId.STATUS:
                 continue
             if not camera.wire.numbers(heard.body)[0] & bits.overtriggered:
@@ -224,7 +224,7 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
                 rose_at = heard.at
                 deadline = rose_at + camera.options.timeout
         client.listen(takes)
-        results = len(of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER))
+        results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
         return DoubleTrigger(results, rose_at, fell_at, client.words(mark))
 
 
@@ -242,8 +242,8 @@ def stopped_trigger(camera: CameraUnderTest) -> Stopped:
     takes = inspection_time(camera)
     with camera.session() as client:
         camera.stop(client)
-        mark = len(client.heard)
-        client.say(m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger())
         came = client.listen(takes + camera.options.quiet)
         return Stopped(came, client.words(mark))
 
@@ -279,13 +279,13 @@ def switch(camera: CameraUnderTest) -> Switch:
         if camera.active(client) == other:
             raise NotObserved(f"application {other} is the active one: name another application")
         camera.stop(client)
-        mark, began = len(client.heard), time.monotonic()
+        mark, began = len(client.received), time.monotonic()
         answer = client.answer(
             m.SwitchApplication(application=other), within=camera.options.switch_timeout
         )
         took = answer.at - began
         _wait_not_busy(camera, client, mark)
-        came = client.heard[mark:]
+        came = client.received[mark:]
         camera.measured["switch"] = took
         return Switch(other, came, answer, camera.active(client), took)
 
@@ -293,7 +293,7 @@ def switch(camera: CameraUnderTest) -> Switch:
 def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
     """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
-    words = camera.wire.statuses(client.heard[mark:])
+    words = camera.wire.statuses(client.received[mark:])
     if busy and any(one & busy for one in words) and words[-1] & busy:
         client.until(
             lambda one: (
@@ -322,7 +322,7 @@ def downtime(camera: CameraUnderTest) -> Downtime:
     """
     camera.require(Allow.REBOOT)
     with camera.session() as client:
-        began = client.say(m.Reboot())
+        began = client.send(m.Reboot())
         _wait_gone(camera, client)
     deadline = began + camera.options.reboot_timeout
     while time.monotonic() < deadline:
@@ -342,7 +342,7 @@ def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
     deadline = time.monotonic() + camera.options.timeout
     try:
         while time.monotonic() < deadline:
-            client.say(m.Query())
+            client.send(m.Query())
             if client.next(camera.patience) is None:
                 return
     except EndedError:

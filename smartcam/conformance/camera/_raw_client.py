@@ -56,7 +56,7 @@ class RawClient:
     _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
-        self.heard: list[Heard] = []  # every frame that came, in order
+        self.received: list[Heard] = []  # every frame that came, in order
         self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
@@ -104,7 +104,7 @@ class RawClient:
 
     # ------------------------------------------------------------------ out
 
-    def say(self, *messages: m.Message) -> float:
+    def send(self, *messages: m.Message) -> float:
         """Send requests, in one write on TCP and a datagram each on UDP; return the time.
 
         Raises:
@@ -120,7 +120,7 @@ class RawClient:
         return self.write(*[self.wire.request(message) for message in messages])
 
     def write(self, *data: bytes) -> float:
-        """Send any bytes; as :meth:`say`."""
+        """Send any bytes; as :meth:`send`."""
         for one in data:
             self._note(">", self.wire.spell_request(one))
         at = time.monotonic()
@@ -177,7 +177,7 @@ class RawClient:
         self._kept += len(body)
         if self._kept > MAX_HEARD_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
-        self.heard.append(heard)
+        self.received.append(heard)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]
         return heard
@@ -217,15 +217,15 @@ class RawClient:
             fits: id of the wanted message, or a function that is true for the wanted frame.
             within: seconds from now.
             expected: text of the difference if no such frame comes.
-            mark: a length of :attr:`heard`; default: only frames that come now.
+            mark: a length of :attr:`received`; default: only frames that come now.
 
         Raises:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
         is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
-        first = len(self.heard) if mark < 0 else mark
-        for heard in self.heard[first:]:
+        first = len(self.received) if mark < 0 else mark
+        for heard in self.received[first:]:
             if is_it(heard):
                 return heard
         deadline = time.monotonic() + within
@@ -238,15 +238,15 @@ class RawClient:
     def answer(self, request: m.Message, *, within: float | None = None) -> Heard:
         """Send a request and return its answer, which has its id; raises as :meth:`until`."""
         message_id = self.wire.dialect.message_id(request)
-        mark = len(self.heard)
-        self.say(request)
+        mark = len(self.received)
+        self.send(request)
         within = self._timeout if within is None else within
         return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
 
     def trigger(self, expected: str = "a result", *, within: float | None = None) -> Heard:
         """Send a trigger and return the next result; raises as :meth:`until`."""
-        mark = len(self.heard)
-        self.say(m.Trigger())
+        mark = len(self.received)
+        self.send(m.Trigger())
         within = self._timeout if within is None else within
         return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
 
@@ -257,21 +257,21 @@ class RawClient:
             Differs: the Query is not answered.
             EndedError: the camera ends the link.
         """
-        mark = len(self.heard)
+        mark = len(self.received)
         self.answer(m.Query())
-        return self.heard[mark:-1]
+        return self.received[mark:-1]
 
     def listen(self, seconds: float) -> list[Heard]:
         """Return the frames that come in so many seconds; the end of the link ends it."""
-        mark, deadline = len(self.heard), time.monotonic() + seconds
+        mark, deadline = len(self.received), time.monotonic() + seconds
         with contextlib.suppress(EndedError):
             while (left := deadline - time.monotonic()) > 0:
                 self.next(left)
-        return self.heard[mark:]
+        return self.received[mark:]
 
     def words(self, first: int = 0) -> str:
-        """Describe the frames from a place of :attr:`heard` on, for a difference."""
-        shown = [self.wire.spell(one) for one in self.heard[first:]]
+        """Describe the frames from a place of :attr:`received` on, for a difference."""
+        shown = [self.wire.spell(one) for one in self.received[first:]]
         if len(shown) > 5:
             shown = [*shown[:4], f"{len(shown) - 4} more"]
         end = ["the end of the link"] if self.ended else []
@@ -287,7 +287,7 @@ class RawClient:
             Differs: a request is not answered.
         """
         if self.wire.is_bid:
-            self.say(m.GetStatus())
+            self.send(m.GetStatus())
         self.fence()
         if self.status is None:
             raise NotObserved("the camera has sent no status")

@@ -31,7 +31,7 @@ def start_begins_run_mode(camera: CameraUnderTest) -> str:
     with camera.session() as client:
         camera.load(client, camera.application)
         camera.stop(client)
-        began = client.say(m.Start())
+        began = client.send(m.Start())
         client.wait_status(
             lambda word: word & bits.running, camera.options.timeout, "a status with Running"
         )
@@ -123,11 +123,11 @@ def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
     """Reset errors is answered with the code 0, and a status follows."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         answer = client.answer(m.ResetErrors())
         if camera.wire.numbers(answer.body) != (0,):
             raise Differs("the code 0", camera.wire.spell(answer))
-        behind = client.heard.index(answer) + 1
+        behind = client.received.index(answer) + 1
         client.until(
             MessageId.STATUS,
             camera.options.timeout,
@@ -143,11 +143,11 @@ def trigger_error_stays_until_reset(camera: CameraUnderTest) -> None:
     error = camera.wire.bits.overtriggered
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger(), m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger(), m.Trigger())
         client.listen(2 * takes + camera.options.quiet)
         word = client.look()
-        results = len(of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER))
+        results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
         if not word & error and results >= 2:
             raise NotObserved("the camera took both of two triggers at once")
         if not word & error:
@@ -175,7 +175,7 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         )
         camera.stop(client)
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         came = client.listen(2 * camera.options.quiet)
         if of_kind(came, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.words(mark))
@@ -188,7 +188,7 @@ def stop_ends_run_mode(camera: CameraUnderTest) -> None:
     with camera.session() as client:
         camera.load(client, camera.application)
         camera.start(client)
-        client.say(m.Stop())
+        client.send(m.Stop())
         word = client.wait_status(
             lambda word: not word & bits.running, camera.options.timeout, "a status without Running"
         )
@@ -207,13 +207,13 @@ def second_stop_is_harmless(camera: CameraUnderTest) -> None:
 def _changes_nothing(camera: CameraUnderTest, message: Message) -> None:
     with camera.session() as client:
         was = camera.running(client)
-        mark = len(client.heard)
-        client.say(message)
+        mark = len(client.received)
+        client.send(message)
         client.fence()
         client.listen(camera.options.quiet)
         now = camera.running(client)
         name = type(message).__name__
-        if of_kind(client.heard, camera.wire.dialect.message_id(message)):
+        if of_kind(client.received, camera.wire.dialect.message_id(message)):
             raise Differs(f"no answer to {name}", client.words(mark))
         if was != now:
             raise Differs(f"a second {name} changes nothing", client.words(mark))

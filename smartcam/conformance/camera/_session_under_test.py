@@ -165,7 +165,7 @@ class CameraUnderTest:
             with client:
                 yield client
         finally:
-            for heard in client.heard:
+            for heard in client.received:
                 self._learn_code(heard)
                 flaw = self.wire.flaw(heard)
                 if flaw is not None:
@@ -212,7 +212,7 @@ class CameraUnderTest:
             try:
                 client = attempt.enter_context(self.link())
                 if number:
-                    client.say(m.Disconnect())
+                    client.send(m.Disconnect())
                 self.greet(client)
             except (NotObserved, Differs, EndedError) as exc:
                 attempt.close()
@@ -297,7 +297,7 @@ class CameraUnderTest:
         if self.wire.is_bid or not client.look() & bits.running:
             return
         self.require(Allow.RUN)
-        client.say(m.Stop())
+        client.send(m.Stop())
         client.wait_status(
             lambda word: not word & bits.running, self.options.timeout, "a status without Running"
         )
@@ -308,7 +308,7 @@ class CameraUnderTest:
         if self.wire.is_bid or client.look() & bits.running:
             return
         self.require(Allow.RUN)
-        client.say(m.Start())
+        client.send(m.Start())
         client.wait_status(
             lambda word: word & bits.running, self.options.timeout, "a status with Running"
         )
@@ -324,7 +324,7 @@ class CameraUnderTest:
             return []
         self.require(Allow.SWITCH)
         self.stop(client)
-        mark = len(client.heard)
+        mark = len(client.received)
         answer = client.answer(
             m.SwitchApplication(application=application), within=self.options.switch_timeout
         )
@@ -341,7 +341,7 @@ class CameraUnderTest:
             self.options.switch_timeout,
             "a status that is not busy",
         )
-        return client.heard[mark:]
+        return client.received[mark:]
 
     def ready(self, client: RawClient) -> None:
         """Make sure that the application is loaded and waits for a trigger.

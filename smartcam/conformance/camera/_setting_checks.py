@@ -102,9 +102,9 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
             camera.load(client, camera.application)
             active = camera.active(client)
         camera.stop(client)
-        mark = len(client.heard)
+        mark = len(client.received)
         request = m.SwitchApplication(application=other)
-        client.say(request, request, m.Query())
+        client.send(request, request, m.Query())
         first = client.until(
             MessageId.QUERY_APPLICATION,
             camera.options.switch_timeout,
@@ -128,7 +128,7 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
 def _judge_second(
     camera: CameraUnderTest, client: RawClient, mark: int, query: Heard, active: int
 ) -> None:
-    switched = of_kind(client.heard[mark:], MessageId.SWITCH_APPLICATION)
+    switched = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
     answers = [camera.wire.numbers(one.body) for one in switched]
     numbers = camera.wire.numbers(query.body)
     if camera.wire.is_bid:
@@ -178,7 +178,7 @@ def _send_setting(
     """Send a request that a BVS ID acknowledges and a smart camera does not answer."""
     if not camera.wire.is_bid:
         message_id = camera.wire.dialect.message_id(request)
-        client.say(request)
+        client.send(request)
         if of_kind(client.fence(), message_id):
             raise Differs(f"no answer to {type(request).__name__}", client.words())
         return
@@ -285,11 +285,11 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
     bits = camera.wire.bits
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
+        mark = len(client.received)
         for _ in range(2):  # the first trigger clears the bit's history
             _send_setting(camera, client, m.SetInput(data=data), (0,))
             camera.once_waiting(client)
-            mark = len(client.heard)
+            mark = len(client.received)
             within = takes + camera.options.timeout
             client.trigger("a result of a trigger with input data", within=within)
         if client.look() & bits.input_container:
