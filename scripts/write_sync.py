@@ -141,7 +141,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
     as a cancellation does, of which each method of :class:`~smartcam.Camera` tells.
 
     Args:
-        camera: what it is the face of, not opened yet.
+        camera: asynchronous camera that this class wraps, not opened yet.
     """
 '''
 
@@ -158,7 +158,7 @@ READER_METHODS = {"statistics", "newest", "after"}
 
 NOTES = {
     "next_result": """\
-Where what causes it is started by the same thread, subscribe first::
+If the same thread starts what causes the result, subscribe first::
 
     with camera.results() as results:
         start_conveyor()

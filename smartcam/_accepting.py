@@ -4,17 +4,17 @@ Emulators, pages, the RTSP server and the link proxy use it. :class:`Places` dec
 connections may stay; it uses no socket and no clock. :class:`Acceptor` accepts them, and keeps the
 deadlines.
 
-- A newcomer always gets in as long as one of the others has no session: the one without a session
-  for longest makes room. One with a session never does. The server defines what a session is; a
-  request that needs none, such as OPTIONS, does not make one.
+- A newcomer always gets in as long as some connection has no session: the connection that has had
+  none for longest is closed. A connection with a session stays. The server defines what a session
+  is; a request that needs no session, such as OPTIONS, does not make one.
 - A connection without a session in time is closed, even if it has sent data.
 - One address gets at most three quarters of the places; the programs of this machine share one
   address, so loopback may have all.
 - Some file descriptors of the process are left to others. If only those are left, the connection
-  without a session for longest, of any server on this event loop, makes room.
+  without a session for longest, of any server on this event loop, is closed.
 
-Connections are not accepted by ``asyncio.Server``. A connection that it has accepted but not yet
-wrapped when it is closed stays open until the garbage collector finds it, and a client would wait
+Connections are not accepted by ``asyncio.Server``. A connection that the server has accepted, but
+not yet wrapped at its end, stays open until the garbage collector finds it, and a client would wait
 forever. And if no file descriptor is left, it writes a traceback for each place of its backlog,
 every second.
 """
@@ -41,8 +41,8 @@ if sys.platform != "win32":
     import resource
 
 ACCEPT_PAUSE = 1.0
-"""Seconds until the next attempt if the system has no socket left, and no connection can make
-room."""
+"""Seconds until the next attempt if the system has no socket left, and no connection can be
+closed."""
 
 BACKLOG: Final = 128
 """Number of connections that the system may queue before they are accepted."""
@@ -93,8 +93,8 @@ class Occupant(Protocol):
 @dataclass(slots=True)
 class _TakenPlace:
     peer: str  # address of the peer, without a port
-    since: float  # time at which it came, or last had a session
-    within: float  # seconds that it has from then on
+    since: float  # time at which the connection came, or last had a session
+    within: float  # seconds that the connection may stay from then on
     what: str  # name of the missing thing, for the log
     deadline: float
 
@@ -110,7 +110,7 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        what: reason for the log why such a connection is closed, "no session".
+        what: name of the missing thing, which the log gives as the reason for closing.
         own: name of a session in the log, "a session".
 
     Attributes:
@@ -129,9 +129,7 @@ class Places(Generic[G]):
         self.most = most
         self.crowded_out = 0
         self._within, self._what, self._own = within, what, own
-        self._places: dict[
-            G, _TakenPlace
-        ] = {}  # the one without a session for longest stands first
+        self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
         return len(self._places)
@@ -146,7 +144,7 @@ class Places(Generic[G]):
         """Give a newcomer a place; another connection may be closed for it.
 
         Returns:
-            "", or the reason why it gets none.
+            "", or the reason why the connection gets no place.
         """
         crowd, taken = list(self._places), f"{self.most} others are open"
         if len(crowd) < self.most:
@@ -178,7 +176,7 @@ class Places(Generic[G]):
             self._places[occupant] = place
 
     def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
-        """Set within how many seconds a connection must have a session; None: no limit.
+        """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
@@ -204,7 +202,7 @@ class Places(Generic[G]):
             self._send_away(found[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """End connections whose time is over; for one with a session the time begins again."""
+        """End connections whose time is over; a connection with a session gets new time."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
@@ -235,8 +233,8 @@ _here = _OnThisThread()
 class Acceptor(Generic[G]):
     """Gives each connection on a listening socket a protocol, which takes a place.
 
-    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when that is
-    lost.
+    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when it
+    is lost.
 
     Args:
         make: function that returns a new protocol. One made after :meth:`close` is for a connection
@@ -300,7 +298,7 @@ class Acceptor(Generic[G]):
     # ------------------------------------------------------------------ its connections
 
     def enter(self, occupant: G, address: Any) -> str:
-        """Give a new connection a place; return "", or why there is none.
+        """Give a new connection a place; return "", or the reason why it gets none.
 
         Args:
             occupant: the connection.
@@ -323,7 +321,7 @@ class Acceptor(Generic[G]):
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
     def expect(self, occupant: G, within: float | None, what: str) -> None:
-        """Set within how many seconds a connection must have a session; None: no limit.
+        """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
@@ -374,7 +372,7 @@ class Acceptor(Generic[G]):
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
             return  # the client has closed the connection already
         except OSError as exc:  # no file descriptor is left: the reader would be called endlessly
-            self._tell(f"a connection cannot be accepted: {exc}")
+            self._warn_once(f"a connection cannot be accepted: {exc}")
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock)
             pause = 0.0 if _make_room() else ACCEPT_PAUSE
@@ -388,13 +386,13 @@ class Acceptor(Generic[G]):
             try:
                 connection, _ = await loop.sock_accept(sock)
             except OSError as exc:
-                self._tell(f"a connection cannot be accepted: {exc}")
+                self._warn_once(f"a connection cannot be accepted: {exc}")
                 await asyncio.sleep(0.0 if _make_room() else ACCEPT_PAUSE)
             else:
                 self._admit(connection)
 
-    def _tell(self, what: str) -> None:
-        """Say once that nothing can be accepted, until it can be again."""
+    def _warn_once(self, what: str) -> None:
+        """Log that nothing can be accepted; once, until accepting works again."""
         if not self._scarce:
             self._log.warning("! %s", what)
         self._scarce = True
@@ -407,7 +405,7 @@ class Acceptor(Generic[G]):
             self._moving += 1
             asyncio.get_running_loop().call_soon(self._move, connection)
         else:
-            self._tell("a connection was refused: the process has too few file descriptors left")
+            self._warn_once("a connection was refused: too few file descriptors are left")
             connection.close()
 
     def _move(self, connection: socket.socket) -> None:
@@ -428,7 +426,7 @@ class Acceptor(Generic[G]):
         self._scarce = False
         connection.setblocking(False)
         with contextlib.suppress(OSError):  # the connection is gone again
-            # asyncio does so only where the listening socket was made with the protocol's number
+            # asyncio does so only if the listening socket was made with the protocol's number
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.adopt(connection)
 

@@ -1,7 +1,7 @@
 """Name the argument of a function that is of a wrong kind.
 
-Only kinds are checked: which numbers, shapes or words can work says the function itself, by an
-error of its own.
+Only kinds are checked. For numbers, shapes or words that cannot work, the function raises an error
+of its own.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ R = TypeVar("R")
 
 
 def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function to say which argument is of a wrong kind, where it does not itself.
+    """Decorate a function to name the argument that is of a wrong kind.
 
     The function is called first, and an error of the library comes out as it is. After any other
     error the checks look at the arguments of these names. The first that finds one of a wrong kind
     raises a ConfigurationError, whose text begins with the function's name, or with the class' for
     an ``__init__``. If all are of the right kind, the function is called once more, with the plain
-    values that the checks return: a text or number of a class of somebody's own may have failed it.
-    So it must be a function that may be called twice.
+    values that the checks return, since a subclass of ``str`` or ``float`` may have failed it. So
+    the function has to allow a second call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -79,7 +79,7 @@ def a_finite_number(value: Any, what: str, who: str) -> Any:
 
 
 def an_integer(value: Any, what: str, who: str) -> Any:
-    """Return a plain integer of at most 64 bits, whichever it is; ``bool`` is not one."""
+    """Return a plain integer of at most 64 bits; ``bool`` is not one."""
     number = plain(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number
@@ -95,7 +95,7 @@ def numbers(value: Any, what: str, who: str) -> Any:
     """Return an array of numbers, of any shape."""
     import numpy as np
 
-    with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+    with contextlib.suppress(Exception):  # a class of the user may raise anything
         found = np.asarray(value)
         if found.dtype.kind in "fiubO":  # objects: fractions, and integers too large for numpy's
             return found.astype(np.float64)
@@ -103,7 +103,7 @@ def numbers(value: Any, what: str, who: str) -> Any:
 
 
 def as_array(value: Any, what: str) -> Any:
-    """Return an array of of whatever kind that came.
+    """Return a value as an array of any kind.
 
     Raises:
         ConfigurationError: the value is no array.
@@ -112,12 +112,12 @@ def as_array(value: Any, what: str) -> Any:
 
     try:
         return np.asarray(value)
-    except Exception as exc:  # whatever a class of somebody's raises there
+    except Exception as exc:  # a class of the user may raise anything
         raise wrong_argument(what, "an array", value) from exc
 
 
 def of_class(name: str) -> Check:
-    """Return a check for an object of a class of this name, which need not be imported for it."""
+    """Return a check for an object of a class of this name, which need not be imported."""
 
     def check(value: Any, what: str, who: str) -> Any:
         if any(one.__name__ == name for one in cast("Any", type(value)).__mro__):
@@ -135,7 +135,7 @@ def a_target(value: Any, what: str, who: str) -> Any:
 
 
 def each(check: Check, count: int | None = None) -> Check:
-    """Return a check for a list of what another check takes, with so many items if that is said."""
+    """Return a check for a list whose items pass ``check``, with ``count`` items if given."""
 
     def check_each(value: Any, what: str, who: str) -> Any:
         items = a_list(value, what, who)
@@ -147,7 +147,7 @@ def each(check: Check, count: int | None = None) -> Check:
 
 
 def or_none(check: Check) -> Check:
-    """Return a check that takes None, too."""
+    """Return a check that accepts None, too."""
 
     def check_unless_none(value: Any, what: str, who: str) -> Any:
         return None if value is None else check(value, what, who)

@@ -1,11 +1,11 @@
 """Checks of the values that users, and other people's programs, give.
 
-Each function returns the plain value, which only then is used: an ``int`` or ``str`` of a subclass
-may compare, hash and print as it likes. A value that cannot work is a
-:exc:`~smartcam.ConfigurationError` that says which argument it is, what was expected, and what
-came. Nothing is searched, sent or waited for.
+Each function returns the plain value, and only that value is used: an ``int`` or ``str`` of a
+subclass may compare, hash and print as it likes. A value that cannot work is a
+:exc:`~smartcam.ConfigurationError` that names the argument, the expected value, and the given
+value. Nothing is searched, sent or waited for.
 
-``who`` names whose argument it is, such as a camera; "" if the argument's name says it all.
+``who`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_SECONDS = 1e9
 """Seconds that a time may have at most, about 31 years: more would overflow a loop's timer."""
 
 MAX_TEXT_LENGTH = 10_000
-"""Largest number of characters that a text may have, where no smaller bound is given."""
+"""Largest number of characters that a text may have, if no smaller bound is given."""
 
 MAX_DATA_BYTES = 1 << 30
 """Largest number of bytes that a byte string may have; the largest payload that a client may
@@ -75,9 +75,9 @@ def wrong_argument(what: str, expected: str, value: object, who: str = "") -> Co
 def check_integer(
     value: object, what: str, least: int, most: int | None = None, who: str = ""
 ) -> int:
-    """Return an integer from ``least`` to ``most``; None: it may be as large as it likes.
+    """Return an integer from ``least`` to ``most``; None: without an upper limit.
 
-    Integers of numpy and others with ``__index__`` are integers, ``bool`` is not one.
+    Integers of numpy and others with ``__index__`` are accepted, ``bool`` is not.
     """
     number = value if type(value) is int else _as_integer(value)
     if number is None or number < least or (most is not None and number > most):
@@ -98,7 +98,7 @@ def _as_integer(value: Any) -> int | None:
 def plain(value: object) -> object:
     """Return the plain value of a number, truth value or text of any class; others as they are.
 
-    It is what pydantic's strict types are given, which would refuse those of numpy.
+    Pydantic's strict types get the plain value, since they refuse numpy's numbers.
     """
     kind = type(value)
     if kind in {int, float, str, bool} or isinstance(value, bool):
@@ -126,7 +126,7 @@ def check_number(
 ) -> float:
     """Return a finite number from ``least`` to ``most``; with ``above``, one above ``least``.
 
-    Numbers of numpy and fractions are numbers; ``bool``, texts and arrays are not valid.
+    Numbers of numpy and fractions are accepted; ``bool``, texts and arrays are not.
     """
     number = value if type(value) is float else _as_float(value)
     if number is None or not least <= number <= most or (above and number == least):
@@ -178,7 +178,7 @@ def check_age(value: object, what: str, who: str = "") -> float:
 
 
 def check_flag(value: object, what: str, who: str = "") -> bool:
-    """Return True or False, which numpy has of its own, too."""
+    """Return True or False; numpy's truth values are accepted, too."""
     if isinstance(value, bool):
         return value
     if _is_numpy_bool(value):
@@ -194,7 +194,7 @@ def _is_numpy_bool(value: object) -> bool:
 def check_text(
     value: object, what: str, who: str = "", *, least: int = 0, most: int = MAX_TEXT_LENGTH
 ) -> str:
-    """Return a text of ``least`` to ``most`` characters, which UTF-8 has bytes for."""
+    """Return a text of ``least`` to ``most`` characters that UTF-8 can encode."""
     if isinstance(value, str):
         text = str.__str__(value)
         if least <= len(text) <= most and (text.isascii() or not _has_surrogates(text)):
@@ -211,19 +211,19 @@ def _has_surrogates(text: str) -> bool:
 
 
 def check_choice(value: object, what: str, known: Collection[str], who: str = "") -> str:
-    """Return a word that is one of those known."""
+    """Return a word that is one of the known words."""
     if isinstance(value, str) and str.__str__(value) in known:
         return str.__str__(value)
     raise wrong_argument(what, " or ".join(map(repr, known)), value, who)
 
 
 def check_bytes(value: object, what: str, who: str = "") -> bytes:
-    """Return a byte string: bytes, or what lends its bytes, such as a ``bytearray``."""
+    """Return a byte string: bytes, or an object with a buffer, such as a ``bytearray``."""
     if type(value) is bytes:
         return value
-    with contextlib.suppress(Exception):  # it lends nothing, or is too odd for it
+    with contextlib.suppress(Exception):  # the object has no buffer, or fails to give it
         view = memoryview(cast("Any", value))
-        if view.ndim and view.nbytes <= MAX_DATA_BYTES:  # a number of numpy lends bytes, too
+        if view.ndim and view.nbytes <= MAX_DATA_BYTES:  # a number of numpy has a buffer, too
             return view.tobytes()
     raise wrong_argument(what, f"bytes, {MAX_DATA_BYTES} at most", value, who)
 
@@ -236,15 +236,15 @@ def check_callable(value: FunctionT, what: str, who: str = "") -> FunctionT:
 
 
 def check_kind(value: T, kind: type[Any], what: str, expected: str, who: str = "") -> T:
-    """Return an object of a class; ``expected`` says in words what that is."""
+    """Return an object of a class; ``expected`` describes the class in words."""
     if not isinstance(value, kind):
         raise wrong_argument(what, expected, value, who)
     return value
 
 
 def check_all(value: Iterable[T], what: str, expected: str, who: str = "") -> tuple[T, ...]:
-    """Return the items of what can be gone through; a text is none of these."""
-    with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+    """Return the items of an iterable; a text is refused."""
+    with contextlib.suppress(Exception):  # a class of the user may raise anything
         if not isinstance(value, (str, bytes)):
             return tuple(value)
     raise wrong_argument(what, expected, value, who)
@@ -263,7 +263,7 @@ def check_time(value: datetime, what: str, who: str = "") -> datetime:
 
 
 def check_application(value: object, what: str = "application", who: str = "") -> int:
-    """Return an application's id; 0, which no camera may have, is the camera's to refuse."""
+    """Return an application's id; 0 passes, since the camera itself refuses it."""
     return check_integer(value, what, 0, MAX_APPLICATION_ID, who)
 
 
@@ -285,10 +285,10 @@ def check_message_id(value: object, what: str = "message_id", who: str = "") -> 
 
 
 def check_path(value: object, what: str, who: str = "") -> Path:
-    """Return the path of a file or folder: a text, or what stands for one, such as a ``Path``."""
+    """Return the path of a file or folder: a text, or an object such as a ``Path``."""
     text: object = value
     if isinstance(value, os.PathLike):
-        with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+        with contextlib.suppress(Exception):  # a class of the user may raise anything
             text = os.fspath(cast("os.PathLike[str]", value))
     if isinstance(text, str):
         path = str.__str__(text)
@@ -311,12 +311,12 @@ def fspath_of(value: object) -> object:
 
 
 def check_seed(value: object, who: str = "") -> int:
-    """Return the seed of what is left to chance: any integer of 64 bits."""
+    """Return the seed of random choices: any integer of 64 bits."""
     return check_integer(value, "seed", -(1 << 63), (1 << 64) - 1, who)
 
 
 def check_port(value: object, who: str = "") -> int:
-    """Return the number of a port to listen on; 0 is any that is free."""
+    """Return the number of a port to listen on; 0 means any free port."""
     return check_integer(value, "port", 0, 0xFFFF, who)
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import socket
 
 MAX_DATAGRAM_BYTES = 1 << 16
-"""Largest number of bytes that one read makes room for: UDP's length field, 16 bits, cannot say
+"""Largest number of bytes of one read: UDP's length field, 16 bits, cannot say
 more."""
 
 

@@ -80,7 +80,7 @@ def load(name: str, use: str = "") -> Any:
 
 
 def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
-    """Return the error that says which extra to install for a module.
+    """Return the error that names the extra to install for a module.
 
     Args:
         name: dotted name of the module.

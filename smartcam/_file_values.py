@@ -36,7 +36,7 @@ _PATTERN = re.compile(r"[a-z0-9_*-]+(?:/[a-z0-9_*-]+)*", re.ASCII)
 
 
 def _amount(units: Mapping[str, int], least: float, most: float, example: str) -> Any:
-    """Return the validator of a number with a unit, in any case of letters, or without a unit."""
+    """Return a validator of numbers, with or without a unit, in upper or lower case."""
     known = {unit.lower(): factor for unit, factor in units.items()}
     text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
 
@@ -91,7 +91,7 @@ Patterns = Annotated[
 
 
 def chosen(patterns: Sequence[str], camera: str) -> bool:
-    """Return True if a camera of this name is meant by one of the patterns."""
+    """Return True if one of the patterns matches the camera's name."""
     return any(_matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in patterns)
 
 
@@ -110,7 +110,7 @@ def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits
 
 
 def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
-    """Return places in a pattern with those behind what may stand for nothing."""
+    """Add to places in a pattern the places after parts that may match nothing."""
     for place, one in enumerate(pattern):
         if place in places and one == many:
             places = places | {place + 1}

@@ -1,4 +1,4 @@
-"""Closing what is open to its end, whoever is cancelled meanwhile."""
+"""Close resources completely, even if the caller is cancelled meanwhile."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 
 async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Close something to its end in a task of its own; it has to be bounded, and idempotent.
+    """Close a resource completely in a task of its own; closing has to be bounded and idempotent.
 
-    Where that task is cancelled, perhaps before its first step, the caller does what is left.
+    If that task is cancelled, perhaps before its first step, the caller closes the resource.
 
     Raises:
-        Exception: what closing raises.
+        Exception: the error of closing.
 
-    Cancellation: takes effect when it is closed.
+    Cancellation: takes effect when the resource is closed.
     """
     closing = asyncio.ensure_future(close())
     cancelled: asyncio.CancelledError | None = None
@@ -35,12 +35,12 @@ async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
 
 async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -> None:
-    """Close several things side by side; each closing has to be bounded, and idempotent.
+    """Close several resources side by side; each closing has to be bounded and idempotent.
 
-    Where the task of one is cancelled, perhaps before its first step, the caller closes it.
+    If the task of one is cancelled, perhaps before its first step, the caller closes the resource.
 
     Raises:
-        Exception: what the first one raises, when all have ended.
+        Exception: the first error, when all have ended.
 
     Cancellation: passed on to each; takes effect when all have ended.
     """

@@ -1,8 +1,8 @@
 """Forget, in a fork of this process, the locks that other threads held, and the threads.
 
 A fork has one thread, the one that called it, and a copy of all else. A lock that another thread
-held at that moment stays locked in the copy without end, and what another thread was to do is
-never done. So nothing here is a lock of a module, and objects that have one are told.
+held at that moment stays locked in the copy forever, and the work of other threads is never
+finished. So no module here has a lock of its own, and objects with locks are notified.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 
 class KnowsForks(Protocol):
-    """An object that is told of forks."""
+    """An object that is notified of forks."""
 
     def forked(self) -> None:
-        """Start anew in a fork: no other thread is there, and nothing may be waited for."""
+        """Start anew in a fork: no other thread runs there; do not wait."""
 
 
-_told: weakref.WeakSet[Any] = weakref.WeakSet()
+_notified: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def tell_of_forks(one: KnowsForks) -> None:
-    """Have an object told, in each fork, that it is there; as long as it lives."""
-    _told.add(one)
+    """Notify an object of each fork, in the fork, as long as the object lives."""
+    _notified.add(one)
 
 
 def _tell_all() -> None:
-    for one in tuple(_told):
+    for one in tuple(_notified):
         one.forked()
 
 

@@ -31,7 +31,7 @@ def result_html(result: Result) -> str:
         "received": f"{result.received_at:%Y-%m-%d %H:%M:%S} UTC",
         "latency": "" if result.latency is None else f"{1e3 * result.latency:.0f} ms",
         "raw": f"{len(result.raw)} bytes",
-        "value": _said(value),
+        "value": _value_text(value),
     }
     rows = [[name, str(text)] for name, text in fields.items() if text != ""]
     if shown:
@@ -39,7 +39,7 @@ def result_html(result: Result) -> str:
     return _table((), rows) + (records_html(value) if _is_records(value) else "")
 
 
-def _said(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """Return the text of a value in the table of its result."""
     if _is_parts(value):
         return f"{len(value)} localizations"

@@ -1,6 +1,6 @@
-"""Values as JSON's text: that of ``json.dumps(jsonable(value))`` without white space, but faster.
+"""Write values as JSON, like ``json.dumps(jsonable(value))`` without white space, but faster.
 
-What is not of the types that a client makes goes through :func:`smartcam.models.jsonable` itself.
+Values of other types than the client's go through :func:`smartcam.models.jsonable`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 MIN_HEX_CHARACTERS = 1024
-"""Characters of a text from which on it pays to look whether it is nothing but hex, which needs no
-quoting: that takes most of the time of a large container."""
+"""Least number of characters of a text that may be hex. Hex needs no quoting, which takes most of
+the time of a large container."""
 
 NULL = "null"
 
@@ -33,10 +33,10 @@ _FORMS = {"i": "%d", "u": "%d", "f": "%r", "S": "%s"}
 """Forms of the values in a table's columns, by the columns' kinds."""
 
 MAX_FLOAT_BYTES = 8
-"""Bytes of a float that numpy gives as one of Python's."""
+"""Largest size of numpy's floats that become Python's floats, in bytes."""
 
 _COLUMNS = frozenset("iufbS")
-"""Kinds of a table's columns whose values numpy gives as Python's."""
+"""Kinds of a table's columns whose values become Python's own."""
 
 _quoted: Callable[[str], str] = encode_basestring_ascii
 _encode = json.JSONEncoder(separators=(",", ":")).encode
@@ -75,7 +75,7 @@ def text_of(value: object) -> str:
 
 
 _latest: list[tuple[datetime, str]] = [(_EPOCH, f'"{_EPOCH.isoformat()}"')]
-"""The time that was written last, and its text: a result and its parts have the same one."""
+"""The time written last, and its text, since a result and its parts share a time."""
 
 
 def _time_text(at: datetime) -> str:
@@ -87,7 +87,7 @@ def _time_text(at: datetime) -> str:
 
 
 def hex_text(text: str) -> str:
-    """Return the text of a string that is hex, most likely."""
+    """Return the JSON text of a string that is probably hex."""
     if (
         len(text) > MIN_HEX_CHARACTERS
         and text.isascii()
@@ -110,7 +110,7 @@ def _container_text(value: object) -> str:
             return text
     try:
         return _encode_finite(plain(value))
-    except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not
+    except (TypeError, ValueError):  # NaN, infinity, or a type of numpy
         return _encode(jsonable(value))
 
 
@@ -120,14 +120,14 @@ def _is_table(value: object) -> bool:
 
 
 def _table_text(table: Any) -> str | None:
-    """Return the text of a table's rows; None where it is to be made in another way."""
+    """Return the text of a table's rows; None if :func:`jsonable` has to make it."""
     row = _row_form(table.dtype)
     if table.ndim != 1 or row is None:
         return None
     form, texts, numbers = row
     rows: list[tuple[Any, ...]] = table.tolist()
     if numbers and not math.isfinite(sum([one[place] for one in rows for place in numbers])):
-        return None  # a sum is not finite where one of them is not
+        return None  # the sum is not finite if a value is not
     if texts:
         rows = [
             tuple(
@@ -141,7 +141,7 @@ def _table_text(table: Any) -> str | None:
 
 @functools.lru_cache(maxsize=256)
 def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
-    """Return the form of a row, the places of its texts and of its floats; None for other ones."""
+    """Return the form of a row, the places of its texts and floats; None for other columns."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
         one.kind not in _FORMS or (one.kind == "f" and one.itemsize > MAX_FLOAT_BYTES)
@@ -158,7 +158,7 @@ def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
 
 
 def _parts_text(value: list[object]) -> str | None:
-    """Return the text of localizations; None if it is to be made in another way."""
+    """Return the text of localizations; None if :func:`jsonable` has to make it."""
     texts: list[str] = []
     header: object = None
     header_text = ""
@@ -173,8 +173,8 @@ def _parts_text(value: list[object]) -> str | None:
             return None
         numbers = quality, *position, *orientation
         if not _FLOAT.issuperset(map(type, numbers)) or not math.isfinite(sum(numbers)):
-            return None  # a sum is not finite where one of them is not
-        if of is not header:  # they have the same one
+            return None  # the sum is not finite if a value is not
+        if of is not header:  # parts of one result share a header
             if type(of) is not Header:
                 return None
             header, header_text = of, _HEADER % (*map(text_of, of),)

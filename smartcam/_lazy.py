@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 
 def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a package's door, having given the door its ``__dir__``.
+    """Return the ``__getattr__`` of a package's door, and set the door's ``__dir__``.
 
-    For type checkers the door imports the same names where ``TYPE_CHECKING`` is set.
+    For type checkers the door imports the same names if ``TYPE_CHECKING`` is set.
 
     Args:
         door: name of the package, or of its module ``_inside``.
-        names: module of the package to the names that stand in it, with spaces between them. A
-            name that is itself a module stands at its parent with a dot behind, or at ``""``. What
-            begins with ``smartcam.`` is another room.
+        names: maps each module of the package to its names, separated by spaces. A submodule is a
+            name, too, below its parent's name and a dot, or below ``""``. A key that begins
+            with ``smartcam.`` is a module of another room.
     """
     homes = {name: module for module, found in names.items() for name in found.split()}
     own = vars(sys.modules[door])

@@ -1,6 +1,6 @@
-"""Locks on open files, which the system takes away from a process that ends, however it ends.
+"""Lock open files; the system releases a lock when its process ends, however it ends.
 
-They hold among processes and among open files of one process.
+A lock excludes other processes, and other open files of the same process.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ else:
     import fcntl
 
 PLACE = 1 << 62
-"""The byte that is locked on Windows, which keeps others from what is locked: behind all data."""
+"""Offset of the byte that is locked on Windows: after all data, which others may then still use."""
 
 _HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK})
 
 
 def try_lock(descriptor: int) -> bool | None:
-    """Lock an open file, whose place does not change.
+    """Lock an open file without moving its position.
 
     Returns:
-        Whether it is ours now, not another one's; None if the file system knows no locks.
+        True if this process has the lock now, False if another has it; None without such locks.
     """
     try:
         if sys.platform == "win32":

@@ -23,12 +23,12 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 CALL_TIMEOUT = 10.0
-"""Seconds that a call into the thread may take that has no deadline of its own. A call normally
-takes well under a millisecond; if it takes longer, a function in the thread, such as a generator of
-an application, does not return."""
+"""Seconds for a call into the thread without its own deadline. A call normally takes well
+under a millisecond; a longer one means that a function in the thread does not return, such as a
+generator of an application."""
 
 MAX_LOCK_WAIT_TIME = 0.1
-"""Longest delay of Ctrl-C, seconds, if it does not interrupt a lock's wait: on Windows, and
+"""Seconds that Ctrl-C may be delayed if it does not interrupt the wait for a lock: on Windows, and
 elsewhere if it comes between the lock's look for signals and its wait."""
 
 
@@ -64,7 +64,7 @@ class _Mailbox:
         self._functions.append(function)
         if not self._closed:
             self._wake()
-        elif function in self._functions:  # otherwise it was called with the last ones
+        elif function in self._functions:  # otherwise close() has called it
             self._functions.remove(function)
             raise ConfigurationError("the thread of the event loop has ended")
 
@@ -76,7 +76,7 @@ class _Mailbox:
         self._call_all()
 
     def __del__(self) -> None:
-        if self._counter is not None:  # no thread writes to it any more
+        if self._counter is not None:  # no thread writes to the counter any more
             os.close(self._counter)
 
     def _wake(self) -> None:
@@ -98,7 +98,7 @@ class _Mailbox:
 class _ThreadCall:
     """A call into the thread: begun there, awaited in another.
 
-    A lock and one wake-up each way: half of what ``asyncio.run_coroutine_threadsafe`` takes.
+    A lock and one wake-up each way: half as many as ``asyncio.run_coroutine_threadsafe`` takes.
     """
 
     __slots__ = (
@@ -115,7 +115,7 @@ class _ThreadCall:
     )
 
     def __init__(self, mailbox: _Mailbox, function: Callable[[], object]) -> None:
-        # wait() begins the call, so that the thread that began it is there to end it
+        # wait() begins the call, so that the thread that begins it can also end it
         self._mailbox = mailbox
         self._function = function
         self._task: asyncio.Task[Any] | None = None
@@ -129,7 +129,7 @@ class _ThreadCall:
         """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
 
         Args:
-            timeout: seconds; None if what is called has deadlines of its own.
+            timeout: seconds; None if the called function has its own deadlines.
         """
         try:
             self._mailbox.post(self._begin)
@@ -210,7 +210,7 @@ class _ThreadCall:
     def _cancel(self) -> None:
         if self._task is not None:
             self._task.cancel()
-        elif not self._finished:  # the call was not even asked to begin
+        elif not self._finished:  # the call was never begun
             self._fail(asyncio.CancelledError())
 
 
@@ -276,7 +276,7 @@ class LoopThread:
         return self._thread is not None and threading.get_ident() == self._thread.ident
 
     def forked(self) -> None:
-        """Note that this process is a fork of the one that has the thread, if there is one."""
+        """Note that this process is a fork; the thread, if any, belongs to its parent."""
         self._forked = self._thread is not None
 
     def call(
@@ -299,7 +299,7 @@ class LoopThread:
         return cast("T", self._call(function, timeout))
 
     def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in the thread and return what it returns; errors as of :meth:`call`."""
+        """Call a function in the thread and return its value; errors as of :meth:`call`."""
         return cast("T", self._call(lambda: function(*args, **kwargs), CALL_TIMEOUT))
 
     def _call(self, function: Callable[[], object], timeout: float | None) -> Any:

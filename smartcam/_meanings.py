@@ -12,7 +12,7 @@ NOT_WORDS = frozenset({"not", "no"})
 
 
 def meaning(name: str) -> bool | None:
-    """Return the good value of a truth field, judged by its name; None if that does not tell.
+    """Return the good value of a truth field, judged by its name; None if the name is unclear.
 
     ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.
     """

@@ -1,4 +1,4 @@
-"""Names of the graph: of nodes, topics and services, and what relative ones mean.
+"""Check and resolve names of ROS nodes, topics and services.
 
 The rules are those of ROS 2's design article "Topic and Service name mapping".
 """
@@ -22,7 +22,7 @@ def check_node(name: str) -> str:
     """Return the name of a node.
 
     Raises:
-        ConfigurationError: the name cannot be one.
+        ConfigurationError: the name is not valid.
     """
     if len(name) > MAX_NAME_CHARACTERS or not _NODE.fullmatch(name):
         raise ConfigurationError(
@@ -36,7 +36,7 @@ def check_namespace(namespace: str) -> str:
     """Return a namespace as ``/`` or ``/line1/cell2``; ``line1`` is ``/line1``.
 
     Raises:
-        ConfigurationError: the text cannot be one.
+        ConfigurationError: the namespace is not valid.
     """
     text = "/" + namespace.strip("/")
     return "/" if text == "/" else _checked(text, "namespace")
@@ -69,7 +69,7 @@ def resolve(name: str, namespace: str, node: str, what: str = "topic") -> str:
         what: kind of the thing named, for error texts.
 
     Raises:
-        ConfigurationError: the name cannot be one.
+        ConfigurationError: the name is not valid.
     """
     checked = _checked(name, what)
     if checked.startswith("/"):
@@ -80,9 +80,9 @@ def resolve(name: str, namespace: str, node: str, what: str = "topic") -> str:
 
 
 def as_name(text: str) -> str:
-    """Return a name of the graph for one of smartcam's: ``line_1/cam3`` for ``line-1/cam3``.
+    """Return a ROS name for a name of smartcam: ``line_1/cam3`` for ``line-1/cam3``.
 
-    What ROS does not allow becomes ``_``; a part that begins with a digit gets one in front.
+    Characters that ROS does not allow become ``_``; ``_`` is put before a part's leading digit.
     """
     parts = [_NOT_ALLOWED.sub("_", part) for part in text.strip("/").split("/")]
     parts = [re.sub("__+", "_", part) for part in parts]

@@ -1,4 +1,4 @@
-"""Start and stop servers: what emulated cameras, sites and proxies have in common."""
+"""Start and stop servers: the common part of emulated cameras, sites and proxies."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 
 class Server(ABC):
-    """Something that is started and stopped; as an asynchronous context manager it does both."""
+    """A server that is started and stopped; as an asynchronous context manager, both."""
 
     @abstractmethod
     async def start(self) -> None:
-        """Start the server; do nothing where it is started already."""
+        """Start the server; do nothing if it is started already."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Stop the server; do nothing where it is stopped."""
+        """Stop the server; do nothing if it is stopped."""
 
     async def __aenter__(self) -> Self:
         await self.start()

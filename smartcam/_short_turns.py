@@ -1,9 +1,9 @@
-"""Let Python's threads take turns more often, as long as somebody in the process wants that.
+"""Let Python's threads take turns more often, as long as a part of the process asks for it.
 
 A thread that works in Python keeps the others waiting for the interpreter's switch interval, by
-default 5 ms, and an event loop beside it is as late as that. The interval belongs to the process,
-so all who want a shorter one share this module: the shortest of the wanted ones holds, and the one
-from before comes back when nobody wants one any more.
+default 5 ms, and delays an event loop beside it by as much. The interval belongs to the process,
+so all users of a shorter interval share this module. The shortest interval asked for is set; the
+original one is restored when none is asked for any more.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_wanted: Final[dict[object, float]] = {}  # seconds, by who wants them
-_before: Final[list[float]] = []  # the one interval of a process in which nobody wants another
+_wanted: Final[dict[object, float]] = {}  # seconds, by the object that asks for them
+_before: Final[list[float]] = []  # the original interval, while another is set
 
 
 def shorten_turns(who: object, seconds: float) -> None:
-    """Have turns of this length at most, until :func:`leave_turns`.
+    """Shorten turns to at most this length, until :func:`leave_turns`.
 
     Args:
-        who: any object that can be a key; it wants one length at a time.
+        who: any object that can be a key; it has one length at a time.
         seconds: length of a turn.
     """
     if not _wanted:
@@ -33,14 +33,14 @@ def shorten_turns(who: object, seconds: float) -> None:
 
 
 def leave_turns(who: object) -> None:
-    """Want no short turns any more. Harmless when called twice."""
+    """End an object's request for short turns. Harmless when called twice."""
     if _wanted.pop(who, None) is not None:
         _apply()
 
 
 @contextmanager
 def short_turns(seconds: float) -> Iterator[None]:
-    """Have turns of this length at most within a block."""
+    """Shorten turns to at most this length within a block."""
     who = object()
     shorten_turns(who, seconds)
     try:
@@ -50,7 +50,7 @@ def short_turns(seconds: float) -> Iterator[None]:
 
 
 def _apply() -> None:
-    """Set the interval that holds now, whatever other threads want meanwhile."""
+    """Set the shortest interval asked for, even if other threads change the requests meanwhile."""
     set_to = 0.0
     while set_to != (interval := min([*_wanted.values(), *_before])):
         sys.setswitchinterval(interval + 5e-7)  # Python cuts off to whole microseconds

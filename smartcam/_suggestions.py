@@ -1,4 +1,4 @@
-"""Suggest the known word that somebody may have meant by an unknown one."""
+"""Suggest a known word in place of an unknown one."""
 
 from __future__ import annotations
 
@@ -14,43 +14,42 @@ if TYPE_CHECKING:
 
 
 MAX_WORD_CHARACTERS = 100
-"""Characters of a word, given or known, beyond which nothing close to it is looked for: comparing
-two words takes as many steps as the product of their lengths."""
+"""Largest number of characters of a word that is compared with others: comparing two words takes
+as many steps as the product of their lengths."""
 
 MAX_KNOWN_WORDS = 10_000
-"""Known words that are compared; a word that a file or a camera says may be one of many more."""
+"""Largest number of known words that are compared; a file or a camera may list many more."""
 
 MAX_PARTS = 8
-"""Largest number of parts of a word that are compared each for itself; what follows them counts as
+"""Largest number of parts of a word that are compared separately; the rest of the word counts as
 unexplained."""
 
 MAX_CANDIDATES = 20
-"""Known words, alike by their letters, whose edits are counted."""
+"""Largest number of known words with similar letters whose edits are counted."""
 
 LETTERS_PER_EDIT = 3
-"""Letters of a word for each edit that it may be away: a typo in three letters, two in six."""
+"""Letters of a word for each edit that is allowed: one edit in three letters, two in six."""
 
 MIN_PREFIX_LETTERS = 3
-"""Least number of letters of a part that may stand for a longer one which begins with it, as
-``int`` does."""
+"""Least number of letters of a part that may abbreviate a longer one, as ``int`` does."""
 
 MIN_EXPLAINED_SHARE = 0.6
 """Share of a word's letters that the parts of a known one have to explain."""
 
 WEIGHT_OF_PARTS = 0.9
-"""Score of a word all of whose parts are in a known one; a word that is one typo away has more."""
+"""Score of a word whose parts are all in a known word; a word one typo away scores higher."""
 
 PREFIX_SCORE = 0.8
-"""Score of a part that a known one begins with; 1 is the same part."""
+"""Score of a part that is the beginning of a known part; an equal part scores 1."""
 
 MAX_NAMED_WORDS = 30
-"""Known words that an error names where none of them is close."""
+"""Largest number of known words that an error names if none is close."""
 
 
 def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | None = None) -> str:
     """Return the end of an error text, with the known word that is closest; empty if none is.
 
-    ``meant``: known words by what others call them, such as ``real32`` for ``float``.
+    ``meant``: known words by their other names, such as ``float`` for ``real32``.
     """
     found = (meant or {}).get(word) or closest(word, known)
     return f"; did you mean {found!r}?" if found else ""
@@ -61,9 +60,9 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
 
     ``least``: score, up to 1, below which a known word is not close.
 
-    A known word is close that is a few edits away, or whose parts explain those of the word:
-    ``timeout`` is a part of ``connect_timeout``. Of several that are as close the first is taken.
-    Words of more than :data:`MAX_WORD_CHARACTERS` are close to none.
+    A known word is close if it is a few edits away, or if its parts explain the parts of the word:
+    ``timeout`` is a part of ``connect_timeout``. Of several equally close words the first is
+    returned. Words of more than :data:`MAX_WORD_CHARACTERS` are never close.
     """
     if len(word) > MAX_WORD_CHARACTERS:
         return None
@@ -77,17 +76,17 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
 
 
 def hint(item: ErrorDetails, known: Iterable[str]) -> str:
-    """Return an end for pydantic's error that names the field or word that was meant; "" for none.
+    """Return an end of pydantic's error with the field or word probably meant; "" for none.
 
-    ``known``: names of the fields, where the error is a field that there is not.
+    ``known``: names of the fields, for an error about an unknown field.
     """
     context = item.get("ctx", {})
     match item["type"]:
         case "extra_forbidden":
             names = list(dict.fromkeys(known))
-            said = did_you_mean(str(item["loc"][-1]), names)
+            suggestion = did_you_mean(str(item["loc"][-1]), names)
             some = names and len(names) <= MAX_NAMED_WORDS
-            return said or (f"; known are {', '.join(sorted(names))}" if some else "")
+            return suggestion or (f"; known are {', '.join(sorted(names))}" if some else "")
         case "union_tag_invalid":
             return did_you_mean(str(context["tag"]), _quoted(str(context["expected_tags"])))
         case "literal_error" | "enum":
@@ -104,7 +103,7 @@ def _quoted(text: str) -> list[str]:
 
 
 def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
-    """Return the known words that a few edits make of a word, with their scores."""
+    """Return the known words that are a few edits away, with their scores."""
     by_fold: dict[str, str] = {}
     for one in known:
         by_fold.setdefault(one.lower(), one)
@@ -138,7 +137,7 @@ def _parts(word: str) -> list[str]:
 
 
 def _near(part: str, every: Iterable[str]) -> dict[str, float]:
-    """Return the parts that are one part, begin with it, or are a few edits away, with scores."""
+    """Return the parts that equal a part, begin with it or are a few edits away, with scores."""
     near = {one: _likeness(part, one) for one in difflib.get_close_matches(part, every, n=10)}
     if len(part) >= MIN_PREFIX_LETTERS:
         begun = (one for one in every if one.startswith(part))
@@ -147,13 +146,13 @@ def _near(part: str, every: Iterable[str]) -> dict[str, float]:
 
 
 def _likeness(one: str, other: str) -> float:
-    """Return 1 for equal words, less for each edit between them, 0 where those are too many."""
+    """Return 1 for equal words, less for each edit between them, 0 for too many edits."""
     edits, longest = _edits(one, other), max(len(one), len(other))
     return 0.0 if edits * LETTERS_PER_EDIT > longest else 1.0 - edits / longest
 
 
 def _edits(one: str, other: str) -> int:
-    """Return the number of letters to put in, take out, change or swap that make two equal."""
+    """Return the number of letters to insert, remove, change or swap to make two words equal."""
     before: list[int] = []
     row: list[int] = [*range(len(other) + 1)]
     for i, letter in enumerate(one, 1):

@@ -36,15 +36,15 @@ T = TypeVar("T")
 P = ParamSpec("P")
 ItemT = TypeVar("ItemT")
 
-_cameras: weakref.WeakSet[SyncCameraBase[Any]] = weakref.WeakSet()  # that are open
-_threads: dict[str, LoopThread] = {}  # one, once a camera was made
+_cameras: weakref.WeakSet[SyncCameraBase[Any]] = weakref.WeakSet()  # open cameras
+_threads: dict[str, LoopThread] = {}  # at most one
 
 
 def _started_thread() -> LoopThread:
-    """Return the thread of all cameras, which is started where a camera is first made.
+    """Return the thread of all cameras; the first camera starts it.
 
-    There is one in a process, and a fork has one of its own. No lock is held, which a fork might
-    inherit: of two that are started at once one is ended again.
+    Each process has one thread; a fork has its own. No lock is held, since a fork
+    might inherit it. If two threads are started at once, one of them is ended again.
     """
     known = _threads.get(_NAME)
     if known is not None and known.running:
@@ -103,7 +103,7 @@ class SyncCameraBase(Generic[ValueT]):
         """Connect: :meth:`smartcam.Camera.open`."""
         camera, opened = self._camera, False
 
-        async def opening() -> None:  # without this object, which may end before it lets go
+        async def opening() -> None:  # keeps no reference to this object
             nonlocal opened
             await camera.open()
             opened = True
@@ -112,7 +112,7 @@ class SyncCameraBase(Generic[ValueT]):
             self._wait(opening)
             _cameras.add(self)
         except BaseException:
-            if opened:  # Ctrl-C came when it was done
+            if opened:  # Ctrl-C came after the camera was opened
                 self._thread.post(lambda: _keep(camera.close()))
             raise
         return self
@@ -156,7 +156,7 @@ class SyncCameraBase(Generic[ValueT]):
 
     @property
     def url(self) -> str:
-        """Its address, with the dialect pinned once it was found out."""
+        """The camera's address, with the dialect once it is known."""
         return self._camera.url
 
     # ------------------------------------------------------------------ inside
@@ -164,7 +164,7 @@ class SyncCameraBase(Generic[ValueT]):
     def _wait(
         self, function: Callable[P, Coroutine[Any, Any, T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Do something in the event loop; it has deadlines of its own."""
+        """Run a coroutine, which has its own deadlines, in the event loop."""
         if _in_event_loop() and not self._thread.inside:
             raise LocalProtocolError(
                 f"{self.name}: smartcam.sync would hold up the event loop that runs here; "
@@ -173,13 +173,13 @@ class SyncCameraBase(Generic[ValueT]):
         return self._thread.call(lambda: function(*args, **kwargs))
 
     def _do(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Do something in the event loop that does not wait."""
+        """Call a function, which does not wait, in the event loop."""
         return self._thread.run(function, *args, **kwargs)
 
     def _subscribed(
         self, subscribe: Callable[P, Any], *args: P.args, **kwargs: P.kwargs
     ) -> SyncSubscription[Any]:
-        # made in the loop's thread, so that one that nobody gets is closed there, too
+        # made in the loop's thread, where it is also closed if the caller never gets it
         return self._do(lambda: SyncSubscription(subscribe(*args, **kwargs), self._thread, self))
 
     @contextlib.contextmanager
@@ -189,7 +189,7 @@ class SyncCameraBase(Generic[ValueT]):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Generator[T]:
-        """Be inside a context of the loop's thread; it is left whenever Ctrl-C comes."""
+        """Enter a context in the loop's thread; leave it also if Ctrl-C comes."""
         inside = _Inside(function(*args, **kwargs))
         try:
             yield self._wait(inside.enter)
@@ -208,7 +208,7 @@ class _Inside(Generic[T]):
     """A context that is entered and left in the loop's thread.
 
     Attributes:
-        entered: whether the object was entered, and leaving it has not begun.
+        entered: True from entering the context until leaving begins.
     """
 
     def __init__(self, context: contextlib.AbstractAsyncContextManager[T]) -> None:
@@ -236,7 +236,7 @@ _closing: set[asyncio.Future[None]] = set()
 
 
 def _keep(work: Coroutine[Any, Any, None]) -> None:
-    """Have something done in the loop's thread that nobody waits for."""
+    """Run a coroutine in the loop's thread without waiting for it."""
     task = start_task(work)
     _closing.add(task)
     task.add_done_callback(_closing.discard)
@@ -246,7 +246,7 @@ class SyncSubscription(Generic[ItemT]):
     """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
 
     As :class:`smartcam.streams.Subscription`: it subscribes when it is made, and its account always
-    balances. One thread takes each item.
+    balances. Each item goes to one thread.
     """
 
     def __init__(
@@ -257,7 +257,7 @@ class SyncSubscription(Generic[ItemT]):
     ) -> None:
         self._subscription = subscription
         self._thread = thread
-        self._camera = camera  # lives as long as somebody listens
+        self._camera = camera  # lives as long as its subscriptions
 
     @property
     def ended(self) -> bool:
@@ -269,7 +269,7 @@ class SyncSubscription(Generic[ItemT]):
         return self._thread.run(self._subscription.statistics)
 
     def close(self) -> None:
-        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        """Unsubscribe; queued items count as dropped. Idempotent."""
         self._thread.run(self._subscription.close)
 
     def get(self, timeout: float) -> ItemT:
@@ -281,7 +281,7 @@ class SyncSubscription(Generic[ItemT]):
         Raises:
             ResponseTimeoutError: no item came in time.
             ConnectionClosedError: the stream has ended in order.
-            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+            SmartCamError: an item that is an error (the stream stays usable), or the stream's end.
         """
         check_seconds(timeout, "timeout", self._camera.name)
         try:
@@ -298,8 +298,8 @@ class SyncSubscription(Generic[ItemT]):
         """Return the next item; waits as long as the stream lives.
 
         Raises:
-            StopIteration: closed.
-            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+            StopIteration: the subscription is closed.
+            SmartCamError: an item that is an error (the stream stays usable), or the stream's end.
         """
         return self._next(None)
 
@@ -337,7 +337,7 @@ class SyncSubscription(Generic[ItemT]):
         self.close()
 
     def __del__(self) -> None:
-        # in the loop's thread, which goes through the subscribers
+        # in the loop's thread, which iterates over the subscribers
         self._thread.post(self._subscription.close)
 
 
@@ -346,7 +346,7 @@ class SyncFrameReaderBase:
 
     Args:
         reader: asynchronous reader that this class wraps.
-        camera: camera that the frames are of.
+        camera: camera of the frames.
     """
 
     def __init__(self, reader: FrameReader, camera: SyncCameraBase[Any]) -> None:
@@ -362,7 +362,7 @@ class SyncFrameReaderBase:
         Raises:
             StopIteration: the source ended in order.
             FrameTimeoutError: no frame came in time; it may be waited for again.
-            FrameSourceError: how the source ended.
+            FrameSourceError: the source has failed.
         """
         frame = self._wait(self._take)
         if frame is None:

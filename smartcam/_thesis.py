@@ -1,8 +1,8 @@
-"""The thesis' six services: what a request may say, and what is done for it.
+"""The thesis' six services: their requests, and the work for each.
 
 Programs reach them as JSON on a fleet's bus, at a node of ROS 2, or at one of ROS 1. Each of these
-is a :class:`ThesisFace`: it turns what came into a request, and the answer into what goes back.
-A field that is 0 or an empty text counts as not said, since messages of ROS have no other way.
+is a :class:`ThesisFace`: it converts its messages to requests, and answers to its messages.
+A field that is 0 or an empty text counts as missing, since messages of ROS have no other way.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from smartcam.settings import Address
 
 DEFAULT_TIMEOUT: Final = 10.0
-"""Seconds for a service that does not trigger, where the request says none."""
+"""Seconds for a service that does not trigger, if the request gives none."""
 
 MAX_TIMEOUT: Final = 600.0
-"""Seconds that a request may give its service."""
+"""Largest number of seconds that a request may give its service."""
 
 MAX_DELAY: Final = 3600.0
-"""Seconds that may lie between two published results."""
+"""Longest delay between two published results, in seconds."""
 
 MAX_QUEUED_RESULTS: Final = 10_000
 DEFAULT_QUEUED_RESULTS: Final = 100
-"""Largest number of results that wait for a delay to pass, where the request gives no number."""
+"""Largest number of results that wait for a delay to pass, if the request gives no number."""
 
 _KEYWORDS: Final = {"localizations": "localizations", "50bytestrings": "strings50"}
 
@@ -43,8 +43,8 @@ _Application = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 def said_spec(text: str) -> str | None:
     """Return the specification that a text names; None for an empty text."""
-    said = text.strip()
-    return _KEYWORDS.get(said.lower(), said) or None
+    spec = text.strip()
+    return _KEYWORDS.get(spec.lower(), spec) or None
 
 
 class ThesisRequest(BaseModel):
@@ -57,7 +57,7 @@ class ThesisRequest(BaseModel):
 
 
 class SetupRequest(ThesisRequest):
-    """A camera's address, and what is to be had of the camera."""
+    """A request for a camera by its address, with application and interpretation."""
 
     camera_model_name: _Text = ""
     port: Annotated[int, Field(ge=0, le=0xFFFF)] | _Text = 0
@@ -70,7 +70,7 @@ class SetupRequest(ThesisRequest):
         """Return the camera's address.
 
         Raises:
-            ConfigurationError: no camera can be there.
+            ConfigurationError: no camera can have this address.
         """
         place = self.con_address
         if "://" not in place:
@@ -81,7 +81,7 @@ class SetupRequest(ThesisRequest):
 
 
 class PublishingRequest(ThesisRequest):
-    """A request that names the topic for results, and how often they are published at most."""
+    """A request that names the topic for results, and the least time between two of them."""
 
     topic_for_outputs: _Text = ""
     min_delay: Annotated[float, Field(ge=0, le=MAX_DELAY, allow_inf_nan=False)] = 0.0
@@ -95,19 +95,19 @@ class ApplicationRequest(ThesisRequest):
 
 
 class ThesisTriggerRequest(ThesisRequest):
-    """The application to trigger, before the camera goes back; 0 is the active one."""
+    """The application to trigger, before the camera returns to its own; 0 is the active one."""
 
     application_id: _Application = 0
 
 
 class ThesisFace(Protocol):
-    """A camera as the six services see it, and what publishes its results and its status.
+    """A camera as the six services see it, and the publisher of its results and status.
 
     Attributes:
         name: the camera's name.
-        address: where the camera itself is.
+        address: address of the camera itself.
         application: the id of the active application; None if that is not known.
-        reading: how its results are read; None if nobody knows what they hold.
+        reading: interpretation of its results; None if their contents are not known.
         stopped: whether SmartcameraStop has closed the camera for these services.
     """
 
@@ -133,10 +133,10 @@ class ThesisFace(Protocol):
         """Raise ConfigurationError if results cannot be read by ``spec``."""
 
     def read_as(self, spec: str | None) -> None:
-        """Read results by ``spec`` from now on; None: as the settings say."""
+        """Read results by ``spec`` from now on; None: by the settings."""
 
     def is_calibrated(self, application: int) -> bool:
-        """Return True if a calibration turns an application's localizations into a robot's."""
+        """Return True if a calibration transforms an application's localizations."""
         ...
 
     def check_status_topic(self, topic: str) -> None:
@@ -154,10 +154,10 @@ class ThesisFace(Protocol):
         """Publish nothing more on the topics that requests have named."""
 
     async def have_session(self) -> None:
-        """Have a session with the camera, or raise the error that says why there is none."""
+        """Make sure of a session with the camera; raise the reason if there is none."""
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Have an application running and ready."""
+        """Make sure that an application is running and ready."""
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
@@ -168,11 +168,11 @@ class ThesisFace(Protocol):
 
 
 class ThesisCall(NamedTuple):
-    """A service under way.
+    """A running call of a service.
 
     Attributes:
         face: the camera.
-        request: what is asked for, of the service's own kind.
+        request: the request, of the service's own class.
         timeout: seconds.
     """
 
@@ -185,10 +185,10 @@ class ThesisService(NamedTuple):
     """One of the six services.
 
     Attributes:
-        request: what it takes.
-        do: does it, and returns what its answer has beside ``error``.
-        timeout: seconds, where the request says none.
-        settles: the service changes what is published, and waits for others that do.
+        request: class of its requests.
+        do: function that carries the service out, and returns the answer's fields but ``error``.
+        timeout: seconds, if the request gives none.
+        settles: the service changes publishing; such services run one after the other.
         after_stop: whether the service works after SmartcameraStop, before the next
             SmartcameraSetup.
         nothing: name of the answer's field that is an empty list beside an error, if it has one.
@@ -202,11 +202,11 @@ class ThesisService(NamedTuple):
     nothing: str | None = None
 
     async def answer(self, call: ThesisCall) -> dict[str, Any]:
-        """Do what is asked for; return what the answer has beside ``error``.
+        """Carry the service out; return the fields of its answer, without ``error``.
 
         Raises:
             LocalProtocolError: the camera was stopped.
-            SmartCamError: as the service ends.
+            SmartCamError: the service failed.
         """
         if call.face.stopped and not self.after_stop:
             raise LocalProtocolError(
@@ -216,7 +216,7 @@ class ThesisService(NamedTuple):
 
 
 async def _setup(call: ThesisCall) -> dict[str, Any]:
-    """Have a camera as a request describes it; nothing is done where it is another one."""
+    """Set a camera up by a request, after checking that the request means this camera."""
     face, request = call.face, call.request
     _check_place(face, request)
     spec = said_spec(request.interpret_as)
@@ -233,7 +233,7 @@ async def _setup(call: ThesisCall) -> dict[str, Any]:
 
 
 def _check_place(face: ThesisFace, request: SetupRequest) -> None:
-    """See that a request means the camera that the face has.
+    """Check that a request means the camera of the face.
 
     Raises:
         ConfigurationError: the request means another camera.
@@ -244,7 +244,7 @@ def _check_place(face: ThesisFace, request: SetupRequest) -> None:
         return
     if has.scheme in FLEET_SCHEMES:
         raise ConfigurationError(
-            f"{name}: it is a fleet's, which knows where it is: expected con_address and "
+            f"{name}: the fleet knows its address: expected con_address and "
             "camera_model_name to be empty"
         )
     if model and (protocol := parse_address(has.host, model=model).protocol) != has.protocol:

@@ -1,8 +1,8 @@
-"""The thesis' five calibration services: what a request may say, and what is done for it.
+"""The thesis' five calibration services: their requests, and the work for each.
 
-Faces of them are those of the six camera services, see :mod:`smartcam._thesis`. What is done is
-:class:`~smartcam.calibration.wizards._thesis.ThesisCalibration`, one for each camera, whichever
-face asks.
+They have the same faces as the six camera services, see :mod:`smartcam._thesis`. The work is done
+by :class:`~smartcam.calibration.wizards._thesis.ThesisCalibration`, one object for each camera,
+which all faces share.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 STEP_TIMEOUT: Final = 150.0
-"""Seconds for a step where the request says none: a calculation has 120, a picture 60."""
+"""Seconds for a step if the request gives none: a calculation has 120, a picture 60."""
 
 MAX_INPUTS: Final = 100
 """Largest number of answers of one kind that a request may have; a step asks for some dozen."""
@@ -40,7 +40,7 @@ _Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allo
 
 
 def _place(value: object) -> object:
-    """Return the text of a place as it is compared."""
+    """Return the text of a place in the spelling that is compared."""
     return value.strip().capitalize() if isinstance(value, str) else value
 
 
@@ -56,7 +56,7 @@ class StartRequest(ThesisRequest):
 
 
 class PerformRequest(ThesisRequest):
-    """The answers of a step, or what is done instead."""
+    """The answers of a step, or the action instead of answering."""
 
     repeat_last_step: bool = False
     abort: bool = False
@@ -66,7 +66,7 @@ class PerformRequest(ThesisRequest):
 
 
 class ExportRequest(ThesisRequest):
-    """The calibration to copy, and the file that the copy is."""
+    """The calibration to copy, and the path of the copy."""
 
     calibration_name: Annotated[str, Field(max_length=1000)]
     target_path: Annotated[str, Field(max_length=1000)]
@@ -90,26 +90,26 @@ class RequestHeader(BaseModel):
 
     @property
     def utc(self) -> float | None:
-        """The time in seconds since 1970; None if the header says none.
+        """The time in seconds since 1970; None if the header has none.
 
         Raises:
             ConfigurationError: the stamp is no time.
         """
-        said = self.stamp or self.time
+        moment = self.stamp or self.time
         try:
-            if isinstance(said, str):
-                said = datetime.fromisoformat(said).timestamp() if said else 0.0
-            datetime.fromtimestamp(said)  # noqa: DTZ006 - only whether there is such a time
+            if isinstance(moment, str):
+                moment = datetime.fromisoformat(moment).timestamp() if moment else 0.0
+            datetime.fromtimestamp(moment)  # noqa: DTZ006 - only whether there is such a time
         except (ValueError, OverflowError, OSError) as exc:
             raise ConfigurationError(
-                f"header: stamp {said!r:.60}: expected a time such as 2030-01-31T12:00:00+00:00, "
+                f"header: stamp {moment!r:.60}: expected a time such as 2030-01-31T12:00:00+00:00, "
                 "or seconds since 1970"
             ) from exc
-        return said or None
+        return moment or None
 
 
 class TransformRequest(ThesisRequest):
-    """The camera's view, and the frame that the robot's pose is wanted in."""
+    """The camera's view, and the frame for the robot's pose."""
 
     header: RequestHeader = RequestHeader()
     x: _Coordinate
@@ -123,8 +123,8 @@ class CalibrationFace(Protocol):
 
     Attributes:
         name: the camera's name.
-        calibrations: calibrations of the camera; None if nobody has said in which folder.
-        camera: the camera, as it is reached for one call of so many seconds.
+        calibrations: calibrations of the camera; None if no folder for them is set.
+        camera: function that returns the camera, for one call of so many seconds.
     """
 
     name: str
@@ -136,11 +136,11 @@ class CalibrationFace(Protocol):
 
 
 class CalibrationCall(NamedTuple):
-    """A service under way.
+    """A running call of a service.
 
     Attributes:
         face: the camera.
-        request: what is asked for, of the service's own kind.
+        request: the request, of the service's own class.
         timeout: seconds.
     """
 
@@ -153,7 +153,7 @@ class CalibrationCall(NamedTuple):
         """The calibrations of the camera.
 
         Raises:
-            ConfigurationError: nobody has said in which folder they are.
+            ConfigurationError: no folder for them is set.
         """
         found = self.face.calibrations
         if found is None:
@@ -168,9 +168,9 @@ class WizardService(NamedTuple):
     """One of the five services.
 
     Attributes:
-        request: kind of its requests.
-        do: function that does it, and returns the fields of its answer, ``error`` where it is one.
-        timeout: seconds, where the request says none.
+        request: class of its requests.
+        do: function that carries the service out, and returns the fields of its answer.
+        timeout: seconds, if the request gives none.
     """
 
     request: type[ThesisRequest]
@@ -219,10 +219,10 @@ async def _transform(call: CalibrationCall) -> dict[str, Any]:
 
 
 def own_localizations(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
-    """Return the specification that a camera's localizations are read by, and their unit.
+    """Return the specification for reading a camera's localizations, and their unit.
 
     Args:
-        reading: how the results of the camera are read; None if nobody knows what they hold.
+        reading: interpretation of the camera's results; None if their contents are not known.
         application: the active application; None if that is not known.
     """
     own = None if reading is None else reading.interpreter(application)
@@ -232,7 +232,7 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
 
 
 def checked_localizations(value: object, camera: str) -> list[Localization]:
-    """Return the localizations that a value is.
+    """Return a value as a list of localizations.
 
     Raises:
         InterpretationError: the value is not valid.

@@ -1,9 +1,9 @@
 """Files that are written whole or not at all.
 
-A temporary file in the same folder is written and synced, the present file is kept under ``NAME.1``
-where that is wanted (the one before as ``NAME.2``, ...), the new one takes its place in one step,
-the folder is synced. Whenever that is cut off, the name leads to the old file or the new one, and
-to all of it; the next writer clears away what was left. One process writes in a folder at a time:
+A temporary file in the same folder is written and synced. If backups are wanted, the present file
+is kept as ``NAME.1``, older ones as ``NAME.2``, ... The new file replaces it in one step, and the
+folder is synced. If the process is killed at any step, the name leads to the whole old or the
+whole new file, and the next writer removes the leftovers. One process writes in a folder at a time:
 the one that has its lock.
 """
 
@@ -32,17 +32,17 @@ _ATTEMPTS = 5
 
 
 class FolderInUseError(OSError):
-    """Another process writes in a file's folder, and does not end."""
+    """Another process writes in a file's folder, and does not finish."""
 
 
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
     """Put a file in the place of another, whole or not at all; a symbolic link is replaced.
 
-    Any number of processes and threads may do so at once; the last one's file stays. What a crash
-    left behind is cleared away.
+    Any number of processes and threads may do so at once; the file of the last one stays. Leftovers
+    of a crash are removed.
 
     Raises:
-        FolderInUseError: another process writes in the folder and does not end.
+        FolderInUseError: another process writes in the folder and does not finish.
         OSError: the file cannot be written. The file from before is still there.
     """
     with _writing(path) as alone:
@@ -55,9 +55,9 @@ def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
 
 
 def keep_backup(path: Path, count: int) -> None:
-    """Keep a file as ``NAME.1``, the one before as ``NAME.2``, up to ``count``; it stays there.
+    """Keep a file also as ``NAME.1``, and older backups up to ``count`` files.
 
-    Nothing is done where it does not exist.
+    Do nothing if the file does not exist.
 
     Raises:
         FolderInUseError, OSError: as :func:`replace_file`.
@@ -67,7 +67,7 @@ def keep_backup(path: Path, count: int) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the system write a folder's names to the disk, where it can."""
+    """Write a folder's list of names to the disk, if the system can."""
     flags = getattr(os, "O_DIRECTORY", None)
     if flags is None:  # Windows: folders cannot be opened
         return
@@ -80,9 +80,9 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[bool]:
-    """Be the only one that writes in a file's folder.
+    """Lock a file's folder for writing.
 
-    Yields False where the file system has no locks.
+    Yields False if the file system has no locks.
     """
     handle = _open_lock(path.parent)
     try:
@@ -100,7 +100,7 @@ def _writing(path: Path) -> Iterator[bool]:
 
 
 def _open_lock(folder: Path) -> int:
-    """Return the path to lock: the folder itself; on Windows, where it cannot be, a file in it."""
+    """Open the path to lock: the folder itself; on Windows, which cannot open it, a file in it."""
     flags = getattr(os, "O_DIRECTORY", None)
     if flags is None:
         return os.open(folder / ".smartcam.lock", os.O_RDWR | os.O_CREAT)
@@ -108,7 +108,7 @@ def _open_lock(folder: Path) -> int:
 
 
 def _replace(path: Path, body: bytes, backups: int) -> None:
-    """Replace a file; where there are no locks, another one may be at the backups, too."""
+    """Replace a file; without locks, another process may change the backups, too."""
     temporary = _temporary(path, body)
     try:
         if backups > 0:
@@ -122,7 +122,7 @@ def _replace(path: Path, body: bytes, backups: int) -> None:
 
 
 def _clear(path: Path) -> None:
-    """Take away what was to become this file when its writer was killed."""
+    """Remove temporary files for this path whose writer was killed."""
     stale = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}\.tmp")
     with os.scandir(path.parent) as found:
         names = [one.name for one in found if stale.fullmatch(one.name)]
@@ -131,7 +131,7 @@ def _clear(path: Path) -> None:
 
 
 def _temporary(path: Path, body: bytes) -> Path:
-    """Write a file beside another one, to take its place."""
+    """Write a file beside the path, which will replace the old file."""
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -151,13 +151,13 @@ def _rotate(path: Path, count: int) -> None:
     rows = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
     if rows[0].is_file() and filecmp.cmp(path, rows[0], shallow=False):
         return  # a crash came between backup and new file
-    filled = list(itertools.takewhile(Path.exists, rows[:-1]))  # a gap takes what comes before it
+    filled = list(itertools.takewhile(Path.exists, rows[:-1]))  # up to the first gap
     for newer, older in reversed(list(zip(filled, rows[1:], strict=False))):
         if older.exists() and newer.samefile(older):
-            newer.unlink()  # to rename one name of a file to another does nothing
+            newer.unlink()  # renaming one name of a file to another does nothing
         else:
             newer.replace(older)
     try:
-        os.link(path, rows[0])  # a second name: no moment without the file
+        os.link(path, rows[0])  # a second name, so that the file is always there
     except (OSError, NotImplementedError):
         _temporary(path, path.read_bytes()).replace(rows[0])

@@ -1,6 +1,6 @@
 """A session of Zenoh, whose binding calls back in threads of its own, for one event loop.
 
-What comes is put into one queue, and a burst wakes the event loop once.
+Received messages are put into one queue, and a burst wakes the event loop once.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ RUNTIME = (
     "(rx:(handover:app),acc:(handover:app),net:(worker_threads:2),tx:(worker_threads:1),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: as few as can be, which halves the CPU time of a call; its callbacks here only
-put what comes into a queue. What sends has one of its own: the one for what comes waits for it
-where an answer is longer than a queue (128 KiB, which the tokens of 20 nodes of ROS are), and would
-wait for itself until the link is given up. Its inner tasks have two of their own: where a latched
-publisher is closed, the binding waits for such a task and lets no thread of Python run meanwhile,
-also not the one that is to call back. The variable ZENOH_RUNTIME goes before it."""
+"""Zenoh's threads: as few as possible, which halves the CPU time of a call; callbacks only put
+messages into a queue. Sending has a thread of its own: the receiving thread waits for it if an
+answer is longer than a queue (128 KiB, such as the tokens of 20 nodes of ROS), and would otherwise
+wait for itself until the link is given up. Inner tasks have two threads: when a latched publisher
+is closed, the binding waits for such a task and blocks all threads of Python, including the one
+that is to call back. The variable ZENOH_RUNTIME overrides these numbers."""
 
 LEASE_TIME = 5.0
-"""Seconds without a sign of life after which an end counts as gone; a killed one goes at once."""
+"""Seconds without a sign of life after which an end counts as gone; if its process was killed, the
+end is gone at once."""
 
 MAX_LISTING_TIME = 120.0
-"""Seconds after which the engine ends the list of those present as if it was whole, however long
-the asker would wait. By itself it takes 10; thousands of presences on a busy machine take
-longer."""
+"""Seconds after which the engine ends a list of presences as if it were complete. The engine's own
+default is 10; thousands of presences on a busy machine take longer."""
 
 PORTS = range(20_000, 32_000)
 """The ports tried for port 0, below the range from which systems give ports to connections.
@@ -70,12 +70,11 @@ INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 ROOM_TIMEOUT = 0.001
 """Seconds that the engine waits for room before it drops a message that may be dropped. It waits
-once: until something goes out to the same end, it drops further ones of that priority at once."""
+once: until something is sent to the same end, further messages of that priority drop at once."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes that wait for the event loop, as many of patient things, or for the
-thread that says what is long; what comes beyond is dropped, and results are asked for again
-later."""
+"""Largest number of bytes that wait for the event loop, as many for patient callbacks, or for the
+thread that sends long replies. More is dropped; results are requested again later."""
 
 QUERY_BYTES = 256
 """Bytes that a query counts beside its payload."""
@@ -90,9 +89,9 @@ TURN = 64
 """Callbacks that run in one turn of the event loop."""
 
 PATIENT_TURN = 8
-"""Patient callbacks that run behind the others in one turn of the event loop.
+"""Patient callbacks that run after the others in one turn of the event loop.
 
-A flood of patient callbacks delays other work by the time of these few only.
+A flood of patient callbacks delays other work only by the time of these few.
 """
 
 CLOSE_TIMEOUT = 5.0
@@ -121,8 +120,8 @@ class BusLink:
         listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
         connect: endpoints to connect to; with several, whichever answers.
         certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
-        peer: whether an end that only connects goes on without the routers at ``connect``, as the
-            nodes of rmw_zenoh do, by links of its own to the ends on this host that it has met.
+        peer: whether an end that only connects keeps working without the routers at ``connect``, as
+            nodes of rmw_zenoh do, by direct links to the ends on this host that it has found.
     """
 
     listen: tuple[str, ...] = ()
@@ -132,12 +131,12 @@ class BusLink:
 
     @property
     def mode(self) -> str:
-        """The end's mode at the engine; one that only connects is a router's client, or a peer."""
+        """The engine's mode: an end that only connects is a router's client, or a peer."""
         return "router" if self.listen else "peer" if self.peer else "client"
 
     @property
     def place(self) -> str:
-        """Return the endpoints of the link as a text, those that it listens on before others."""
+        """Return the endpoints of the link as a text, those to listen on first."""
         return ", ".join(self.listen or self.connect)
 
     def settings(self, timeout: float) -> dict[str, Any]:
@@ -146,7 +145,7 @@ class BusLink:
             "mode": self.mode,
             "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
-            # one try; later ones are made without end, by a peer only where the first has no end
+            # 0: one try, the engine goes on later; a peer goes on only without a timeout (-1)
             "connect/timeout_ms": -1 if self.mode == "peer" else 0,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
             "connect/exit_on_failure": self.mode == "client",
@@ -159,8 +158,8 @@ class BusLink:
                 1e6 * ROOM_TIMEOUT
             ),
             "routing/interests/timeout": int(1e3 * MAX_LISTING_TIME),
-            # of each later try, too: of one that began while a cable was cut the system repeats
-            # the packets ever more seldom, so who stays with it for long is back that much later
+            # also for each later try: a try that began while a cable was cut repeats its packets
+            # less and less often, so a long timeout would delay the return by as much
             "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE_TIME))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
@@ -180,7 +179,7 @@ class BusLink:
 
 
 def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
-    """Return endpoints to listen on, with a free port where one has port 0."""
+    """Return endpoints to listen on, with a free port in place of port 0."""
     return tuple(
         f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
         for one in endpoints
@@ -188,7 +187,7 @@ def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
 
 
 def _free_port(endpoint: str) -> int:
-    """Return a port that nobody has; where the host is none of this machine, the engine says so."""
+    """Return a free port; the engine reports a host that is not this machine."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     ports = random.SystemRandom().sample(PORTS, 100)
@@ -204,10 +203,10 @@ def _free_port(endpoint: str) -> int:
 
 
 def _end_lingering(ports: frozenset[int]) -> None:
-    """Have the engine close its connections without waiting.
+    """Make the engine close its connections without waiting.
 
-    It closes one that is cut off in the thread that serves all others, which would wait there 10 s
-    for an answer to what was sent last.
+    Otherwise, to close a connection that is cut off, the thread that serves all connections waits
+    10 s for the acknowledgement of the last data.
     """
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
@@ -225,7 +224,7 @@ def _end_lingering(ports: frozenset[int]) -> None:
             }:
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
         except OSError:
-            pass  # it has no other end
+            pass  # the socket has no peer
         finally:
             found.detach()
 
@@ -250,7 +249,7 @@ class _EngineUse:
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Be without the engine's threads, if there were any."""
+        """Note in a fork that the engine's threads do not run there."""
         self.in_a_fork = self.begun
 
 
@@ -279,7 +278,7 @@ class ZenohSession:
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
-        # bytes that came, and those of them that were taken; all threads count the first ones
+        # bytes received, counted by all threads; and those of them that were handled
         self._bytes = self._patient_bytes = 0
         self._taken_bytes = self._taken_patient_bytes = 0
         self._woken = False
@@ -297,7 +296,7 @@ class ZenohSession:
         """Open the session.
 
         Raises:
-            ConnectFailedError: the session cannot listen, or reach anybody, within ``timeout``
+            ConnectFailedError: the session cannot listen, or reach another end, within ``timeout``
                 seconds.
             ConfigurationError: the engine refuses a setting.
             LocalProtocolError: this process is a fork of one that had a session before.
@@ -326,7 +325,7 @@ class ZenohSession:
                     try:
                         self._session = await self._opened(timeout)
                     except self._zenoh.ZError as exc:
-                        # who is silent is given up after a lease: there may be time for another
+                        # a silent end is given up after a lease, so another end may still be tried
                         if loop.time() - begun < 0.9 * min(timeout, LEASE_TIME):
                             raise self._failed(await self._why(exc)) from exc
         except TimeoutError as exc:
@@ -335,20 +334,20 @@ class ZenohSession:
             await self._meet(min(timeout, ROUTER_TIMEOUT))
 
     async def _meet(self, timeout: float) -> None:
-        """Wait for a router, so that what follows finds who is there; go on without one."""
+        """Wait for a router, so that later queries find all ends; go on without one."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while not self._session.info.routers_zid():  # noqa: ASYNC110 - nothing tells of it
                     await asyncio.sleep(0.02)
                 return
         logger.warning(
-            "%s ! no router at %s yet: who is to be met there will be when it is there",
+            "%s ! no router at %s yet: ends behind it can be reached once it runs",
             self._what,
             self._link.place,
         )
 
     async def _opened(self, timeout: float) -> Any:
-        """Return a session; one that comes after all when nobody waits any more is closed."""
+        """Return a session; close one that is opened after the caller has given up."""
         zenoh = self._zenoh
         config = zenoh.Config()
         settings = {**self._link.settings(timeout), **self._more}
@@ -367,14 +366,14 @@ class ZenohSession:
             raise
 
     async def reopen(self, timeout: float) -> None:
-        """Have a new session in the place of this one, with all that is declared.
+        """Replace this session by a new one, with all declarations.
 
-        Those at the other ends of its connections see it go and come; nothing is said or heard in
-        between. What is declared meanwhile is declared with all else.
+        The other ends see this end leave and return; nothing is sent or received in between. New
+        declarations meanwhile are made with the others.
 
         Raises:
-            ConnectFailedError: the session cannot listen again within ``timeout`` seconds; it is
-                away until it is tried again.
+            ConnectFailedError: the session cannot listen again within ``timeout`` seconds; there is
+                no session until the next try.
 
         Cancellation: as an error.
         """
@@ -398,14 +397,14 @@ class ZenohSession:
         self._reopening = False
 
     def _end_lingering(self) -> None:
-        """Look at the connections now, and again before a new one can be cut off for its lease."""
+        """Close lingering connections now, and again before a new one can outlast its lease."""
         self._look = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
         endpoints = (*self._link.listen, *self._link.connect)
         ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
         self._loop.run_in_executor(None, _end_lingering, ports)
 
     async def _why(self, error: Exception) -> str:
-        """Return why nothing was reached; the engine does not tell of names that do not resolve."""
+        """Return why nothing was reached; the engine does not report names that do not resolve."""
         reason = _reason(error)
         for endpoint in self._link.connect if reason == NOT_ZENOH else ():
             host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
@@ -454,7 +453,7 @@ class ZenohSession:
         self._taken_bytes, self._taken_patient_bytes = self._bytes, self._patient_bytes
 
     def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
-        """Have something called in the event loop, in order; for any thread."""
+        """Schedule a call in the event loop, in order; from any thread."""
         with self._lock:
             self._waiting.append((call, arguments, size))
             self._bytes += size
@@ -464,7 +463,7 @@ class ZenohSession:
         self._wake()
 
     def in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
-        """Have something called as :meth:`in_loop` does, but behind all that is not patient."""
+        """Schedule a call as :meth:`in_loop` does, but after all calls that are not patient."""
         with self._lock:
             self._patient.append((call, arguments, size))
             self._patient_bytes += size
@@ -478,7 +477,7 @@ class ZenohSession:
         if bell is not None:
             bell.ring()
             return
-        with contextlib.suppress(RuntimeError):  # the loop is closed, and nobody hears any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
@@ -532,11 +531,11 @@ class ZenohSession:
     def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
         """Answer a query, and end it; never waits.
 
-        The engine may wait for the asker, where the query says that it may; hence the threads.
+        The engine may wait for the asker if the query allows it; hence the threads.
 
         Args:
-            query: the engine's.
-            replies: keys and what is said under them.
+            query: query of the engine.
+            replies: keys and their payloads.
             **how: the engine's options of a reply.
         """
         if replies:
@@ -563,7 +562,7 @@ class ZenohSession:
             self._replying -= 1
 
     def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
-        """Declare something at the engine; it is closed with this end."""
+        """Declare something at the engine; the declaration is closed with this session."""
         made = None if self._reopening else how(self.session)
         self._declared[one] = None
         return made
@@ -590,7 +589,7 @@ class ZenohSession:
 
     @property
     def engine(self) -> Any:
-        """The module."""
+        """Zenoh's module."""
         return self._zenoh
 
     def later(self, call: Callable[..., None], *arguments: Any) -> None:
@@ -599,22 +598,22 @@ class ZenohSession:
 
 
 class _LoopBell:
-    """Wakes an event loop from any thread; for less than its own ``call_soon_threadsafe``.
+    """Wakes an event loop from any thread; cheaper than its own ``call_soon_threadsafe``.
 
     Args:
         loop: the loop.
-        call: what it calls then.
+        call: function that the loop calls after a ring.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
-        # a file, as its number may be another's when it is closed, and an object knows that
+        # a file object knows that it is closed; its number may be another file's by then
         self._file = io.FileIO(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC), "r+")
         self._loop, self._call = loop, call
-        loop.add_reader(self._file.fileno(), self._hear)
+        loop.add_reader(self._file.fileno(), self._on_ring)
 
     @classmethod
     def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
-        """Return a bell; None if the system or the loop has nothing for it."""
+        """Return a bell; None if the system or the loop does not support it."""
         if sys.platform != "linux":
             return None
         with contextlib.suppress(NotImplementedError, OSError):
@@ -622,32 +621,31 @@ class _LoopBell:
         return None
 
     def ring(self) -> None:
-        """Have the loop call; once, however often it is rung before."""
+        """Make the loop call the function once, however often the bell is rung before."""
         try:  # noqa: SIM105 - each message does this, and suppress() costs as much as the rest
             self._file.write(_ONE)
-        except (ValueError, OSError):  # closed: nobody hears any more
+        except (ValueError, OSError):  # the bell is closed
             pass
 
-    def _hear(self) -> None:
+    def _on_ring(self) -> None:
         self._file.read(8)
         self._call()
 
     def close(self) -> None:
-        """Wake nobody any more. Idempotent."""
+        """Stop waking the loop. Idempotent."""
         if not self._file.closed:
             self._loop.remove_reader(self._file.fileno())
             self._file.close()
 
 
 class ZenohDeclared:
-    """Something that is declared at the engine until it is closed, or its session is.
+    """A declaration at the engine, until this object or its session is closed.
 
     Args:
         end: the session.
         by_dropping: True if the end is dropped instead of undeclared, since this object has its
-            only reference. To undeclare an advanced end, the binding holds the interpreter while
-            it waits for a thread that may wait for the interpreter; to drop one, it releases the
-            interpreter.
+            only reference. To undeclare an advanced end, the binding holds Python's lock while
+            it waits for a thread that may wait for that lock; to drop one, it releases the lock.
     """
 
     def __init__(self, end: ZenohSession, *, by_dropping: bool = False) -> None:
@@ -659,25 +657,25 @@ class ZenohDeclared:
         self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
-        """Declare what ``how`` makes of the engine's session."""
+        """Declare the object that ``how`` makes with the engine's session."""
         self._how = how
         self._it = self._end.declare(self, how)
         return self
 
     def when_lost(self, call: Callable[[], None]) -> Self:
-        """Have something called in the event loop when its session is lost to a new one."""
+        """Schedule a call in the event loop for when a new session replaces this one."""
         self._on_lost = call
         return self
 
     def lose(self) -> Any:
-        """Prepare for the end of the session; return what is to be kept until then."""
+        """Prepare for the end of the session; return the object to keep until then."""
         it, self._it = self._it, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
         return None if self._by_dropping else it
 
     def again(self) -> None:
-        """Declare the key at the session that is there now."""
+        """Declare the key again at the present session."""
         if not self._closed and self._it is None:
             self._it = self._how(self._end.session)
 
@@ -698,7 +696,7 @@ class ZenohDeclared:
 
 def _lose(session: Any, declared: list[Any], router: bool) -> None:
     _end(session, [], router)
-    declared.clear()  # which takes long before
+    declared.clear()  # slow while the session is open
 
 
 def _nothing(_: Any) -> None:
@@ -719,9 +717,9 @@ def _refuse(query: Any, why: str) -> None:
 def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     """Wait for the threads that still send, then end the session.
 
-    A router that is closed is never freed: its last reference would wait for an engine's thread,
-    and hold the interpreter, which that thread may wait for to tell another session of this process
-    something. It is 16 KiB.
+    A closed router is never freed, which costs 16 KiB. To drop its last reference would wait for an
+    engine's thread while holding the interpreter lock, and that thread may wait for the lock to
+    call another session of this process.
     """
     for one in threads:
         one.shutdown()
@@ -740,11 +738,11 @@ _thread = _EngineThread()
 
 
 def keep_thread() -> None:
-    """Have Python keep its state of this thread of the engine; for the first line of a callback.
+    """Keep Python's state of this thread of the engine; call this first in a callback.
 
-    The binding enters Python anew for each callback, and what Python then makes and frees for a
-    thread that is not its own costs a third of a message. A thread that has entered once more than
-    it leaves keeps that until it ends; the engine has a few threads, which end with the process.
+    The binding enters Python anew for each callback, and making and freeing Python's state of a
+    foreign thread costs a third of a message. A thread that enters once more than it leaves keeps
+    its state until it ends; the engine has a few threads, which end with the process.
     """
     if not _thread.known:
         _thread.known = True
@@ -752,9 +750,9 @@ def keep_thread() -> None:
 
 
 def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
-    """Have a callback called in the engine's own thread: by default each has a thread.
+    """Return a handler that runs ``call`` in the engine's own thread, not in a new one.
 
-    ``ended`` is called when nothing more comes.
+    ``ended`` is called when no more calls will come.
     """
 
     def called(it: Any) -> None:
@@ -766,9 +764,9 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
 
 
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
-    """Do something at the engine; a session that ends meanwhile is no error of the caller's.
+    """Call the engine; a session that ends meanwhile is no error of the caller.
 
-    What a thread is at when it is taken back ends with its last reference, which that thread has.
+    An object that another thread is using is released when that thread drops its reference.
     """
     try:
         call(*arguments, **named)
@@ -781,10 +779,10 @@ def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
 
 
 def _close_late(router: bool, opening: asyncio.Future[Any]) -> None:
-    """Close a session that came after nobody wanted it any more.
+    """Close a session that was opened after the caller had given up.
 
-    The interpreter waits for that at its end: where it ends under a thread that is in the engine,
-    that thread cannot come back to Python, and the engine aborts the process.
+    The interpreter waits for this thread when it exits. Otherwise a thread inside the engine could
+    not return to Python, and the engine would abort the process.
     """
     if not opening.cancelled() and opening.exception() is None:
         threading.Thread(target=_end, args=(opening.result(), [], router), daemon=False).start()

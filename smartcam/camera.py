@@ -1,6 +1,6 @@
-"""The camera as the user sees it, whatever lies between: a wire, or a fleet.
+"""The camera as the user sees it, whether at the wire or in a fleet.
 
-:class:`Camera` says what every camera does. :class:`~smartcam.SmartCamera` does it with a session
+:class:`Camera` has the methods of every camera. :class:`~smartcam.SmartCamera` has a session
 of its own.
 """
 
@@ -62,8 +62,8 @@ DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
 
 DEFAULT_MAX_QUEUE_BYTES = 1 << 26
-"""Bytes of containers a subscriber's queue holds: 1024 of the 64 kB that a camera sends at most, so
-it bounds nothing but larger ones; what is made of them may take several times as much."""
+"""Bytes of containers that a subscriber's queue holds: 1024 of 64 kB, the most that known cameras
+send. The interpreted values may take several times as much."""
 
 MAX_INTERPRETATIONS = 32
 """Largest number of texts given as ``interpret_as`` whose interpreters a client keeps."""
@@ -129,14 +129,14 @@ class StreamRequest(NamedTuple):
 class Camera(abc.ABC, Generic[ValueT]):
     """A camera, wherever it is; made by :func:`smartcam.connect`.
 
-    It outlives its links: one that is lost is made again as ``reconnect`` says. Until then every
+    It outlives its links: a lost link is replaced by the rules of ``reconnect``. Until then every
     method that talks to the camera raises :exc:`~smartcam.ConnectionLostError` at once,
     with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
-    ``close()`` it is :exc:`~smartcam.ConnectionClosedError`.
+    ``close()`` the error is :exc:`~smartcam.ConnectionClosedError`.
 
     Args:
         settings: validated options.
-        observers: see what happens.
+        observers: objects that see its frames, events, results and errors.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
@@ -150,24 +150,24 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._default_spec: object = settings.interpret_as
         self._default = self._interpretation(self._default_spec, own=True)
 
-    # ------------------------------------------------------------------ what each kind does its way
+    # ------------------------------------------------------------------ for each kind of camera
 
     @abc.abstractmethod
     def _require_session(self) -> object:
-        """Raise the error that says why there is no session, if there is none."""
+        """Raise the reason why there is no session, if there is none."""
 
     @abc.abstractmethod
     def _deadline(self, timeout: float) -> float:
-        """Return the loop time in ``timeout`` seconds; ConfigurationError if it cannot be one."""
+        """Return the loop time in ``timeout`` seconds; ConfigurationError if there is none."""
 
     @abc.abstractmethod
     def _listens(self, subscribers: object) -> None:
-        """Somebody listens to what ``subscribers`` are offered, from now on."""
+        """Note that ``subscribers`` has a listener from now on."""
 
     def _abandoned(self) -> bool:
-        """Have a camera that nobody has any more given back; return whether it was open.
+        """Release a camera without any reference; return whether it was open.
 
-        It is called in any thread, and also where ``__init__`` has failed.
+        Any thread may call it, also after ``__init__`` has failed.
         """
         return False
 
@@ -184,10 +184,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     async def open(self) -> Self:
-        """Connect; with ``application=`` in the options also have it running and ready.
+        """Connect; with ``application=`` in the options also start that application.
 
         Raises:
-            ConnectFailedError: no session; names each attempt and what came.
+            ConnectFailedError: no session could be made; the error lists each attempt.
             CommandRejectedError: the camera does not have the application.
             ResponseTimeoutError: the camera did not become ready within ``switch_timeout``.
             ConnectionLostError: the session was lost again before the application was ready.
@@ -199,22 +199,22 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def close(self) -> None:
         """Send Disconnect, end the link, wait for the client's tasks. Idempotent, bounded.
 
-        Going back after a temporary switch is finished first, within ``switch_timeout``. Otherwise
+        The return from a temporary switch is finished first, within ``switch_timeout``. Otherwise
         the camera's application and run state are left as they are.
         Cancellation: the link is dropped at once.
         """
 
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session, and what ``restore`` asks for is done.
+        """Wait until there is a session, and the state that ``restore`` asks for.
 
         Args:
             timeout: seconds.
 
         Raises:
-            ResponseTimeoutError: there was none in time; the last loss is told.
+            ResponseTimeoutError: there was no session in time; the error names the last loss.
             ConnectionLostError: ``reconnect`` is None, or it gave up.
             ConnectionTakenError: another client has the camera.
-            ConnectionClosedError: not opened, or closed.
+            ConnectionClosedError: the camera was not opened, or was closed.
 
         Cancellation: safe.
         """
@@ -249,7 +249,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name} {self.url}>"
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ state
 
     @property
     def name(self) -> str:
@@ -259,7 +259,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @property
     @abc.abstractmethod
     def url(self) -> str:
-        """Its address, with the dialect pinned once it was found out."""
+        """The camera's address, with the dialect once it is known."""
 
     @property
     @abc.abstractmethod
@@ -270,7 +270,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def trouble(self) -> SmartCamError | None:
         """The error that a call would raise now without a session; None while there is one.
 
-        It is told without a traceback; what caused it is its ``__cause__``.
+        The error has no traceback; its cause is in ``__cause__``.
         """
         try:
             self._require_session()
@@ -281,7 +281,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @property
     @abc.abstractmethod
     def status(self) -> Status:
-        """The last status the camera sent; after a loss it is the one of before.
+        """The last status the camera sent, also after the session was lost.
 
         Raises:
             ConnectionClosedError: there was no session yet.
@@ -290,7 +290,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @property
     @abc.abstractmethod
     def active_application(self) -> int | None:
-        """Id of the active application as last told by the camera; None before ``open()``."""
+        """Id of the active application as last reported by the camera; None before ``open()``."""
 
     @property
     @abc.abstractmethod
@@ -346,20 +346,20 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> Subscription[Result[ValueT]] | BatchSubscription[Result[ValueT]]:
         """Subscribe to everything the camera sends, triggered or not; subscribed when called.
 
-        The stream goes on over a reconnect; what the camera sent in between nobody got.
+        The stream continues after a reconnect; results that the camera sent in between are lost.
 
         A container that does not fit its layout, or its calibration, is raised from the iterator as
         :exc:`~smartcam.InterpretationError`; the iterator stays usable. Results of
         another application than the one named are counted, not delivered.
 
         Args:
-            batch: give lists of what is there, one result at least, instead of single results:
-                for a camera that sends thousands a second. ``max_queue`` counts results.
+            batch: give lists of all waiting results, at least one, instead of single results: for a
+                camera that sends thousands a second. ``max_queue`` counts results.
             min_interval: seconds; results that come sooner after the last one are dropped.
             max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
-            max_queue_bytes: bytes that their containers may have together (``Result.raw``; values
-                may be larger). One that is larger alone is kept while no other is.
-            overflow: what happens beyond either.
+            max_queue_bytes: largest number of bytes of their containers together (``Result.raw``;
+                values may be larger). A larger single container is kept if the queue is empty.
+            overflow: consequence of reaching either limit.
         """
         check_flag(batch, "batch", self.name)
         kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
@@ -392,7 +392,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[CameraEvent]:
-        """Subscribe to what happens to the camera, in order.
+        """Subscribe to the camera's events, in order.
 
         The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged``,
         ``ApplicationChanged`` and ``NoticeReceived``. Subscribe before :meth:`open` to see the
@@ -406,7 +406,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> Status:
         """Return the first status, the present one included, that ``predicate`` accepts.
 
-        It is shown every status in order, never only the last.
+        The predicate sees every status in order, not only the last.
 
         Raises:
             ResponseTimeoutError: after ``timeout`` seconds.
@@ -435,9 +435,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
     ) -> Coroutine[Any, Any, Result[ValueT]]:
-        """Wait for the next result, whoever triggers it; registered when called, not when awaited.
+        """Wait for the next result, whatever triggers it; registered when called, not when awaited.
 
-        One that is known to be of a trigger that was given up is not taken for it.
+        A result that is known to belong to a trigger that was given up is left out.
 
         ``waiting = camera.next_result(); start_conveyor(); result = await waiting``
 
@@ -446,7 +446,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             TriggerTimeoutError: no result came in time.
-            InterpretationError: what came does not fit its layout, or its calibration.
+            InterpretationError: the container does not fit its layout, or its calibration.
 
         Cancellation: safe; the result still goes to the streams.
         """
@@ -570,40 +570,39 @@ class Camera(abc.ABC, Generic[ValueT]):
         Waits until the camera waits for a trigger, then sends. One trigger at a time: a second
         caller waits its turn, within its own ``timeout``. A trigger is never sent twice.
 
-        Where the layout has an ``@sequence`` field, the run's number is set right before the
-        trigger, and only the container that carries it is the result. Otherwise, over TCP, a Query
-        goes out in front of the trigger: what comes before its answer is older. An
-        earlier trigger that was given up is settled first: its result is awaited a moment, or made
-        impossible (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
-        ``@sequence`` a late result can pass for the next one's: nothing on the wire tells.
+        If the layout has an ``@sequence`` field, the number of the run is set right before the
+        trigger, and only the container with this number is the result. Otherwise, over TCP, a Query
+        is sent before the trigger: containers that arrive before its answer are older. An
+        earlier trigger that was given up is settled first: its result is awaited a moment, or
+        prevented (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
+        ``@sequence`` a late result can pass for the next trigger's: the wire does not show it.
 
         Args:
-            application: have this application running for this trigger, by its id or its name in
-                ``application_names``, and go back to the present
-                one afterwards, also after an error or a cancellation. Each switch has
-                ``switch_timeout`` of its own.
+            application: id, or name in ``application_names``, of the application to run for this
+                trigger. The camera returns to the present one afterwards, also after an error or a
+                cancellation. Each switch has ``switch_timeout`` of its own.
             interpret_as: how to read this result; default as given to :func:`connect`.
             input: input data for this inspection, sent right before the trigger.
             timeout: seconds, for the turn, the readiness and the result together.
             when_busy: ``refuse`` raises CameraBusyError instead of waiting for readiness.
             results_per_trigger: how many results the application sends for a trigger (one for each
-                "send results" tool); they come as a list then. By default it is one, and more are
-                counted as ``extra_results``.
+                "send results" tool); they are returned as a list then. By default one is expected,
+                and more are counted as ``extra_results``.
 
         Raises:
             ConfigurationError: an argument cannot work; nothing was sent.
-            NotRunningError: the application is stopped (neither BUSY nor Running), or somebody
-                else stopped it during the inspection.
-            TriggerTimeoutError: no result in time; it says what the status was. An application
+            NotRunningError: the application is stopped (neither BUSY nor Running), or was stopped
+                from elsewhere during the inspection.
+            TriggerTimeoutError: no result in time; the error names the status. An application
                 that runs free never waits for a trigger and ends here, and so does a switch to
-                ``application`` that takes too long. Where others had the camera for so long that
-                no time is left for a result, no trigger was sent.
+                ``application`` that takes too long. If other callers had the camera for so long
+                that no time is left for a result, no trigger was sent.
             OvertriggeredError: the camera dropped a trigger meanwhile.
             CameraBusyError: with ``when_busy="refuse"``.
             CameraFaultError: the camera reports System Error.
-            InputContainerError: with ``input``: it did not belong to this inspection, or the input
-                of an earlier trigger without a result may still be queued in the camera; loading
-                an application (:meth:`switch_application`) empties its queue (inferred).
+            InputContainerError: with ``input``: the data did not belong to this inspection, or the
+                input of an earlier trigger without a result may still be queued in the camera;
+                loading an application (:meth:`switch_application`) empties its queue (inferred).
             InterpretationError: the result does not fit its layout, or its calibration.
             WrongApplicationError: the result is another application's, or another application is
                 active than the one that was named.
@@ -647,12 +646,12 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             application: id of the application, its name in ``application_names``, or the name of
-                its file where the camera can load by that.
+                its file if the camera can load by that.
             timeout: seconds for the whole; default ``switch_timeout``.
 
         Raises:
             UnsupportedError: a name, to a camera that knows ids only.
-            CommandRejectedError: unknown id, or 0; tells the id that is active.
+            CommandRejectedError: the id is unknown, or 0; the error names the active id.
             ResponseTimeoutError: the camera did not answer, or stayed BUSY.
 
         Cancellation: safe; the camera may be in either application, and stopped.
@@ -666,12 +665,12 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _switch_application(self, application: int | str, timeout: float) -> None: ...
 
     def application(self, application: int | str) -> contextlib.AbstractAsyncContextManager[Self]:
-        """Have an application running inside the ``async with``, then go back to the one before.
+        """Run an application inside the ``async with``, then return to the one before.
 
         Raises:
             CommandRejectedError, ResponseTimeoutError: as :meth:`switch_application`.
 
-        Cancellation: going back is finished by the client's supervisor; the next call waits for it.
+        Cancellation: the client's supervisor finishes the return; the next call waits for it.
         """
         return self._in_application(check_application(self._named(application), who=self.name))
 
@@ -679,11 +678,11 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the id of an application's name; anything else as it is.
 
         Args:
-            application: what the user gave.
-            file: a name that is not known may be a file's.
+            application: the user's value.
+            file: whether an unknown name may be the name of a file.
 
         Raises:
-            ConfigurationError: there are names, and this is none of them.
+            ConfigurationError: there are names, and this one is not among them.
         """
         names = self.settings.application_names
         if not names or not isinstance(application, str) or (file and application not in names):
@@ -698,7 +697,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: the camera did not within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not report so within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -714,7 +713,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: the camera did not within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not report so within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -727,8 +726,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Ask the camera which application is active.
 
         Raises:
-            ResponseTimeoutError: no answer. The next question waits for it first, so that it does
-                not pass for its own; after ``request_timeout`` the link is given up for it.
+            ResponseTimeoutError: no answer. The next request waits for the late answer first, so
+                that it is not taken for another; after ``request_timeout`` the link is dropped.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
@@ -741,7 +740,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Ask the camera for its status.
 
         Raises:
-            UnsupportedError: the camera cannot be asked; its status comes by itself.
+            UnsupportedError: the camera has no such request; it sends its status by itself.
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe.
@@ -754,10 +753,10 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def reset_errors(self, *, timeout: float | None = None) -> Status:
         """Clear the error bits that stay set until then; return the status after it.
 
-        :meth:`trigger` does so by itself where a Trigger Error of before would hide its own.
+        :meth:`trigger` does so by itself if an earlier Trigger Error would hide its own.
 
         Raises:
-            UnsupportedError: the camera's bits fall by themselves.
+            UnsupportedError: the camera clears its bits by itself.
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe; the command may have been sent.
@@ -772,7 +771,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the last picture, as a file's bytes.
 
         Raises:
-            UnsupportedError: the protocol has no message for it, as BVS.
+            UnsupportedError: the protocol has no message for it, such as BVS.
             CommandRejectedError: the camera refused.
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
@@ -793,32 +792,32 @@ class Camera(abc.ABC, Generic[ValueT]):
         decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> contextlib.AbstractAsyncContextManager[FrameReader]:
-        """Read what the camera sees: ``async with camera.frames() as frames``, then iterate.
+        """Read the camera's frames: ``async with camera.frames() as frames``, then iterate.
 
-        It is a :class:`smartcam.frames.FrameReader`: it gives the newest frame, and counts what was
-        skipped for that and what was lost. The device streams while anybody reads, and the bus has
-        one frame at a time under way for each reader.
+        The reader is a :class:`smartcam.frames.FrameReader`: it gives the newest frame, and counts
+        skipped and lost frames. The device streams while there is a reader, and the bus carries
+        one frame at a time for each reader.
 
-        Only a camera of a fleet has frames, where its entry in the fleet file says ``frames``.
+        Only a camera of a fleet has frames, if its entry in the fleet file has ``frames``.
 
         Args:
-            encoding: ``raw`` is as the device gives them; ``jpeg``, or ``png`` and ``jpegxl``
-                without loss. They stay so until somebody asks for pixels. ``h264`` is decoded here,
-                and only whole pictures are given.
+            encoding: ``raw``, as the device gives them; ``jpeg``; or ``png`` and ``jpegxl``,
+                without loss. Frames stay encoded until their pixels are read. ``h264`` is decoded
+                here, and only whole pictures are given.
             quality: quality of JPEG, 1 to 100.
-            bitrate: bits per second that JPEGs are held to, by quality first and frame rate then
-                (each frame's ``rate`` says how); of H.264 what its encoder keeps to.
-            latency: seconds from a JPEG's capture to its arrival that are held the same way.
-            decode: False: of H.264 the encoded frames. Who skips one has no picture until the next
-                key frame.
+            bitrate: bits per second that JPEGs are limited to, first by quality, then by frame rate
+                (each frame's ``rate`` says how); for H.264 the bit rate of its encoder.
+            latency: seconds from a JPEG's capture to its arrival, limited in the same way.
+            decode: False: give H.264 frames encoded. A reader that skips one has no picture until
+                the next key frame.
             timeout: seconds that an iteration waits for a frame; None: without limit.
 
         Raises:
-            UnsupportedError: the camera has none.
+            UnsupportedError: the camera has no frames.
             FrameSourceError: the device is not there, in use, or was unplugged; or the agent is
-                gone. A reader ends with it, and another one tries again.
+                gone. The reader ends then; a new reader tries again.
 
-        Cancellation: nothing is left.
+        Cancellation: safe; nothing stays open.
         """
         form = self._check_form(encoding, quality, STREAM_ENCODINGS)
         rate = self._check_rate(bitrate, latency)
@@ -837,13 +836,13 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the newest frame.
 
         Args:
-            max_age: seconds since it was captured at most; ``inf``: any.
+            max_age: largest age of the frame in seconds; ``inf``: any age.
             encoding: as :meth:`frames` has it.
             quality: as :meth:`frames` has the argument.
             timeout: seconds.
 
         Raises:
-            UnsupportedError: the camera has none.
+            UnsupportedError: the camera has no frames.
             FrameTimeoutError: no frame came in time.
             FrameSourceError: the device is not there, in use, or was unplugged.
             ConnectionLostError: the agent is gone.
@@ -865,7 +864,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> FleetFrame:
         """Return the first frame whose exposure began after a moment, or after this call.
 
-        Where clocks or the source leave a doubt, it is the first one of which that is sure.
+        If clocks or the source leave a doubt, return the first frame that is surely late enough.
 
         Args:
             moment: time of ``time.monotonic()``; None: now.
@@ -895,33 +894,34 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> FleetFrame:
         raise self._no_frames()
 
-    # ------------------------------------------------------------------ for oneself
+    # ------------------------------------------------------------------ reservations
 
     def reserve(self, timeout: float = 10.0) -> contextlib.AbstractAsyncContextManager[Self]:
-        """Keep the commands of other programs out as long as the body runs.
+        """Keep the commands of other programs out while the body of the block runs.
 
-        They wait within their own timeouts, and then fail naming this program. It ends with the
-        body, or with this program: killed, or cut off, within the lease of the engine. The tasks of
-        this program use the camera as before, and may reserve it, too.
+        Other programs wait within their own timeouts, and then fail with an error that names this
+        program. The reservation ends with the block or with this program; if the program is killed
+        or cut off, within the lease of the engine. The tasks of this program use the camera as
+        before, and may reserve it, too.
 
         Only a camera of a fleet can be reserved: one at the wire serves one client, and the
         newcomer wins.
 
         Args:
-            timeout: seconds until it has to be ours. Whoever came before is waited for.
+            timeout: seconds to wait for the reservation; earlier ones come first.
 
-        A reservation may be lost before: its agent ends or is restarted, another one takes the
+        A reservation may be lost before: its agent ends or is restarted, another agent takes the
         camera over, this program was cut off or stopped for longer than the lease. Then every
-        command of this object is refused until the block has ended, and so is the block at its end,
-        unless it raises something else.
+        command of this object is refused until the block has ended, and so is the block's end,
+        unless the block raises another error.
 
         Raises:
-            UnsupportedError: the camera is none of a fleet.
-            ResponseTimeoutError: somebody else has it; says who.
+            UnsupportedError: the camera is not in a fleet.
+            ResponseTimeoutError: another program has the camera; the error names it.
             ConnectionLostError: the agent is away, or was restarted meanwhile.
-            ReservationLostError: at the end of the body: it was lost meanwhile, or nobody knows.
+            ReservationLostError: at the end of the block: it was, or may have been, lost.
 
-        Cancellation: safe; it is given back.
+        Cancellation: safe; the reservation is given back.
         """
         return self._reserved(check_seconds(timeout, "timeout", self.name))
 
@@ -929,16 +929,16 @@ class Camera(abc.ABC, Generic[ValueT]):
         raise self._not_shared("it cannot be reserved")
 
     async def take_back(self, *, timeout: float | None = None) -> None:
-        """Have the agent take the camera from another client, and wait for the session.
+        """Make the agent take the camera back from another client, and wait for the session.
 
-        By itself an agent tries a camera that was taken again after 30 s, then ever more seldom.
-        Does nothing where it has a session.
+        By itself an agent tries a camera that was taken again after 30 s, then less and less often.
+        Do nothing if the agent has a session.
 
         Args:
             timeout: seconds, ``request_timeout`` by default.
 
         Raises:
-            UnsupportedError: the camera is none of a fleet; a new connection takes it.
+            UnsupportedError: the camera is not in a fleet; a new connection takes it.
             LinkError: there is no agent.
             ResponseTimeoutError: there was no session within ``timeout``.
         """
@@ -965,7 +965,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
-            InterpretationError: what came is no date.
+            InterpretationError: the answer is no date.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
@@ -991,7 +991,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Send input data for the next inspection; only result codes confirm it.
 
         ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
-        inspections; the Input Container bit says when they are out of step.
+        inspections; the Input Container bit shows that they are out of step.
         """
         await self._set_input(check_bytes(data, "data", self.name))
 
@@ -1001,9 +1001,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def set_sequence_number(self, number: int) -> None:
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
-        :meth:`trigger` takes it for the next run's where the layout has an ``@sequence`` field;
-        otherwise it picks numbers of its own there. A run that something else triggers in between
-        would take this number: then leave the numbers to :meth:`trigger`.
+        If the layout has an ``@sequence`` field, :meth:`trigger` uses this number for the next run;
+        otherwise it picks numbers of its own there. A run that is triggered by something else in
+        between would use this number: then leave the numbers to :meth:`trigger`.
 
         Raises:
             ConfigurationError: the number has more than 32 bits.
@@ -1037,21 +1037,21 @@ class Camera(abc.ABC, Generic[ValueT]):
         answered: bool | None = None,
         timeout: float | None = None,
     ) -> bytes | None:
-        """Send any message; the escape hatch for what has no method here.
+        """Send any message; for requests that have no method here.
 
         Args:
-            message_id: id of the message; a command's text where the protocol has commands.
+            message_id: id of the message; a command's text if the protocol has commands.
             payload: body of the message.
-            answered: whether to wait for an answer under the same id; by default what the message
-                table says, True for an unknown id.
+            answered: whether to wait for an answer under the same id; default: as in the
+                message table, True for an unknown id.
             timeout: seconds for the answer.
 
         Returns:
-            The answer's body, None if none is waited for: returned once written.
+            The answer's body; None, once the message is written, if no answer is expected.
 
         Raises:
-            LocalProtocolError: Connect and Disconnect (sessions are the client's own).
-            UnsupportedError: an id of another kind than the protocol's.
+            LocalProtocolError: the message is Connect or Disconnect, which only the client sends.
+            UnsupportedError: the protocol has no ids of this kind.
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe; the answer is dropped when it comes.
@@ -1072,7 +1072,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     # ------------------------------------------------------------------ small helpers
 
     def _limit(self, timeout: float | None, usual: float) -> float:
-        """Return a call's seconds: those given, or the usual ones."""
+        """Return a call's timeout in seconds: the given one, or the usual one."""
         return usual if timeout is None else check_seconds(timeout, "timeout", self.name)
 
     def _check_form(
@@ -1107,12 +1107,12 @@ class Camera(abc.ABC, Generic[ValueT]):
         return self.settings.address
 
     def _read_by(self, spec: object) -> None:
-        """Read results by ``spec`` from now on; None: as the settings say.
+        """Read results by ``spec`` from now on; None: by the settings.
 
-        Whoever has this object reads so; its results are the same for all of them.
+        Every user of this object gets results that are read so.
 
         Raises:
-            ConfigurationError: ``spec`` cannot be, or not with the calibration.
+            ConfigurationError: ``spec`` is not valid, or does not fit the calibration.
         """
         spec = self.settings.interpret_as if spec is None else spec
         self._default = self._interpretation(spec)
@@ -1123,10 +1123,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             spec: as ``interpret_as``.
-            own: whether the settings say it, beside the calibration.
+            own: whether ``spec`` is the camera's own setting, next to its calibration.
 
         Raises:
-            ConfigurationError: ``spec`` cannot be, or not with the calibration.
+            ConfigurationError: ``spec`` is not valid, or does not fit the calibration.
         """
         if isinstance(spec, Interpretation):
             return spec
@@ -1157,7 +1157,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             ) from exc
 
     def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
-        """Have a queue offered what comes; it has ended already where nothing will."""
+        """Offer a queue all new items; end it at once if none will come."""
         over = self._over()
         if over is not None:
             queue.end(over[0])

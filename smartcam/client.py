@@ -1,8 +1,8 @@
 """A camera at the wire.
 
-``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and has
-every chunk of their links handed on by the :class:`~smartcam._client.dispatch.Dispatch`. Commands
-stand here; each is a few messages out and a wait with a deadline.
+``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and
+passes every chunk of their links to the :class:`~smartcam._client.dispatch.Dispatch`. The commands
+are here; each sends a few messages and waits with a deadline.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class SmartCamera(Camera[ValueT]):
         return CameraState(self.settings.name, self.settings.application, self._listeners)
 
     def _go_to(self, address: Address) -> None:
-        """Take another address than that of the settings; only before the client is opened."""
+        """Use another address than that of the settings; only before the client is opened."""
         self.settings: CameraSettings = self.settings.model_copy(update={"address": address})
         self._supervisor.go_by(self.settings)
 
@@ -115,7 +115,7 @@ class SmartCamera(Camera[ValueT]):
 
     def _over(self) -> tuple[SmartCamError | None] | None:
         end = self._waits.end
-        if end is None or not self._supervisor.over:  # between two sessions it waits for the next
+        if end is None or not self._supervisor.over:  # between sessions, streams wait for the next
             return None
         return (None if isinstance(end, ConnectionClosedError) else end,)
 
@@ -260,7 +260,7 @@ class SmartCamera(Camera[ValueT]):
             ) from exc
 
     async def _set_clock(self, when: datetime) -> None:
-        await self._tell(
+        await self._send(
             m.SetClock(
                 year=when.year,
                 month=when.month,
@@ -272,20 +272,20 @@ class SmartCamera(Camera[ValueT]):
         )
 
     async def _set_input(self, data: bytes) -> None:
-        await self._tell(m.SetInput(data=data))
+        await self._send(m.SetInput(data=data))
 
     async def _set_sequence_number(self, number: int) -> None:
-        await self._tell(m.SetSequenceNumber(number=number))
+        await self._send(m.SetSequenceNumber(number=number))
         self._triggers.give_number(number)
 
     async def reboot(self) -> None:
         link = self._connection.require_link()
         self._connection.require(m.Reboot)
         self._supervisor.restarts(link)
-        await self._tell(m.Reboot())
+        await self._send(m.Reboot())
         if link.machine.transport is Transport.TCP:
             await link.wait_closed(self.settings.close_timeout)
-        # over UDP nothing tells that the session is over, and over TCP perhaps nothing in time
+        # over UDP nothing shows that the session is over, and over TCP perhaps nothing in time
         link.abort(ConnectionResetError("the camera restarts"))
         self._dispatch.fail(link.lost_error())
 
@@ -298,13 +298,13 @@ class SmartCamera(Camera[ValueT]):
         if raw.answered if answered is None else answered:
             return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
         if raw.answered and raw.known:
-            # the camera answers all the same, and that must not pass for the next request's answer
+            # the camera still answers, and its answer must not pass for the next request's
             await self._requests.post(raw.message, raw.answer, deadline)
         else:
             await self._requests.tell(raw.message, deadline, answered=False)
         return None
 
-    async def _tell(self, message: m.Request) -> None:
+    async def _send(self, message: m.Request) -> None:
         await self._requests.command(
             message, self._connection.deadline(self.settings.request_timeout)
         )

@@ -91,9 +91,9 @@ def connect(
             pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
             ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
             (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
-            are inspected in this process, as a cell file says (:mod:`smartcam.inspection`).
+            are inspected in this process, by a cell file (:mod:`smartcam.inspection`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
-        observers: see frames, events, results and errors:
+        observers: objects that see frames, events, results and errors:
             :class:`~smartcam.Observer`.
         **options: ``name``, ``application``, ``application_names``,
             ``interpret_as``, ``calibration``, ``y_down``,
@@ -101,20 +101,20 @@ def connect(
             ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
             ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
 
-    The type of the camera's values is that which ``interpret_as`` names: of ``"localizations"``,
-    ``"raw"``, a class, a function. Without one it is ``Any``, since a URL does not say it: bytes at
-    the wire, and of a camera of a fleet what its agent knows.
+    ``interpret_as`` gives the type of the camera's values: ``"localizations"``, ``"raw"``, a class,
+    a function. Without it the type is ``Any``, since a URL does not say it: bytes at the wire; for
+    a camera of a fleet the values that its agent makes.
 
     With ``calibration`` the value of every result is a list of localizations in the robot's frame,
     as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
-    an observer. It gets what ``interpret_as`` gives, turned to y up with ``y_down``; the headers'
-    frame is the camera's ``name``, which a calibration with a ``camera_frame`` wants to be that.
-    No value passes without it. One that is no list of localizations, or that the calibration
-    refuses, is an :exc:`~smartcam.InterpretationError` with the cause chained; an
-    interpreter whose values never are localizations (raw, record, table, strings50) is a
-    ConfigurationError at once; where a single trigger names such a one, its value stays as it is. A
-    mapping from application id takes another calibration for each, and None for those whose values
-    are to stay as they are; an application that it lacks is an error, too.
+    an observer. The calibration gets the values that ``interpret_as`` gives, turned to y up with
+    ``y_down``. The frame in their headers is the camera's ``name``, which has to be the
+    ``camera_frame`` of a calibration that has one. No value passes without the calibration: a value
+    that is no list of localizations, or that the calibration refuses, is an
+    :exc:`~smartcam.InterpretationError` with the cause chained. An interpreter that never gives
+    localizations (raw, record, table, strings50) is a ConfigurationError at once; if a single
+    trigger names one, its value stays as it is. A mapping gives each application id its own
+    calibration, or None to leave its values as they are; an id that it lacks is an error, too.
 
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.

@@ -1,19 +1,19 @@
-"""Every error smartcam raises.
+"""Every error that smartcam raises.
 
 ::
 
     SmartCamError
-    ├── ConfigurationError (ValueError)        what the user gave cannot work
+    ├── ConfigurationError (ValueError)        a value of the user cannot work
     │   ├── LayoutError                        a layout text, with the position of the mistake
     │   ├── PluginError                        a plug-in: unknown, twice there, failed to load
     │   └── MissingExtraError                  an optional part is not installed
     ├── LinkError (ConnectionError)            host, port
-    │   ├── ConnectFailedError                 no session; each attempt and what came
+    │   ├── ConnectFailedError                 no session; the attempts and outcomes
     │   ├── ConnectionLostError                the session ended by itself
     │   ├── ConnectionTakenError               another client took the camera
     │   └── ConnectionClosedError              closed by us
     ├── ResponseTimeoutError (TimeoutError)    a wait in a session ran out
-    ├── CommandRejectedError                   the camera said no; what is active now
+    ├── CommandRejectedError                   the camera refused; the active application
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── NotAllowedError (PermissionError)      the role of this program's certificate forbids it
     ├── ReservationLostError               the camera was not this program's alone all the time
@@ -21,17 +21,17 @@
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
     │   ├── FrameFeatureError                  no such feature, or not settable so now
-    │   ├── FrameFormatError                   pixels that it has not, or that are not valid
+    │   ├── FrameFormatError                   no such pixels, or bytes that are no picture
     │   └── FrameTimeoutError (TimeoutError)   no picture in time
     ├── InspectionError                        a tool failed: the picture has no verdict
     ├── OutletError                            the far end of an outlet is away; it is tried again
     │   └── EntryRefusedError                  it will never take one of the entries
     ├── RecordingError (OSError)               a recording that could not be written, or read
-    ├── RosError                               what another ROS node, or we to one, said
+    ├── RosError                               something between ROS nodes did not work
     │   ├── RosMessageError                    bytes or fields that are no message of their type
     │   └── ServiceCallError                   a call without a reply: no such service, refused
     │       └── ServiceTimeoutError (TimeoutError)
-    ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
+    ├── SubscriberOverflowError                a stream's reader was too slow
     ├── TriggerError                           a trigger that gave no result, and why
     │   ├── OvertriggeredError
     │   ├── NotRunningError
@@ -40,15 +40,15 @@
     │   ├── FrameLostError                     a triggered picture that was lost on its way
     │   └── TriggerTimeoutError (TimeoutError)
     ├── ProtocolError
-    │   ├── LocalProtocolError                 we asked for what this state forbids
+    │   ├── LocalProtocolError                 the protocol's state forbids the request
     │   └── RemoteProtocolError                the peer broke the protocol
     │       ├── FrameError                     magic, length: no frame can be cut
     │       └── MessageError                   a frame whose body does not fit its message
     └── InterpretationError (ValueError)       field, offset, expected, got; the link stays up
         └── WrongApplicationError              the result is another application's: both ids
 
-All of them survive ``pickle``. Texts say what was tried, what came and what was expected; at most
-64 bytes of a peer's data stand in one.
+All of them survive ``pickle``. Texts name the attempt, the received value and the expected one; at
+most 64 bytes of a peer's data stand in a text.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ MAX_EXCERPT_BYTES = 64
 
 
 MAX_TEXT_CHARACTERS = 10_000
-"""Largest number of characters of an error's text: a net under texts that quote what somebody gave,
-each of which shows a part of it only."""
+"""Largest number of characters of an error's text: a safety net, since texts already cut the
+values that they quote."""
 
 _LEFT_OUT = " ... "
 
@@ -128,10 +128,10 @@ def _cut(text: object) -> object:
 class SmartCamError(Exception):
     """Root of all errors of this library.
 
-    Attributes of the subclasses are keyword arguments with defaults, which is what lets
-    ``pickle`` rebuild them from the text and then restore the attributes.
+    Attributes of the subclasses are keyword arguments with defaults, so that ``pickle``
+    can rebuild them from the text and then restore the attributes.
 
-    A text has :data:`MAX_TEXT_CHARACTERS` characters at most; what is longer is cut in its middle.
+    A text has :data:`MAX_TEXT_CHARACTERS` characters at most; longer ones are cut in the middle.
     """
 
     def __init__(self, *args: object) -> None:
@@ -181,7 +181,7 @@ class MissingExtraError(ConfigurationError):
 
 
 class LinkError(SmartCamError, ConnectionError):
-    """The link to the camera: could not be made, or is gone.
+    """The link to the camera could not be made, or is lost.
 
     Attributes:
         host: address of the camera.
@@ -198,7 +198,7 @@ class ConnectFailedError(LinkError):
     """No session could be made.
 
     Attributes:
-        attempts: one text per attempt: what was tried and what came.
+        attempts: one text for each attempt: what was tried and how it failed.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class ConnectionLostError(LinkError):
 
 
 class ConnectionClosedError(LinkError):
-    """We closed the session, or never opened it."""
+    """This program closed the session, or never opened it."""
 
 
 class ConnectionTakenError(LinkError):
@@ -276,9 +276,9 @@ class NotAllowedError(SmartCamError, PermissionError):
 
 
 class ReservationLostError(SmartCamError):
-    """A reservation ended before its block, or nobody knows: others may have come between.
+    """A reservation ended, or may have ended, before its block; others may have come between.
 
-    A command that raises it was not done.
+    A command that raises this error was not carried out.
     """
 
 
@@ -287,10 +287,10 @@ class CameraFaultError(SmartCamError):
 
 
 class CalibrationError(SmartCamError, ValueError):
-    """Samples, or a calibration, of which no number can be made that means something.
+    """Samples, or a calibration, from which no meaningful number can be computed.
 
     Attributes:
-        code: what is wrong, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
+        code: kind of the mistake, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
         expected: what was expected.
         got: what came.
     """
@@ -319,7 +319,7 @@ class FrameSourceError(SmartCamError, OSError):
 
 
 class FrameFormatError(FrameSourceError):
-    """A source has no such pixels, or bytes are no picture of the format that they should have."""
+    """A source has no such pixels, or bytes are no picture of their format."""
 
 
 class FrameFeatureError(FrameSourceError):
@@ -352,7 +352,7 @@ class EntryRefusedError(OutletError):
     """The far end of an outlet will never take one of the entries.
 
     Attributes:
-        place: place of the entry in what was delivered; the entries before it were taken.
+        place: place of the entry among those delivered; the entries before it were taken.
     """
 
     def __init__(self, message: str = "", *, place: int = 0) -> None:
@@ -361,10 +361,10 @@ class EntryRefusedError(OutletError):
 
 
 class RecordingError(SmartCamError, OSError):
-    """A recording could not be written: the disk is full, or too slow; it ends there.
+    """A recording could not be written, or could not be read.
 
-    What was written before stays and can be read. Or one could not be read, since it unpacks to
-    more than any recording.
+    A full or slow disk ends a recording; the part written before stays and can be read. A file that
+    would unpack to more than any recording is not read.
     """
 
 
@@ -377,7 +377,7 @@ class RosMessageError(RosError):
 
 
 class ServiceCallError(RosError):
-    """A call of a ROS service had no reply: nobody serves it, or who does refused or failed.
+    """A call of a ROS service had no reply: no node serves it, or the node refused or failed.
 
     Attributes:
         service: name of the service.
@@ -393,7 +393,7 @@ class ServiceTimeoutError(ServiceCallError, TimeoutError):
 
 
 class SubscriberOverflowError(SmartCamError):
-    """A stream with ``overflow="error"`` was full; items after what was queued are lost."""
+    """A stream with ``overflow="error"`` was full; items after the queued ones are lost."""
 
 
 class TriggerError(SmartCamError):
@@ -401,7 +401,7 @@ class TriggerError(SmartCamError):
 
 
 class OvertriggeredError(TriggerError):
-    """The camera dropped a trigger; it cannot be told whose."""
+    """The camera dropped a trigger, perhaps another client's: the camera does not name it."""
 
 
 class NotRunningError(TriggerError):
@@ -437,7 +437,7 @@ class ProtocolError(SmartCamError):
 
 
 class LocalProtocolError(ProtocolError):
-    """We asked for what the protocol's state forbids; nothing was sent."""
+    """The protocol's state forbids a request of this program; nothing was sent."""
 
 
 class RemoteProtocolError(ProtocolError):
@@ -445,7 +445,7 @@ class RemoteProtocolError(ProtocolError):
 
     Attributes:
         offset: byte where the mistake is, counted from the start of the frame.
-        data: the first bytes of it, at most 64.
+        data: first bytes of the frame, at most 64.
     """
 
     def __init__(
@@ -465,7 +465,7 @@ class MessageError(RemoteProtocolError):
 
 
 class InterpretationError(SmartCamError, ValueError):
-    """A result container does not fit what the user said about it; the link stays up.
+    """A result container does not fit its layout; the link stays up.
 
     Attributes:
         field: name of the field, or "" if the whole container is meant.
@@ -491,7 +491,7 @@ class InterpretationError(SmartCamError, ValueError):
 
 
 class WrongApplicationError(InterpretationError):
-    """A result came from another application than the one it was expected from.
+    """A result came from another application than expected.
 
     ``expected`` and ``got`` are the two application ids.
     """

@@ -1,8 +1,8 @@
-"""Public values: what the camera says and what comes of it.
+"""Public values: the camera's data, and the values made of them.
 
-They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable where many
+They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable if many
 readers share them, and turned to JSON by :func:`jsonable` with their field names.
-Lengths are metres, angles radians, times seconds unless a name says otherwise.
+Lengths are metres, angles radians, times seconds unless a name has another unit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, c
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    # with a default, so that a bare Result or SmartCamera stays what it always was
+    # with a default, so that a bare Result or SmartCamera keeps its meaning
     from typing_extensions import TypeVar
 
     ValueT = TypeVar("ValueT", default=Any)
@@ -60,8 +60,8 @@ class Status(enum.IntFlag):
     """The camera's status word. Bits not named here are kept.
 
     Source: SC manual p. 30 and p. 33 (published) for the first seven bits and their values; the
-    bits need not be reset by the client, when a state ends the camera sends a status without it.
-    Where a dialect's own word differs, its table maps its bits to these; a bit that has no
+    client need not reset the bits: when a state ends, the camera sends a status without its bit.
+    If a dialect's own word differs, its table maps its bits to these; a bit without a
     counterpart here stands 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
     Error, which stays set until the errors are reset.
     """
@@ -126,7 +126,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 
 def as_status(word: int) -> Status:
-    """Return the status of a word; for the receiving path, where ``Status(word)`` is slow."""
+    """Return the status of a word; for the receiving path, since ``Status(word)`` is slow."""
     known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
@@ -192,16 +192,16 @@ class Header(NamedTuple):
 
 
 class PoseSigma(NamedTuple):
-    """The errors that a pose may have: what a robot may expect of it, as standard deviations.
+    """The errors that a robot may expect of a pose, as standard deviations.
 
     Attributes:
-        x: along the frame's x axis, metres; pixels where the position is in pixels.
-        y: along the frame's y axis, the same.
+        x: along the frame's x axis, metres; pixels if the position is in pixels.
+        y: along the frame's y axis, in the unit of ``x``.
         theta: error of the rotation about the pose's z axis, radians.
         correlation_xy: correlation of the errors of x and y, -1 to 1.
         correlation_xt: correlation of those of x and theta.
         correlation_yt: correlation of those of y and theta.
-        z: along the frame's z axis, metres; None: it is not known, as a camera sees no height.
+        z: along the frame's z axis, metres; None if not known: a camera sees no height.
     """
 
     x: float
@@ -214,7 +214,7 @@ class PoseSigma(NamedTuple):
 
     @property
     def place(self) -> float:
-        """The standard deviation in the frame's x and y along the worst direction; as ``x``."""
+        """The standard deviation in x and y along the worst direction, in the unit of ``x``."""
         mean, half = (self.x**2 + self.y**2) / 2, (self.x**2 - self.y**2) / 2
         return math.sqrt(mean + math.hypot(half, self.correlation_xy * self.x * self.y))
 
@@ -238,7 +238,7 @@ class Pose(NamedTuple):
 
     @property
     def sigma(self) -> PoseSigma | None:
-        """The errors that it may have; None: nobody said. Comparisons leave it out."""
+        """The errors that the pose may have; None if not known. Comparisons leave them out."""
         return None
 
     def with_sigma(self, sigma: PoseSigma) -> Pose:
@@ -249,7 +249,7 @@ class Pose(NamedTuple):
 
 
 class _EstimatedPose(Pose):
-    """A pose whose errors are known; what is made of it by ``_replace`` has none."""
+    """A pose whose errors are known; a pose made of it by ``_replace`` has none."""
 
     @property
     def sigma(self) -> PoseSigma | None:
@@ -271,8 +271,8 @@ class Localization(NamedTuple):
         feature_id: name of the taught feature.
         quality: 0 to 1.
         photo_index: index of the photo it was found in.
-        pose: place of the part: x right, y up, theta counter-clockwise. Of cameras that tell it,
-            ``pose.sigma`` says how far off the pose may be.
+        pose: place of the part: x right, y up, theta counter-clockwise. ``pose.sigma`` is the
+            error that the pose may have, if the camera sends it.
     """
 
     feature_id: str
@@ -303,9 +303,8 @@ class Calibration(Protocol):
                 frame.
 
         Raises:
-            CalibrationError: one of the localizations cannot be brought there. That makes
-                the whole result an :exc:`~smartcam.InterpretationError`, and so does anything else
-                that is raised.
+            CalibrationError: one of the localizations cannot be transformed. This error, and any
+                other one, makes the whole result an :exc:`~smartcam.InterpretationError`.
         """
         ...
 
@@ -318,11 +317,11 @@ class Result(NamedTuple, Generic[ValueT]):
         application: id of the application that made it.
         sequence: value of the layout's ``@sequence`` field, None without one.
         number: the client's own count of containers, from 1.
-        triggered_at: when the trigger was sent, UTC; None for a result nobody had triggered.
+        triggered_at: when the trigger was sent, UTC; None without a trigger of this client.
         received_at: when its last byte arrived, UTC.
-        latency: seconds from trigger to arrival (monotonic clock); None like ``triggered_at``.
+        latency: seconds from trigger to arrival (monotonic clock); None without a trigger.
         raw: the container's bytes after the application id.
-        value: what the interpreter made of them.
+        value: the interpreted value.
     """
 
     camera: str
@@ -360,10 +359,10 @@ class Capabilities:
         load_file: load an application by the name of its file.
         start_stop: enter and leave run mode; otherwise the camera always runs.
         reboot: restart.
-        get_clock: tell the time.
-        set_clock: have the clock set.
+        get_clock: return the camera's time.
+        set_clock: set the camera's clock.
         input_data: take input data for an inspection.
-        sequence_number: have the number of the next run set.
+        sequence_number: set the number of the next run.
         result_codes: commands are acknowledged, or refused with a code.
         status_by_itself: the status comes with the session and at every change.
         get_status: the status can be asked for.
@@ -390,13 +389,13 @@ class Capabilities:
 
     @property
     def names(self) -> list[str]:
-        """Names of what it can do."""
+        """Names of the abilities that the camera has."""
         return [f.name for f in dataclasses.fields(self) if getattr(self, f.name) is True]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraEvent:
-    """Something happened to a camera.
+    """An event of a camera.
 
     Attributes:
         camera: name of the camera.
@@ -416,14 +415,14 @@ class Connected(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reconnected(CameraEvent):
-    """A later session was made, and the camera has told its active application again."""
+    """A later session was made, and the camera has reported its active application again."""
 
     url: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnected(CameraEvent):
-    """The session ended; ``reason`` says why, ``expected`` is True if this side ended it."""
+    """The session ended; ``reason`` is the cause, ``expected`` is True if this side ended it."""
 
     reason: str
     expected: bool
@@ -447,12 +446,12 @@ class ApplicationChanged(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoticeReceived(CameraEvent):
-    """The camera has said something that is neither a status nor a result.
+    """The camera has sent a notice that is neither a status nor a result.
 
     Attributes:
         kind: ``"error"``, ``"notification"`` or ``"debug"``.
-        code: the camera's number of it, 0 where it has none.
-        text: what the camera says.
+        code: the camera's number of the notice, 0 without one.
+        text: the camera's text.
     """
 
     kind: str
@@ -467,13 +466,13 @@ class SubscriberStatistics:
     What a camera sent while it was subscribed is ``offered + missed``.
 
     Attributes:
-        name: what is subscribed to: ``results``, ``statuses`` or ``events``.
-        policy: what happens when the queue is full: ``drop_oldest`` or ``error``.
+        name: kind of the subscribed items: ``results``, ``statuses`` or ``events``.
+        policy: consequence of a full queue: ``drop_oldest`` or ``error``.
         offered: items that came while it was subscribed.
-        taken: items it took.
+        taken: items that the subscriber took.
         dropped: items lost to the policy or to ``min_interval``.
         queued: items waiting.
-        queued_bytes: bytes of their containers; 0 for statuses and events.
+        queued_bytes: bytes of the queued containers; 0 for statuses and events.
         missed: items of a fleet's camera that were lost, since the program was cut off from its
             agent for longer than the agent keeps them; 0 for a camera at the wire.
     """
@@ -490,14 +489,14 @@ class SubscriberStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """The number of times that fell into each of a row of bins.
+    """The number of times in each of a row of bins.
 
     Attributes:
         bounds: upper bounds of the bins, seconds, each included; a last bin has none.
-        counts: how many there were in each bin; one more than bounds.
+        counts: number of times in each bin; one more than bounds.
         total: sum of all times, seconds.
-        shortest: the shortest one, seconds; None before the first.
-        longest: the longest one, seconds; None before the first.
+        shortest: the shortest time, seconds; None before the first.
+        longest: the longest time, seconds; None before the first.
     """
 
     bounds: tuple[float, ...]
@@ -532,20 +531,20 @@ class Statistics:
     Attributes:
         received: result containers that arrived.
         triggered: results of this client's triggers.
-        streamed: results that nobody had triggered, while somebody was listening.
+        streamed: results without a trigger of this client, while there was a subscriber.
         late: results that came after their trigger had given up.
         wrong_application: containers from another application than expected; not interpreted.
         uninterpretable: containers that do not fit their layout.
-        unclaimed: results that nobody had triggered and nobody was listening for.
+        unclaimed: results without a trigger of this client and without a subscriber.
         empty_slots: all-zero records skipped by interpreters.
         extra_results: containers that came for a trigger which had its results already; they are
             counted as streamed or unclaimed too.
-        inspections_by_others: inspections that something else has triggered, a sensor or a person:
-            Waiting for Trigger went away, and not at a trigger of this client. Told over TCP where
-            the status comes by itself.
+        inspections_by_others: inspections triggered by something else, a sensor or a person:
+            Waiting for Trigger ended without a trigger of this client. Counted over TCP if the
+            camera sends its status by itself.
         overtriggers: times the Overtriggered bit rose.
         notices: errors, notifications and other remarks of the camera's own; the log has the first
-            ones of each minute.
+            few of each minute.
         sessions: sessions made.
         reconnects: sessions made after the first.
         frames_received: whole frames from the camera.
@@ -555,10 +554,10 @@ class Statistics:
         ignored_datagrams: datagrams that were dropped as broken, or because they came faster than
             the client could read; on TCP a broken frame ends the link.
         unknown_ids: messages with an id that the dialect does not know.
-        unexpected_messages: answers nobody waited for any more.
+        unexpected_messages: answers that no request waited for any more.
         long_bodies: known messages whose body was longer than documented.
         last_error: text of the last error of a link, or None.
-        round_trip: seconds from a request to its answer; a switch, which takes its time, left out.
+        round_trip: seconds from a request to its answer, without switches, which take long.
         processing: seconds from a trigger to its result.
         subscribers: accounts of the living subscribers.
     """
@@ -592,7 +591,7 @@ class Statistics:
 
 
 def jsonable(value: object) -> Any:
-    """Return ``value`` as what ``json.dumps`` takes, with the models' field names.
+    """Return ``value`` as objects that ``json.dumps`` takes, with the models' field names.
 
     Bytes become hex, times ISO 8601, a status the list of its bits' names, NaN and infinity null
     (JSON has no word for them), numpy arrays lists (structured ones lists of objects).
@@ -611,7 +610,7 @@ def jsonable(value: object) -> Any:
 
 
 def _jsonable_container(value: Any) -> Any:
-    # never imported for JSON's sake; another thread may be importing it just now
+    # numpy is not imported for this; another thread may be importing it just now
     numpy = sys.modules.get("numpy")
     arrays = getattr(numpy, "ndarray", ()), getattr(numpy, "generic", ())
     if hasattr(value, "_asdict"):

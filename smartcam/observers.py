@@ -34,7 +34,7 @@ class TraceEntry(NamedTuple):
         camera: name of the camera.
         direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
             unfinished frame when the link ended.
-        message_id: id on the wire, None for broken bytes and where there are no such ids.
+        message_id: id on the wire, None for broken bytes, and if the protocol has no ids.
         message: name of the message, or the error's text for broken bytes.
         fields: decoded body, None if it cannot be decoded.
         hex: the bytes.
@@ -50,14 +50,14 @@ class TraceEntry(NamedTuple):
 
 
 class RawFrame(NamedTuple):
-    """One frame as it went over the wire, which nobody has decoded yet.
+    """One frame as it went over the wire, not yet decoded.
 
     Attributes:
         at: time, UTC.
         camera: name of the camera.
         dialect: dialect that the frame is decoded in.
         sender: side that sent the frame.
-        frame: the frame; bytes that make none are an entry already.
+        frame: the frame; for bytes that make no frame, their entry.
     """
 
     at: datetime
@@ -83,61 +83,61 @@ class RawFrame(NamedTuple):
 
 
 class Observer:
-    """Sees what a client sees; override what is of interest.
+    """Base of classes that observe a client; override the methods of interest.
 
     Give one or more to :func:`smartcam.connect` (``observers=[...]``). They are called in the
-    event loop, in order, and must return at once; what one raises is logged and goes no further.
+    event loop, in order, and must return at once; errors that one raises are only logged.
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """See a frame that went over the wire, or bytes that make no frame.
+        """Handle a frame that went over the wire, or bytes that make no frame.
 
-        Frames are decoded for this only where an observer overrides it, and not ``on_raw_frame``.
+        Frames are decoded only if an observer overrides this method, and not ``on_raw_frame``.
         """
 
     def on_raw_frame(self, frame: RawFrame) -> None:
-        """See a frame as ``on_frame`` does, before it is decoded.
+        """Handle a frame as ``on_frame`` does, before it is decoded.
 
-        An observer that overrides it gets every frame here, and ``on_frame`` is not called unless
-        a subclass overrides that again. ``frame.entry()`` decodes it, which another thread may do.
+        An observer that overrides this method gets every frame here, and ``on_frame`` is not called
+        unless a subclass overrides that again. Another thread may call ``frame.entry()``.
         """
         self.on_frame(frame.entry())
 
     def on_state(self, event: CameraEvent) -> None:
-        """See what happened to the camera: the items of ``camera.events()``, in the same order.
+        """Handle an event of ``camera.events()``, in the same order.
 
-        They are made for this only where an observer overrides it.
+        Events are made for this only if an observer overrides the method.
         """
 
     def on_result(self, result: Result) -> None:
-        """See a result that was interpreted: for a trigger, a stream or ``next_result()``.
+        """Handle an interpreted result: for a trigger, a stream or ``next_result()``.
 
-        Results are handed over one by one for this only where an observer overrides it, and not
+        Results are passed one by one only if an observer overrides this method, and not
         ``on_results``.
 
-        The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
-        for is counted and not interpreted.
+        The result of a trigger has ``triggered_at`` and ``latency``. A container without a caller
+        or a subscriber is counted and not interpreted.
         """
 
     def on_results(self, results: Sequence[Result]) -> None:
-        """See results that came together, in order: one or more; do not change the sequence.
+        """Handle results that came together, in order: one or more; do not change the sequence.
 
         An observer that overrides it gets every result here, and ``on_result`` is not called.
-        Where no observer wants them one by one, those of a camera that runs free stay together:
-        each costs a fraction. They are counted and interpreted before it is called, and statuses
-        between them may be told behind them.
+        If no observer wants single results, the results of a camera that runs free stay together,
+        which costs a fraction. They are counted and interpreted before the call, and statuses
+        between them may be reported after them.
         """
         for result in results:
             self.on_result(result)
 
     def on_picture(self, result: Result, frame: Picture) -> None:
-        """See the picture that a result was made of, right before the result.
+        """Handle the picture that a result was made of, right before the result.
 
-        Cameras that have it call this: software cameras.
+        Only software cameras have it and call this.
         """
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """See an error.
+        """Handle an error.
 
         Args:
             camera: name of the camera.
@@ -154,10 +154,10 @@ class Observers:
         observers: observers in the order in which they are called.
 
     Attributes:
-        see_states: whether any looks at events.
-        see_results: whether any looks at results.
-        see_each: whether any looks at each result by itself.
-        see_pictures: whether any looks at the pictures of results.
+        see_states: whether an observer handles events.
+        see_results: whether an observer handles results.
+        see_each: whether an observer handles single results.
+        see_pictures: whether an observer handles the pictures of results.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
@@ -178,7 +178,7 @@ class Observers:
 
     @property
     def trace(self) -> Callable[[RawFrame], None] | None:
-        """Function to call with every frame; None if no observer looks at frames."""
+        """Function to call with every frame; None if no observer handles frames."""
         hooks = tuple(self._looking_at("on_raw_frame", "on_frame"))
         if not hooks:
             return None
@@ -196,17 +196,17 @@ class Observers:
         return on_frame
 
     def state(self, event: CameraEvent) -> None:
-        """Tell all of an event."""
+        """Report an event to all observers."""
         for hook in self._on_state:
             self._call(hook, event)
 
     def result(self, result: Result) -> None:
-        """Tell all of a result."""
+        """Report a result to all observers."""
         for hook, together in self._on_result:
             self._call(hook, (result,) if together else result)
 
     def results(self, results: Sequence[Result]) -> None:
-        """Tell all of results that came together; one by one where any sees each."""
+        """Report results that came together; one by one if an observer wants single results."""
         if self.see_each:
             for result in results:
                 self.result(result)
@@ -215,26 +215,26 @@ class Observers:
             self._call(hook, results)
 
     def picture(self, result: Result, frame: Picture) -> None:
-        """Tell all of the picture that a result was made of."""
+        """Report the picture that a result was made of to all observers."""
         for hook in self._on_picture:
             self._call(hook, result, frame)
 
     def error(
         self, camera: str, error: SmartCamError, triggered_at: datetime | None = None
     ) -> None:
-        """Tell all of an error."""
+        """Report an error to all observers."""
         for one in self._all:
             self._call(one.on_error, camera, error, triggered_at)
 
     def _overriding(self, name: str) -> tuple[Callable[..., None], ...]:
-        """Return a hook of those observers that have one of their own, in order."""
+        """Return this method of the observers that override it, in order."""
         hooks = [_own_hook(one, name) for one in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
     def _looking_at(self, first: str, other: str) -> Iterator[tuple[Callable[..., None], bool]]:
-        """Yield the hook of each observer that has one of two, and whether it is the first one.
+        """Yield the overridden one of two methods of each observer, and whether it is ``first``.
 
-        Of both counts the one that is overridden last; the first one, where a class has both.
+        The method that is overridden last counts; ``first`` if one class overrides both.
         """
         for one in self._all:
             hook, second = _own_hook(one, first), _own_hook(one, other)
@@ -249,18 +249,18 @@ class Observers:
             hook(*arguments)
         except ENDS_PROGRAM:
             raise
-        except BaseException:  # it is not to end the receive task
+        except BaseException:  # an observer must not end the receive task
             logger.exception("! an observer failed: %r", hook)
 
 
 def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:
-    """Return a hook of an observer that is its own; None if it does nothing."""
+    """Return a method that an observer overrides; None if it does not."""
     hook: Callable[..., None] | None = getattr(observer, name, None)
     return None if getattr(hook, "__func__", None) is getattr(Observer, name) else hook
 
 
 def _depth(observer: Observer, name: str) -> int:
-    """Return the place of a hook in the order of an observer's classes; -1 for its own object."""
+    """Return the index of the class that defines a method; -1 for the object itself."""
     if name in getattr(observer, "__dict__", ()):
         return -1
     classes = type(observer).__mro__

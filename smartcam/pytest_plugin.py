@@ -1,4 +1,4 @@
-"""The pytest plugin ``smartcam``: emulated cameras as fixtures, for tests of anybody's client.
+"""The pytest plugin ``smartcam``: emulated cameras as fixtures, for tests of any client.
 
 ::
 
@@ -77,7 +77,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Pytest: say which marker there is."""
+    """Pytest: register the marker."""
     config.addinivalue_line("markers", MARKER)
     pytest.register_assert_rewrite("smartcam.testing._suites.interpreters")
 
@@ -90,15 +90,15 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     """An emulated camera over real TCP or UDP, on a free port of this machine.
 
     It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
-    tests, and programs that a test starts. The marker ``smartcam`` says what it is.
+    tests, and programs that a test starts. The marker ``smartcam`` sets its options.
     """
     from smartcam.emulator._inside import emulated_class
     from smartcam.testing import ThreadedCamera
 
-    said = _said(request)
-    protocol = said.get("protocol", PROTOCOL)
-    options = {key: one for key, one in said.items() if key not in OWN or key in TO_CAMERA}
-    application = said.get("application")
+    given = _given_options(request)
+    protocol = given.get("protocol", PROTOCOL)
+    options = {key: one for key, one in given.items() if key not in OWN or key in TO_CAMERA}
+    application = given.get("application")
     if application is not None:
         options = {**emulated_class(protocol).state_options(application, running=True), **options}
     with contextlib.ExitStack() as stack:
@@ -107,24 +107,24 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
-    """Emulated cameras by name: two, or those of a scenario; otherwise as emulated_camera."""
+    """Emulated cameras by name: two, or those of a scenario; otherwise like emulated_camera."""
     from smartcam.testing import ThreadedFleet
 
-    said = _said(request)
-    options = {key: value for key, value in said.items() if key in FLEET_OPTIONS}
+    given = _given_options(request)
+    options = {key: value for key, value in given.items() if key in FLEET_OPTIONS}
     scenarios = options.pop("scenario", None)
     if scenarios is None:
-        application = said.get("application")
+        application = given.get("application")
         scenarios = [
-            _scenario(said.get("protocol", PROTOCOL), application, number)
-            for number in range(1, 1 + said.get("cameras", CAMERAS))
+            _scenario(given.get("protocol", PROTOCOL), application, number)
+            for number in range(1, 1 + given.get("cameras", CAMERAS))
         ]
     with contextlib.ExitStack() as stack:
         yield _made(lambda: stack.enter_context(ThreadedFleet(scenarios, **options)))
 
 
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
-    """Return a camera of a fleet, with a running application where the camera can have one."""
+    """Return a camera of a fleet, with a running application if the camera can have one."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
@@ -142,17 +142,17 @@ def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
 def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> Camera:
     """A client of the emulated camera, connected while an asynchronous test runs.
 
-    It is opened in the task of the test itself, right before it, and closed behind it: so it has
-    the event loop of the test, whatever plugin and settings made that. A fixture that needs it
-    earlier opens it with ``await camera``.
+    The client is opened in the test's own task right before the test, and closed right after it.
+    So it uses the event loop of the test, whichever plugin made that. A fixture that needs the
+    client earlier opens it with ``await camera``.
     """
     from smartcam.connecting import connect
 
-    said = _said(request)
+    given = _given_options(request)
     options = {
-        "interpret_as": said.get("interpret_as"),
-        "application": said.get("application"),
-        **said.get("connect", {}),
+        "interpret_as": given.get("interpret_as"),
+        "application": given.get("application"),
+        **given.get("connect", {}),
     }
     given = {key: one for key, one in options.items() if one is not None}
     client = _made(lambda: connect(emulated_camera.url, **given))
@@ -168,18 +168,18 @@ def _made(make: Callable[[], T]) -> T:
         return make()
     except (SmartCamError, TypeError, OSError) as exc:
         wrong = f"the marker smartcam: {exc}"
-    pytest.fail(wrong, pytrace=False)  # out here, or pytest shows where it came from
+    pytest.fail(wrong, pytrace=False)  # outside of the except block, which pytest would show
 
 
-def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return the markers' options of a test; the nearest goes before those of class and module."""
-    said: dict[str, Any] = {}
+def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Return the options of a test's markers; the nearest marker wins."""
+    given: dict[str, Any] = {}
     for marker in reversed(list(request.node.iter_markers("smartcam"))):
         if marker.args:
             pytest.fail("the marker smartcam takes names only: application=7", pytrace=False)
-        said |= marker.kwargs
-    known = OWN | _options(said)
-    unknown = sorted(said.keys() - known)
+        given |= marker.kwargs
+    known = OWN | _options(given)
+    unknown = sorted(given.keys() - known)
     if unknown:
         from smartcam._suggestions import did_you_mean
 
@@ -188,18 +188,18 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
             f"{did_you_mean(unknown[0], known)}",
             pytrace=False,
         )
-    if isinstance(said.get("scenario"), (str, Path)):
-        said["scenario"] = _scenario_path(request, said["scenario"])
-    return said
+    if isinstance(given.get("scenario"), (str, Path)):
+        given["scenario"] = _scenario_path(request, given["scenario"])
+    return given
 
 
-def _options(said: dict[str, Any]) -> frozenset[str]:
+def _options(given: dict[str, Any]) -> frozenset[str]:
     """Return the options of the marker that an emulated camera takes."""
     from smartcam.emulator._inside import emulated_class, options_of
     from smartcam.exceptions import SmartCamError
 
     try:
-        kind = emulated_class(said.get("protocol", PROTOCOL))
+        kind = emulated_class(given.get("protocol", PROTOCOL))
     except SmartCamError as exc:
         pytest.fail(f"the marker smartcam: {exc}", pytrace=False)
     return options_of(kind) - {"host", "clock"}
@@ -217,7 +217,7 @@ def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, None]:
-    """Pytest: have the client of the fixture ``camera`` open while the test runs."""
+    """Pytest: keep the client of the fixture ``camera`` open while the test runs."""
     client = item.stash.get(_CLIENT, None)
     if client is None or not isinstance(item, pytest.Function):
         yield
@@ -256,7 +256,7 @@ def _with_client(test: Callable[..., Any], client: Camera) -> Callable[..., Any]
 
 
 def _in_asyncio() -> bool:
-    import asyncio  # costs more than all else here
+    import asyncio  # slow, compared with the rest of this module
 
     try:
         asyncio.get_running_loop()

@@ -1,8 +1,8 @@
-"""Finding plug-ins by name: built-ins and entry points in one place.
+"""Find plug-ins by name: built-ins and entry points in one place.
 
 Names are listed without importing anything, a plug-in is loaded when it is first asked for, and a
-broken one costs only its own name. A distribution whose metadata cannot be read costs only its own
-plug-ins; the log names it.
+broken plug-in makes only its own name unusable. A distribution whose metadata cannot be read loses
+only its own plug-ins; the log names it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class PluginInfo(NamedTuple):
     """The origin of a plug-in.
 
     Attributes:
-        name: name it is asked for by.
+        name: name by which users ask for it.
         target: ``module:attribute`` that it is loaded from.
         origin: ``built-in`` or the distributions that provide it.
     """
@@ -78,10 +78,10 @@ class Registry:
         return any(name in one for one in own) or name in self._entry_points()
 
     def register(self, name: str, plugin: object) -> None:
-        """Have a plug-in in this process, without a package that brings it.
+        """Register a plug-in for this process, without a package that provides it.
 
         Raises:
-            PluginError: the name is taken by another one.
+            PluginError: the name is taken by another object.
         """
         if self._registered.get(name) is plugin:
             return
@@ -94,7 +94,7 @@ class Registry:
         """Return the plug-in of a name, importing it at the first call.
 
         Raises:
-            PluginError: unknown, provided by two distributions, or its import failed.
+            PluginError: the name is unknown, provided twice, or its import failed.
         """
         name = self._aliases.get(name, name)
         if name not in self._loaded:
@@ -103,7 +103,7 @@ class Registry:
         return self._loaded[name]
 
     def refresh(self) -> None:
-        """Forget what was found and loaded, but not what was registered; the next call looks."""
+        """Forget found and loaded plug-ins, but not registered ones; later calls search again."""
         self._found = None
         self._loaded.clear()
         self.revision += 1
@@ -123,7 +123,7 @@ class Registry:
         return self._found
 
     def _load(self, name: str) -> object:
-        if name in self._builtins:  # whoever else is installed, which would take long to list
+        if name in self._builtins:  # without a slow look at the installed packages
             module, _, attribute = self._builtins[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
         points = self._entry_points().get(name, [])
@@ -154,15 +154,15 @@ def _distribution(point: EntryPoint) -> str:
 
 
 def _points(group: str) -> Iterator[EntryPoint]:
-    """Yield the entry points of a group; of a distribution that is there twice, the first's."""
-    found = [(one, _said(one)) for one in _distributions()]
-    if not any(said is None or group in said for _, said in found):
-        return  # as it mostly is; names are the slow part
+    """Yield the entry points of a group; for a distribution found twice, the first one's."""
+    found = [(one, _entry_points_text(one)) for one in _distributions()]
+    if not any(text is None or group in text for _, text in found):
+        return  # the usual case; names are slow to read
     seen: set[str] = set()
-    for one, said in found:
+    for one, text in found:
         try:
             name = _key(one)
-            wanted = name not in seen and (said is None or group in said)
+            wanted = name not in seen and (text is None or group in text)
             points = list(one.entry_points.select(group=group)) if wanted else []
             seen.add(name or str(id(one)))
         except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
@@ -176,8 +176,8 @@ def _points(group: str) -> Iterator[EntryPoint]:
             yield from points
 
 
-def _said(found: Distribution) -> str | None:
-    """Return the text of a distribution's entry points, None if it cannot be told like this."""
+def _entry_points_text(found: Distribution) -> str | None:
+    """Return the text of a distribution's entry points, None if it cannot be read in this way."""
     try:
         return found.read_text("entry_points.txt") or ""
     except Exception:  # noqa: BLE001 - anything may stand in other people's files
@@ -192,7 +192,7 @@ def _distributions() -> Iterator[Distribution]:
 
 
 def _key(found: Distribution) -> str:
-    """Return a distribution's normalized name; its file's name, where that says it, is fastest."""
+    """Return a distribution's normalized name; its folder's name is fastest, if known."""
     known: str | None = getattr(found, "_normalized_name", None)
     return known or _name_of(found).lower()
 

@@ -39,7 +39,7 @@ PLAIN = BeforeValidator(plain)
 """Lets a strict type take numbers and texts of any class, such as numpy's."""
 
 MAX_NAME_CHARACTERS = 200
-"""Largest number of characters of a camera's name that a user gives."""
+"""Largest number of characters of a camera's name from a user."""
 
 Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
 Integer = Annotated[int, Field(strict=True), PLAIN]
@@ -49,7 +49,7 @@ Flag = Annotated[bool, Field(strict=True), PLAIN]
 
 
 class Address(NamedTuple):
-    """The address of a camera, and what is known of its protocol.
+    """The address of a camera, and the known facts about its protocol.
 
     Attributes:
         protocol: name of the protocol.
@@ -60,7 +60,7 @@ class Address(NamedTuple):
         quirks: pinned deviations from the dialect.
         parameters: other parts of the URL by name, which the protocol interprets. They include
             ``user`` and ``password`` if the protocol has a login.
-        path: part of the URL behind the host: a camera's name in a fleet.
+        path: part of the URL after the host: a camera's name in a fleet.
     """
 
     protocol: str
@@ -114,30 +114,30 @@ def is_software(url: str) -> bool:
 
 
 MAX_KNOWN_ADDRESSES = 256
-"""Largest number of URLs whose address is kept, so that a camera opened again reads none anew."""
+"""Largest number of URLs whose address is kept, for cameras that are opened again."""
 
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
 
     Args:
-        url: a URL, or a bare ``HOST[:PORT]``: BVS over TCP, unless ``model`` says otherwise.
+        url: a URL, or a bare ``HOST[:PORT]``: BVS over TCP, unless ``model`` has another protocol.
         model: camera model; picks the protocol of a bare host.
 
     Raises:
-        ConfigurationError: says which part is wrong and what is accepted.
+        ConfigurationError: names the wrong part, and the accepted values.
     """
     url = check_text(url, "camera address")
     if model is not None:
         model = check_text(model, "camera model", least=1, most=200)
-    if "@" in url:  # before it stands a password, which is kept nowhere else
+    if "@" in url:  # with a password, which must not be kept
         return _read_address(url, model)
     return _known_address(url, model, PROTOCOLS.revision)
 
 
 @functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
 def _known_address(url: str, model: str | None, revision: int) -> Address:
-    """Return what a URL says; ``revision`` is that of the protocols it is read with."""
+    """Return the address of a URL; ``revision``: that of the protocols that read it."""
     return _read_address(url, model)
 
 
@@ -158,7 +158,7 @@ def _read_address(url: str, model: str | None) -> Address:
         port = protocol.default_port
     if not host:
         raise ConfigurationError(f"camera address {shown!r} has no host")
-    # urlsplit lets some pass, and which ones differs from Python to Python
+    # urlsplit accepts some of these, and which ones depends on the version of Python
     place = parts.netloc.rpartition("@")[2]
     if "[" in host or "]" in host or place.rfind("[") > 0:
         raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
@@ -179,10 +179,10 @@ def _read_address(url: str, model: str | None) -> Address:
             f"camera address {shown!r} has {surplus[0]}, which means nothing: expected "
             f"{parts.scheme}://HOST[:PORT]"
         )
-    said = _query(shown, parts.query, protocol)
+    values = _query(shown, parts.query, protocol)
     if has_login and parts.username is not None:
-        said[USER], said[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
-    dialect, quirks = said.pop("dialect", None), said.pop("quirks", "")
+        values[USER], values[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
+    dialect, quirks = values.pop("dialect", None), values.pop("quirks", "")
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(
             f"camera address {shown!r}: {protocol.name} has no dialect {dialect!r}; "
@@ -195,12 +195,12 @@ def _read_address(url: str, model: str | None) -> Address:
         port,
         dialect,
         tuple(sorted({name.strip() for name in quirks.split(",") if name.strip()})),
-        tuple(said.items()),
+        tuple(values.items()),
     )
     try:
         if dialect is None and address.quirks:
             raise ConfigurationError("quirks are a dialect's: name the dialect, too")
-        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, said)
+        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, values)
     except ConfigurationError as exc:
         raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
     return address
@@ -213,17 +213,17 @@ USER, PASSWORD = "user", "password"
 def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
     """Return the parameters of a URL's query; ``shown`` is the URL for error texts."""
     known = ["dialect", "quirks", *(key for key in protocol.parameters if key not in _LOGIN)]
-    said: dict[str, str] = {}
+    values: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
             raise ConfigurationError(
                 f"camera address {shown!r}: unknown {key!r}; known are "
                 f"{', '.join(map(repr, known))}{did_you_mean(key, known)}"
             )
-        if key in said:
+        if key in values:
             raise ConfigurationError(f"camera address {shown!r} names two {key}")
-        said[key] = value
-    return said
+        values[key] = value
+    return values
 
 
 _LOGIN = frozenset({USER, PASSWORD})
@@ -291,7 +291,7 @@ def known_protocols() -> Iterator[Protocol]:
 
 
 class OtherOptions(TypedDict, total=False):
-    """The options of ``connect()``, except for those that say how to read results."""
+    """The options of ``connect()``, except for the interpretation of results."""
 
     name: str
     application: int | str | None
@@ -335,12 +335,12 @@ class CameraSettings(BaseModel):
     application_names: dict[Text, ApplicationId] = Field(
         default_factory=dict,
         max_length=1000,
-        description="names of applications and their ids; a name stands wherever an id may",
+        description="names of applications and their ids; a name may replace any id",
     )
-    interpret_as: Any = Field(None, description="what result containers hold")
+    interpret_as: Any = Field(None, description="interpretation of result containers")
     calibration: Any = Field(
         None,
-        description="what brings localizations into the robot's frame: one for all applications, "
+        description="transforms localizations into the robot's frame: one for all applications, "
         "or a mapping from application id to one, or to None to leave its values as they are",
     )
     y_down: Flag = Field(
@@ -372,7 +372,7 @@ class CameraSettings(BaseModel):
     def make(
         cls, url: str, model: str | None, options: CameraOptions | dict[str, Any]
     ) -> CameraSettings:
-        """Validate what ``connect()`` was given.
+        """Validate the options of ``connect()``.
 
         Raises:
             ConfigurationError: names the option, what came and what was expected.
@@ -452,9 +452,9 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
 
 
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """Return pydantic's findings as one line: where, what was expected, what came.
+    """Return pydantic's findings as one line: field, expected value, given value.
 
-    ``known``: names that may stand at the top, one of which may have been meant.
+    ``known``: names of the fields at the top, of which one may have been meant.
     """
     return "; ".join(
         f"{'.'.join(f'{part!s:.80}' for part in item['loc']) or 'value'}: {item['msg']}"

@@ -1,4 +1,4 @@
-"""Bounded streams: what a camera says, to any number of subscribers side by side."""
+"""Bounded streams: a camera's items for any number of independent subscribers."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Overflow(enum.Enum):
     """The treatment of a new item when a subscriber's queue is full."""
 
     DROP_OLDEST = "drop_oldest"
-    """The oldest item makes room; it is counted."""
+    """The oldest item is dropped and counted."""
     ERROR = "error"
-    """The stream ends with :exc:`~smartcam.SubscriberOverflowError`, after what is
-    queued."""
+    """The stream ends with :exc:`~smartcam.SubscriberOverflowError`, after the queued
+    items."""
 
 
 _OVERFLOWS = [one.value for one in Overflow]
@@ -46,12 +46,12 @@ class Queue(Generic[T]):
     """Base of both kinds of subscription: a bounded queue that counts what it drops.
 
     Args:
-        name: name of what is subscribed to.
+        name: kind of the subscribed items.
         max_queue: number of items kept for a slow reader.
-        overflow: value of :class:`Overflow` that says what happens beyond ``max_queue``.
-        min_interval: seconds after an item was kept in which the next ones are dropped.
-        max_queue_bytes: bytes of all items kept together. An item that has more alone is kept
-            where no other is: otherwise it could never be delivered.
+        overflow: value of :class:`Overflow`, the consequence of a full queue.
+        min_interval: seconds after a kept item in which further items are dropped.
+        max_queue_bytes: largest number of bytes of all kept items. A larger single item is kept if
+            the queue is empty: otherwise it could never be delivered.
         size_of: function that returns the bytes of an item that is no error.
 
     Raises:
@@ -82,14 +82,14 @@ class Queue(Generic[T]):
         self._kept: object = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
-        self._errors = 0  # among the items
-        # Bytes are counted where items come; what was taken since is subtracted there, too, so that
+        self._errors = 0  # number of errors among the items
+        # Bytes are counted when items come; only then are those of taken items subtracted, so that
         # taking costs nothing. A parcel came together: number of its last item, items, bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
         self._bytes = 0  # of all parcels, of which some may be of items that are gone
         self._missed = 0
         self.since: float = -math.inf  # time of the subscription, on the clock of the items
-        self._evicted = 0  # those dropped that were queued before: only these have numbers
+        self._evicted = 0  # dropped items that were queued before: only these have numbers
 
     @property
     def ended(self) -> bool:
@@ -102,13 +102,13 @@ class Queue(Generic[T]):
         return bool(self._items)
 
     def share(self, ready: asyncio.Event) -> None:
-        """Set this event where something comes, or it ends; for readers of several."""
+        """Set this event when an item comes, or the stream ends; for readers of several streams."""
         self._ready = ready
         if self._items or self._ended:
             ready.set()
 
     def keep(self, source: object) -> None:
-        """Refer to the items' source until the end, for a program that keeps the stream alone."""
+        """Keep a reference to the items' source, for a program that keeps the stream alone."""
         if not self._ended:
             self._kept = source
 
@@ -127,7 +127,7 @@ class Queue(Generic[T]):
         )
 
     def close(self) -> None:
-        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        """Unsubscribe; queued items count as dropped. Idempotent."""
         self._dropped += len(self._items)
         self._evicted += len(self._items)
         self._items.clear()
@@ -139,13 +139,13 @@ class Queue(Generic[T]):
         """Wait until an item is there.
 
         Raises:
-            StopAsyncIteration: closed.
-            SmartCamError: the stream has ended, and how.
+            StopAsyncIteration: the stream is closed.
+            SmartCamError: the reason why the stream has ended.
         """
         while not self._items:
             if self._ended:
                 if self._end_error is not None:
-                    raise self._end_error.with_traceback(None)  # it would grow with each raise
+                    raise self._end_error.with_traceback(None)  # else it grows with each raise
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()
@@ -214,7 +214,7 @@ class Queue(Generic[T]):
             self._missed += count
 
     def end(self, error: SmartCamError | None) -> None:
-        """End the stream after what is queued; the first reason stays."""
+        """End the stream after the queued items; the first reason stays."""
         if not self._ended:
             self._ended = True
             self._end_error = error
@@ -224,7 +224,7 @@ class Queue(Generic[T]):
     # ------------------------------------------------------------------ inside
 
     def _make_room(self, size: int) -> bool:
-        """Do what the policy says for an item of ``size`` bytes; False where it is refused."""
+        """Apply the overflow policy to an item of ``size`` bytes; return False if it is refused."""
         items = self._items
         while items:
             if len(items) >= self._max_queue:
@@ -251,7 +251,7 @@ class Queue(Generic[T]):
     def _add_parcel(self, count: int, size: int) -> None:
         """Count the bytes of the last ``count`` items, which are queued by now."""
         parcels, queued = self._parcels, len(self._items)
-        if queued == count:  # nothing else is
+        if queued == count:  # nothing else is queued
             parcels.clear()
             self._bytes = size
         else:
@@ -261,17 +261,17 @@ class Queue(Generic[T]):
         parcels.append((self._taken + self._evicted + queued, count, size))
 
     def _subtract_gone(self) -> int:
-        """Forget parcels of which nothing is queued; return how many items were ever gone."""
+        """Forget parcels without queued items; return the number of all items gone so far."""
         parcels, gone = self._parcels, self._taken + self._evicted
         while parcels and parcels[0][0] <= gone:
             self._bytes -= parcels.popleft()[2]
         return gone
 
     def _weigh(self) -> None:
-        """Have the bytes of all parcels be those of the items that are queued."""
+        """Recount the bytes of all parcels from the items that are queued."""
         gone, parcels = self._subtract_gone(), self._parcels
         if parcels and parcels[0][0] - parcels[0][1] < gone:
-            # begun: from now on each item that is left of it is one
+            # partly taken: from now on each of its other items is a parcel
             last, _, size = parcels.popleft()
             left = cast("list[T]", list(itertools.islice(self._items, last - gone)))
             sizes = [self._size_of(item) for item in left]
@@ -296,8 +296,8 @@ class Subscription(Queue[T]):
         """Return the next item.
 
         Raises:
-            StopAsyncIteration: closed.
-            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+            StopAsyncIteration: the stream is closed.
+            SmartCamError: an item that is an error (the stream stays usable), or the stream's end.
         """
         if not self._items:
             await self._wait()
@@ -310,7 +310,7 @@ class Subscription(Queue[T]):
 
 
 class BatchSubscription(Queue[T]):
-    """The same in batches: ``async for items in subscription`` gives a list of what is there.
+    """A bounded stream of batches: ``async for items in subscription`` gives all waiting items.
 
     Cancellation: safe, nothing is lost; a batch is taken as the last step.
     """
@@ -322,8 +322,8 @@ class BatchSubscription(Queue[T]):
         """Return all items that wait, at least one; only those before an error, if there is one.
 
         Raises:
-            StopAsyncIteration: closed.
-            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+            StopAsyncIteration: the stream is closed.
+            SmartCamError: an item that is an error (the stream stays usable), or the stream's end.
         """
         if not self._items:
             await self._wait()
@@ -348,9 +348,9 @@ class BatchSubscription(Queue[T]):
 
 
 class Subscribers(Generic[T]):
-    """The queues that are offered something; one that nobody refers to any more is gone.
+    """The queues that are offered items; a queue without other references is removed.
 
-    To subscribe and to leave takes the same work, however many there are.
+    The work to subscribe and to leave does not depend on the number of queues.
     """
 
     __slots__ = ("_in_order", "horizon", "references")
@@ -358,7 +358,7 @@ class Subscribers(Generic[T]):
     def __init__(self) -> None:
         # age of the items offered now; later subscribers do not get them
         self.horizon: float = math.inf
-        # empty if nobody is subscribed: looked at for every message
+        # empty without subscribers: looked at for every message
         self.references: dict[weakref.ref[Queue[T]], None] = {}
         # copy to iterate over while some leave; None if it must be made again
         self._in_order: list[weakref.ref[Queue[T]]] | None = None

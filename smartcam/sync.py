@@ -133,11 +133,11 @@ class SyncCamera(SyncCameraBase[ValueT]):
     as a cancellation does, of which each method of :class:`~smartcam.Camera` tells.
 
     Args:
-        camera: what it is the face of, not opened yet.
+        camera: asynchronous camera that this class wraps, not opened yet.
     """
 
     def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session, and what ``restore`` asks for is done.
+        """Wait until there is a session, and the state that ``restore`` asks for.
 
         As :meth:`smartcam.Camera.wait_connected`.
         """
@@ -158,12 +158,15 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
     @property
     def status(self) -> Status:
-        """The last status the camera sent, as :attr:`smartcam.Camera.status`."""
+        """The last status the camera sent, also after the session was lost.
+
+        As :attr:`smartcam.Camera.status`.
+        """
         return self._camera.status
 
     @property
     def active_application(self) -> int | None:
-        """Id of the active application as last told by the camera.
+        """Id of the active application as last reported by the camera.
 
         As :attr:`smartcam.Camera.active_application`.
         """
@@ -255,7 +258,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> SyncSubscription[CameraEvent]:
-        """Subscribe to what happens to the camera, in order: :meth:`smartcam.Camera.events`."""
+        """Subscribe to the camera's events, in order: :meth:`smartcam.Camera.events`."""
         return self._subscribed(self._camera.events, max_queue=max_queue, overflow=overflow)
 
     def wait_status(self, predicate: Callable[[Status], bool], timeout: float = 10.0) -> Status:
@@ -273,9 +276,9 @@ class SyncCamera(SyncCameraBase[ValueT]):
         return self._wait(self._camera.wait_ready, timeout)
 
     def next_result(self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT) -> Result[ValueT]:
-        """Wait for the next result, whoever triggers it: :meth:`smartcam.Camera.next_result`.
+        """Wait for the next result, whatever triggers it: :meth:`smartcam.Camera.next_result`.
 
-        Where what causes it is started by the same thread, subscribe first::
+        If the same thread starts what causes the result, subscribe first::
 
             with camera.results() as results:
                 start_conveyor()
@@ -407,7 +410,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
     @contextlib.contextmanager
     def application(self, application: int | str) -> Generator[Self]:
-        """Have an application running inside the ``with``, then go back to the one before.
+        """Run an application inside the ``with``, then return to the one before.
 
         As :meth:`smartcam.Camera.application`.
         """
@@ -449,7 +452,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> Generator[SyncFrameReader]:
-        """Read what the camera sees: :meth:`smartcam.Camera.frames`."""
+        """Read the camera's frames: :meth:`smartcam.Camera.frames`."""
         with self._inside(
             self._camera.frames,
             encoding=encoding,
@@ -496,7 +499,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
     @contextlib.contextmanager
     def reserve(self, timeout: float = 10.0) -> Generator[Self]:
-        """Keep the commands of other programs out as long as the body runs.
+        """Keep the commands of other programs out while the body of the block runs.
 
         As :meth:`smartcam.Camera.reserve`.
         """
@@ -504,7 +507,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
             yield self
 
     def take_back(self, *, timeout: float | None = None) -> None:
-        """Have the agent take the camera from another client, and wait for the session.
+        """Make the agent take the camera back from another client, and wait for the session.
 
         As :meth:`smartcam.Camera.take_back`.
         """

@@ -154,9 +154,7 @@ def test_value_that_is_no_number_is_refused(name: str, value: float) -> None:
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_error_is_transient_where_another_try_may_help(
-    error: BaseException, transient: bool
-) -> None:
+def test_error_is_transient_if_another_try_may_help(error: BaseException, transient: bool) -> None:
     assert is_transient(error) is transient
     assert Backoff().transient(error) is transient
 

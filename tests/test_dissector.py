@@ -263,7 +263,7 @@ def test_dialect_without_magic_is_found_by_what_the_camera_says(
 
 
 @needs_tshark
-def test_side_on_another_port_is_found_by_what_is_said(lua: Path, tmp_path: Path) -> None:
+def test_side_on_another_port_is_found_by_what_is_reported(lua: Path, tmp_path: Path) -> None:
     capture = Capture(tmp_path / "made.pcap", camera=999)
     capture.udp(CAMERA, HANDBOOK.encode(m.QueryAnswer(application=1)))
     capture.udp(CLIENT, HANDBOOK.encode(m.Query()))

@@ -133,7 +133,7 @@ def test_error_that_is_no_triggers_has_no_time() -> None:
     assert calls == [("one", "error", "press 4", ERROR, None)]
 
 
-def test_frames_are_not_asked_for_where_nobody_looks() -> None:
+def test_frames_are_not_asked_for_if_nobody_looks() -> None:
     assert Observers().trace is None
     assert Observers([Blind(), Observer()]).trace is None
 
@@ -179,7 +179,7 @@ def test_raw_frame_that_is_not_taken_goes_to_the_other_hook() -> None:
     assert RawFrame(AT, "press 4", DIALECT, Sender.CAMERA, broken).size == 2
 
 
-def test_results_and_events_are_asked_for_where_somebody_looks() -> None:
+def test_results_and_events_are_asked_for_if_somebody_looks() -> None:
     class Looks(Observer):
         def on_result(self, result: Result) -> None: ...
 
@@ -208,7 +208,7 @@ class Together(Everything):
         self.calls.append((self.name, "results", *results))
 
 
-def test_results_come_together_where_nobody_wants_them_one_by_one() -> None:
+def test_results_come_together_if_nobody_wants_them_one_by_one() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers([Together("one", calls), Blind(), Together("two", calls)])
     assert (observers.see_results, observers.see_each) == (True, False)

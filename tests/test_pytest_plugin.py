@@ -213,7 +213,7 @@ def test_marker_says_what_the_camera_is(pytester: pytest.Pytester) -> None:
         ("applications=[1]", "the marker smartcam: application 1: *valid dictionary*"),
     ],
 )
-def test_wrong_marker_is_told(pytester: pytest.Pytester, marker: str, text: str) -> None:
+def test_wrong_marker_is_reported(pytester: pytest.Pytester, marker: str, text: str) -> None:
     source = f"""
         import pytest
 

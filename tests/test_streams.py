@@ -406,9 +406,7 @@ async def test_bytes_beyond_the_bound_end_the_stream_where_that_was_wanted(offer
 
 @each_way
 @pytest.mark.parametrize("overflow", ["drop_oldest", "error"])
-async def test_item_larger_than_the_bound_is_kept_where_no_other_is(
-    offer: Any, overflow: str
-) -> None:
+async def test_item_larger_than_the_bound_is_kept_if_no_other_is(offer: Any, overflow: str) -> None:
     stream = weighed(overflow=overflow)
     for _ in range(2):
         offer(stream, 11)

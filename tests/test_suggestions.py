@@ -78,7 +78,7 @@ def test_known_word_means_itself_and_so_does_one_without_a_letter(known: list[st
             assert closest(word[:place] + word[place + 1 :], known) == word
 
 
-def test_name_that_others_use_is_told_by_a_table() -> None:
+def test_name_that_others_use_is_reported_by_a_table() -> None:
     assert did_you_mean("float", ["bool", "real32"], {"float": "real32"}).endswith("'real32'?")
 
 
@@ -87,7 +87,7 @@ def test_slip_of_a_plug_ins_name_must_be_sure() -> None:
     assert closest("row", ["raw"], least=0.8) is None
 
 
-def test_option_of_connect_is_told() -> None:
+def test_option_of_connect_is_reported() -> None:
     options: dict[str, Any] = {"timeout": 2}
     with pytest.raises(ConfigurationError, match=r"timeout: .*did you mean 'connect_timeout'"):
         smartcam.connect("bvs://127.0.0.1", **options)
@@ -102,7 +102,7 @@ def test_field_of_a_fleet_file_with_no_like_lists_what_there_is(tmp_path: Path) 
     assert "known are access, agent, calibrations, cameras," in str(caught.value)
 
 
-def test_kind_of_a_fault_in_a_scenario_is_told(tmp_path: Path) -> None:
+def test_kind_of_a_fault_in_a_scenario_is_reported(tmp_path: Path) -> None:
     from smartcam.emulator import load_scenario
 
     path = tmp_path / "scenario.yaml"
@@ -111,7 +111,7 @@ def test_kind_of_a_fault_in_a_scenario_is_told(tmp_path: Path) -> None:
         load_scenario(path)
 
 
-def test_choice_of_a_few_words_in_a_scenario_is_told(tmp_path: Path) -> None:
+def test_choice_of_a_few_words_in_a_scenario_is_reported(tmp_path: Path) -> None:
     from smartcam.emulator import load_scenario
 
     path = tmp_path / "scenario.yaml"
@@ -120,7 +120,7 @@ def test_choice_of_a_few_words_in_a_scenario_is_told(tmp_path: Path) -> None:
         load_scenario(path)
 
 
-def test_interpreters_name_is_told() -> None:
+def test_interpreters_name_is_reported() -> None:
     from smartcam.exceptions import PluginError
     from smartcam.interpreters import resolve
 

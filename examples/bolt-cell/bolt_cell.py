@@ -1,4 +1,4 @@
-"""A cell that sorts bolts by what a smart camera says of them.
+"""A cell that sorts bolts by a smart camera's results.
 
 The camera's application 11 sends whether a bolt is good, its length and what is stamped on it.
 """
@@ -21,12 +21,12 @@ LAYOUT = "ok: bool, length: real32 mm, code: string[12]"
 
 @dataclass
 class Tally:
-    """What became of the bolts.
+    """Numbers of sorted bolts.
 
     Attributes:
-        good: lengths of the good ones, metres.
-        scrap: how many were bad.
-        unseen: of how many the camera said nothing that counts; they go round again.
+        good: lengths of the good bolts, metres.
+        scrap: number of bad bolts.
+        unseen: number of bolts without a valid result; they go round again.
     """
 
     good: list[float] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Tally:
 
 
 async def sort_bolts(camera: Camera, count: int, *, timeout: float = 2.0) -> Tally:
-    """Look at so many bolts; a bolt without a result is never taken for a good one.
+    """Inspect ``count`` bolts; a bolt without a result never counts as good.
 
     Raises:
         smartcam.LinkError: the camera is gone.

@@ -1,4 +1,4 @@
-"""Give a client's account to Prometheus when it asks, by a collector.
+"""Give a client's counters to Prometheus on request, by a collector.
 
 It needs ``pip install prometheus-client``. Prometheus' server asks in a thread of its own, and the
 client belongs to the event loop, so the collector goes through the loop.
@@ -45,7 +45,7 @@ class AccountCollector(Collector):
 
 
 def cumulative(histogram):
-    """Return Prometheus' buckets: each has everything up to its bound."""
+    """Return Prometheus' buckets: each counts all values up to its bound."""
     bounds = [*map(str, histogram.bounds), "+Inf"]
     return [(bound, sum(histogram.counts[: n + 1])) for n, bound in enumerate(bounds)]
 
@@ -64,7 +64,7 @@ async def main():
             await camera.trigger()
 
             waiting = camera.next_result()
-            emulator.device.trigger()  # a sensor's, and somebody waits for it
+            emulator.device.trigger()  # like a sensor's trigger; the subscriber gets the result
             await waiting
 
             lines = await asyncio.to_thread(scrape, server.server_port)

@@ -1,7 +1,7 @@
 """Make an OpenTelemetry span of each trigger.
 
 It needs ``pip install opentelemetry-sdk``. The exporter here keeps the spans in memory, so that the
-example can look at them; yours sends them somewhere, behind a ``BatchSpanProcessor``.
+example can check them; yours sends them through a ``BatchSpanProcessor``.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ class TriggerSpans(smartcam.Observer):
 
     def on_result(self, result):
         if result.triggered_at is None:
-            return  # a sensor's, or a free run
+            return  # the trigger of a sensor, or a free run
         start = nanoseconds(result.triggered_at)
         span = self._start(result.camera, start)
         span.set_attribute("smartcam.application", result.application)

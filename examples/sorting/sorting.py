@@ -1,8 +1,8 @@
 """A cell that sorts: screws into one container, nuts into the other.
 
-A smart camera above a table says what lies where, a calibration turns that into the robot's
-coordinates, and the robot picks one part after the other and drops it into its kind's container.
-Run as a script, camera and robot are simulated: ``python sorting.py``.
+A smart camera above a table reports the parts and their places, and a calibration converts them to
+the robot's coordinates. The robot picks one part after the other, and drops it into the container
+of its kind. ``python sorting.py`` simulates camera and robot.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ __all__ = ["APPLICATION", "CONTAINERS", "Robot", "TableRobot", "calibrate", "sor
 APPLICATION = 7
 
 CONTAINERS = {"screw": Position(0.30, -0.25, 0.05), "nut": Position(0.30, 0.25, 0.05)}
-"""Where the robot opens its gripper, by kind of part; metres in the robot's frame."""
+"""Places where the robot opens its gripper, by kind of part; metres in the robot's frame."""
 
 TRIES = 3
-"""How often the table is looked at in a row without a part being taken."""
+"""Largest number of pictures in a row without a part taken."""
 
 
 class Robot(Protocol):
-    """What the cell needs of a robot; yours has these three under its own names."""
+    """The functions of a robot that the cell needs; your robot has them under its own names."""
 
     async def touch(self, mark: str) -> Position:
-        """Have the tip moved to a mark, and return where the robot says that it is."""
+        """Wait until the tip is at a mark, and return its position in the robot's frame."""
         ...
 
     async def pick(self, pose: Pose) -> bool:
-        """Close the gripper at a pose; False where nothing is in it then."""
+        """Close the gripper at a pose; return False if it is empty then."""
         ...
 
     async def drop(self, place: Position) -> None:
@@ -50,7 +50,7 @@ class Robot(Protocol):
 
 
 async def calibrate(camera: Camera, robot: Robot) -> PlaneCalibration:
-    """Return the way from the camera to the robot: it touches each mark that the camera sees."""
+    """Calibrate camera and robot: the robot touches each mark that the camera sees."""
     seen = (await camera.trigger(timeout=2.0)).value
     touched = [await robot.touch(mark.feature_id) for mark in seen]
     return fit_plane([mark.pose.position[:2] for mark in seen], touched)
@@ -62,11 +62,11 @@ async def sort(
     calibration: PlaneCalibration,
     containers: Mapping[str, Position] = CONTAINERS,
 ) -> Counter[str]:
-    """Sort what the camera sees until nothing is left that has a container.
+    """Sort the parts that the camera sees until no part with a container is left.
 
     Returns:
-        How many of each kind were sorted. What has no container stays where it is, and so does what
-        could not be taken in three looks at the table.
+        Number of sorted parts of each kind. A part without a container stays on the table, and so
+        does a part that could not be picked in three tries.
     """
     sorted_parts: Counter[str] = Counter()
     tries = 0
@@ -95,7 +95,7 @@ class TableRobot:
 
     Args:
         scene: the table.
-        grip: how far beside a part it still takes it, metres.
+        grip: largest distance from a part at which the robot still picks it, metres.
         noise: standard deviation of a touch along each axis, metres.
     """
 
@@ -109,16 +109,16 @@ class TableRobot:
         )
         self._held = ""
         self.contents: dict[Position, list[str]] = {}
-        """What was dropped, and where."""
+        """Dropped parts of each container."""
 
     async def touch(self, mark: str) -> Position:
-        """Return where a mark is, with noise."""
+        """Return the position of a mark, with noise."""
         pose = self._scene.pieces[mark]
         true = self._table.apply((pose.x, pose.y, 0.0)).tolist()
         return Position(*(value + self._random.gauss(0.0, self._noise) for value in true))
 
     async def pick(self, pose: Pose) -> bool:
-        """Take the part that is there."""
+        """Take the part at the pose, if there is one."""
         x, y, z = self._table.inverse().apply(pose.position).tolist()
         for name, part in list(self._scene.pieces.items()):
             if (x - part.x) ** 2 + (y - part.y) ** 2 + z**2 < self._grip**2:
@@ -128,7 +128,7 @@ class TableRobot:
         return False
 
     async def drop(self, place: Position) -> None:
-        """Let go of what was taken."""
+        """Drop the part."""
         self.contents.setdefault(place, []).append(self._held)
 
 
@@ -148,7 +148,7 @@ async def main() -> None:
 
 
 def lay(scene: TableScene, things: Mapping[str, TablePose]) -> None:
-    """Clear the table and put these things onto it."""
+    """Clear the table, and put these things onto it."""
     scene.pieces.clear()
     scene.pieces.update(things)
 

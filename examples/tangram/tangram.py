@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PIXELS_PER_MM = 4.0
-SAMPLES = 8  # along each side of a pixel
+SAMPLES = 8  # samples along each side of a pixel
 
 TRIANGLE = [(-1, -1 / 3), (1, -1 / 3), (0, 2 / 3)]
 OUTLINES = {  # corners about the centroid, y up, mm
@@ -47,12 +47,12 @@ cameras:
 
 
 def shape_of(piece: str) -> str:
-    """Return the shape of a piece: there are two big triangles, for one."""
+    """Return the shape of a piece; several pieces may share one."""
     return piece.rstrip("_12")
 
 
 def picture(scene: TableScene) -> NDArray[np.uint8]:
-    """Return what a plain camera sees of a table: pixels of 8 bits, with blur and noise."""
+    """Return a plain camera's picture of a table: pixels of 8 bits, with blur and noise."""
     fine = np.full((SAMPLES * 1024, SAMPLES * 1280), 60, np.uint8)
     for name, pose in scene.pieces.items():
         u, v, theta = scene.to_pixels(pose)
@@ -86,7 +86,7 @@ def write_cell(folder: Path, scene: TableScene) -> dict[str, PartModel]:
 
 
 async def main(folder: Path) -> None:
-    """Locate the pieces, and say where they lie beside where they are."""
+    """Locate the pieces, and print their found and true places."""
     scene = TableScene(y_down=True, offset=(45.0, 1010.0))
     models = await asyncio.to_thread(write_cell, folder, scene)
     program = load_cell(folder / "cell.yaml")["table"].program(7)

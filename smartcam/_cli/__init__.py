@@ -1,4 +1,4 @@
-"""The commands ``smartcam`` and ``smartcam-emulator``; thin, each calls the library."""
+"""The commands ``smartcam`` and ``smartcam-emulator``; each calls the library."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _run(program: str, module: str) -> None:
             importlib.import_module("click")
         except ModuleNotFoundError:
             sys.exit(_missing(program))
-        # PyYAML is a package, which a module of the same name is not
+        # PyYAML is a package, a module of the same name is not it
         yaml = importlib.util.find_spec("yaml")
         if yaml is None or yaml.submodule_search_locations is None:
             sys.exit(_missing(program))

@@ -1,4 +1,4 @@
-"""Read bytes from the texts that other tools copy them as: hex, escapes, dumps with offsets."""
+"""Read bytes from texts of other tools: hex, escapes, dumps with offsets."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PARTED: Final = re.compile(r"[0-9a-fA-F]{2}(?:[:-][0-9a-fA-F]{2})+")
 
 
 def bytes_of_text(text: str) -> bytes:
-    r"""Return the bytes that a text says.
+    r"""Return the bytes that a text stands for.
 
     It may be hex with or without blanks, with ``:`` or ``-`` between the bytes, ``0x50, 0x53``,
-    ``\x50\x53``, or a dump with offsets, as Wireshark, ``xxd``, ``hexdump -C`` and ``tcpdump -X``
-    have them.
+    ``\x50\x53``, or a dump with offsets in the form of Wireshark, ``xxd``, ``hexdump -C`` or
+    ``tcpdump -X``.
 
     Raises:
-        ConfigurationError: a dump whose offsets do not follow each other.
-        ValueError: the text is in no form that is known here.
+        ConfigurationError: the offsets of a dump do not follow each other.
+        ValueError: the text has no known form.
     """
     lines = [line for line in text.splitlines() if line.strip()]
     found = [_DUMP_LINE.fullmatch(line) for line in lines]
@@ -42,7 +42,7 @@ def bytes_of_text(text: str) -> bytes:
 
 
 def _dumped(lines: list[re.Match[str]]) -> bytes:
-    """Return the bytes of a dump; the offsets say how many a line has."""
+    """Return the bytes of a dump; the offsets give the number of bytes of each line."""
     data, widest = b"", 0
     for number, line in enumerate(lines, 1):
         offset = int(line[1], 16)
@@ -58,12 +58,12 @@ def _dumped(lines: list[re.Match[str]]) -> bytes:
 
 
 def _row(line: re.Match[str], count: int | None, widest: int) -> tuple[bytes, int]:
-    """Return the bytes of a line, and where in it they end.
+    """Return the bytes of a line, and the column where they end.
 
     Args:
         line: line of a dump.
-        count: bytes that it has; None: as many as stand before the text beside them.
-        widest: column at which the bytes of the lines before ended; 0: there was none.
+        count: number of its bytes; None: all bytes before the text beside them.
+        widest: column at which the bytes of earlier lines ended; 0 without such lines.
     """
     start = line.start(2)
     body = line.string[start:].partition("|")[0]

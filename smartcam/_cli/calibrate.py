@@ -1,4 +1,4 @@
-"""``smartcam calibrate``: the wizards of a calibration in the terminal, or as a web page."""
+"""``smartcam calibrate``: the wizards of a calibration in the terminal, or on a web page."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 ABORTED = 130
-"""Exit code after an abort: as after Ctrl-C there is no calibration."""
+"""Exit code after an abort, as after Ctrl-C: there is no calibration."""
 
 STALE = 7
-"""Exit code after a check that found the calibration stale."""
+"""Exit code after a check that found the calibration out of date."""
 
 LINGER = 30.0
-"""Seconds that a source of frames streams on after a picture: the next one needs no new start, and
-finds exposure and white balance as they were."""
+"""Seconds that a source of frames streams on after a picture, so that the next picture needs no new
+start, and exposure and white balance stay."""
 
 HELP = "Calibrate a camera against a robot: where its localizations lie in the robot's space. "
 
@@ -53,38 +53,38 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     cls=WithParts,
     hidden=True,
     help=f"{HELP}"
-    "Asks step by step; an answer is on the disk before the next step is shown, so the same "
-    "command goes on where it was broken off. Beside an answer, :undo, :repeat and :abort are "
+    "Asks step by step; each answer is saved before the next step is shown, so the same "
+    "command continues after an interruption. Instead of an answer, :undo, :repeat and :abort are "
     "understood. With --json each step is a line of stdout and each line of stdin "
-    '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of the step that '
-    "is meant, or without for the current one. "
-    "With --check it asks for some touches only, and tells whether a calibration is still true: "
+    '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of its '
+    "step, or without one for the current step. "
+    "With --check it asks for a few touches only, and reports whether a calibration still holds: "
     f"exit code {STALE} if it is stale. "
-    "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
-    "that sends them, or those of --pictures, which come into a folder or are the frames of a "
+    "With --wizard sheet or hand-eye it uses pictures: those of a camera "
+    "that sends them, or those of --pictures, which arrive in a folder or are the frames of a "
     "source (see smartcam frames); then no URL is needed. "
     f"The camera is connected for each picture only. {CONNECTS}",
 )
 @click.argument("url", required=False)
-@click.option("--name", "called", metavar="NAME", help="Its name.  [default: that of the wizard]")
+@click.option("--name", "called", metavar="NAME", help="Its name.  [default: the wizard's]")
 @click.option(
     "--wizard",
     type=click.Choice(WIZARDS),
-    help="What to calibrate: a plane from what the camera localizes, a plane from a picture of a "
+    help="Kind of calibration: a plane from localizations, a plane from a picture of a "
     "printed sheet, or a camera on a robot or beside it.  [default: plane]",
 )
 @click.option(
     "--pictures",
     metavar="FOLDER|URL",
     type=click.Path(file_okay=False),
-    help="Take the next picture that comes into this folder, as by FTP; or the first frame of this "
-    "source that is exposed when it is wanted, such as v4l2:///dev/video0.",
+    help="Take the next picture that arrives in this folder, such as by FTP; or the next frame of "
+    "this source, such as v4l2:///dev/video0.",
 )
 @click.option(
     "--target",
     metavar="FILE",
     type=click.Path(dir_okay=False),
-    help="What is on the sheet, as smartcam sheet --describe writes it.",
+    help="Description of the sheet, as smartcam sheet --describe writes it.",
 )
 @click.option(
     "--lens",
@@ -99,28 +99,28 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     type=click.Path(file_okay=False),
     default="calibrations",
     show_default=True,
-    help="Where calibrations and journals stand; made if need be.",
+    help="Folder of calibrations and journals; created if missing.",
 )
 @click.option(
     "--list",
     "listed",
     is_flag=True,
-    help="List the calibrations of the folder: date, error, last check; nothing else.",
+    help="Only list the calibrations of the folder: date, error, last check.",
 )
 @page_options("Serve a page instead of asking here, until Ctrl-C; its address goes to stdout.")
-@click.option("--fresh", is_flag=True, help="Begin anew, also where one was broken off.")
+@click.option("--fresh", is_flag=True, help="Begin anew, even after an interruption.")
 @click.option("--feature", metavar="ID", help="Only localizations of this feature are marks.")
-@option("--application", help="Have this application running and ready for each picture.")
+@option("--application", help="Run this application for each picture.")
 @option(
     "--interpret-as",
     default="localizations",
     show_default=True,
-    help="How to read results; must give localizations.",
+    help="Interpretation of results; must give localizations.",
 )
 @option("--y-down")
 @option(
     "--timeout",
-    help="Bound of each step of a picture: connect (default 10), switch (10), trigger (5).",
+    help="Longest time for each step of a picture: connect (default 10), switch (10), trigger (5).",
 )
 @runs(*OUTPUT)
 async def wizard_command(
@@ -149,10 +149,10 @@ async def wizard_command(
     if url is not None and _only_frames(url):
         from smartcam.frames import FrameAddress
 
-        said = FrameAddress.parse(url).shown
+        address = FrameAddress.parse(url).shown
         raise ConfigurationError(
-            f"{said} gives frames, no localizations: expected the URL of a camera that does, or "
-            f"--pictures {said} with --wizard sheet or --wizard hand-eye"
+            f"{address} gives frames, no localizations: expected the URL of a camera that does, or "
+            f"--pictures {address} with --wizard sheet or --wizard hand-eye"
         )
     if url is None and (pictures is None or wizard in {None, "plane"}):
         raise click.UsageError(
@@ -174,7 +174,7 @@ async def _run(
     fresh: bool,
     web: PageOptions,
 ) -> None:
-    """Go through the wizard to its end."""
+    """Run the wizard to its end."""
     from smartcam.calibration._inside import WIZARD
 
     options = sources.options
@@ -218,7 +218,7 @@ def _only_frames(url: str) -> bool:
 async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
     """Open the source of frames that ``--pictures`` names; None if it names no source.
 
-    Raises ConfigurationError: the URL is wrong; FrameSourceError: it does not exist.
+    Raises ConfigurationError: the URL is wrong; FrameSourceError: the source does not exist.
     """
     if pictures is None or not is_source(pictures):
         yield None
@@ -269,7 +269,7 @@ def _service(folder: str, sources: _Sources) -> CalibrationService:
     from smartcam.calibration import Folder
     from smartcam.calibration.wizards import CalibrationService
 
-    load("scipy")  # before anything is measured
+    load("scipy")  # fails before anything is measured
     with naming(f"--folder {folder}"):
         inside = Folder(folder)
     return CalibrationService(inside, sources.wizards(inside))
@@ -277,7 +277,7 @@ def _service(folder: str, sources: _Sources) -> CalibrationService:
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """The sources of localizations and pictures, and what is known of target and lens."""
+    """The sources of localizations and pictures, with the descriptions of target and lens."""
 
     options: Options
     url: str | None
@@ -294,7 +294,7 @@ class _Sources:
         return target_to_data(read_target(str(self.target)))
 
     def wizards(self, folder: Folder) -> list[Wizard]:
-        """Return the wizards that can work with what there is; the first is the page's default.
+        """Return the wizards that these sources allow; the first is the page's default.
 
         Raises ConfigurationError: a file of the options cannot be used.
         """
@@ -308,7 +308,7 @@ class _Sources:
         found: list[Wizard] = []
         connect: dict[str, Any] | None = None
         if self.url is not None:
-            with self.options.camera(self.url):  # an address or option that cannot work
+            with self.options.camera(self.url):  # raises for a wrong address or option
                 y_down = self.options.y_down
             connect = {"url": self.url} | {
                 name: getattr(self.options, name)
@@ -347,10 +347,10 @@ class _Sources:
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
-                if camera.settings.y_down != options.y_down:  # the agent of a fleet knows
+                if camera.settings.y_down != options.y_down:  # a fleet's agent knows it
                     raise ConfigurationError(
                         f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
-                        "what is calibrated is mirrored"
+                        "the calibration is mirrored"
                     )
                 result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
         found = result.value
@@ -362,7 +362,7 @@ class _Sources:
         return found
 
     def _taking(self) -> dict[str, Any]:
-        """Return the wizard's arguments that say where its pictures come from."""
+        """Return the wizard's arguments for the source of its pictures."""
         from smartcam.calibration.wizards import PictureFolder
 
         if self.source is not None:
@@ -376,15 +376,15 @@ class _Sources:
         from smartcam.calibration._inside import decode_picture
         from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
-        # the picture counts, not what the application says of it
+        # only the picture counts, not the result of the application
         options = replace(self.options, interpret_as=None)
         wait = options.step(DEFAULT_TRIGGER_TIMEOUT)
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
                 if not camera.capabilities.read_image:
                     raise UnsupportedError(
-                        f"{camera.name}: its protocol sends no pictures; expected one that does, "
-                        "or --pictures FOLDER, where the camera writes them by FTP"
+                        f"{camera.name}: its protocol sends no pictures; expected one with them, "
+                        "or --pictures FOLDER, to which the camera writes them by FTP"
                     )
                 await camera.trigger(timeout=wait)
                 data = await camera.read_image(timeout=wait)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats import LengthUnit
 
 DIFFERENT = 7
-"""Exit code after a comparison of calibrations that differ by more than their noise explains."""
+"""Exit code after a comparison of calibrations that differ by more than noise explains."""
 
 COLUMNS = ("centre", "corners", "worst", "mean")
 """Names of a map's figures."""
@@ -32,7 +32,7 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 """The values of --wizard."""
 
 MIN_LIKENESS = 0.75
-"""A word counts as a command, not as a host, from this likeness on (0 to 1)."""
+"""Likeness to a command, 0 to 1, from which a word counts as that command and not as a host."""
 
 OWN = "wizard"
 """Name of the default command below ``calibrate``, which users need not type."""
@@ -48,7 +48,7 @@ class OwnContext(click.Context):
 
 
 class WithParts(click.Command):
-    """The default command, whose help also lists the other commands."""
+    """The default command; its help also lists the other commands."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, and the commands."""
@@ -58,7 +58,7 @@ class WithParts(click.Command):
 
 
 class WithFiles(ListedGroup):
-    """A command with others below it, of which a default takes arguments without a name."""
+    """A group of commands; arguments without a command go to the default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
@@ -105,18 +105,18 @@ def distance_option(function: Any) -> Any:
         "--distance",
         type=click.FloatRange(min=0, min_open=True, max=1e6),
         metavar="M",
-        help="Of the points before the camera, metres.  [default: infinity]",
+        help="Distance of the points from the camera, metres.  [default: infinity]",
     )(function)
 
 
 @click.command(
-    help="Compare two calibrations of one lens, or of one pair: by how much they differ in where "
-    "they project, after the small motion of the camera that makes up for most, beside what the "
-    "noise of both leads to. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
+    help="Compare two calibrations of one lens, or of one pair: the difference of their "
+    "projections, after the small motion of the camera that cancels most of it, beside the effect "
+    "of noise. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
     "camera_info of ROS, camchains of Kalibr, files of OpenCV or of others whose format is known; "
-    "what noise leads to is known of calibrations of a lens alone. "
-    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also where "
-    "there is no verdict."
+    "the effect of noise is only known for calibrations of a lens. "
+    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also "
+    "without a verdict."
 )
 @click.argument("a", type=click.Path(dir_okay=False))
 @click.argument("b", type=click.Path(dir_okay=False))
@@ -124,7 +124,7 @@ def distance_option(function: Any) -> Any:
 @click.option(
     "--unit",
     type=click.Choice(["m", "cm", "mm", "inch"]),
-    help="Of the lengths between cameras, for files that do not say it, such as OpenCV's.",
+    help="Unit of lengths between cameras, for files without one, such as OpenCV's.",
 )
 @click.option(
     "--svg",
@@ -163,8 +163,8 @@ async def compare(
         turn, shift = rig_difference(one, other, *pair)
         between = f"{one.target} to {one.source}"
         value = {"between": between, "turn_deg": math.degrees(turn), "shift_mm": 1e3 * shift}
-        said = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
-        options.show(value, said)
+        text = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
+        options.show(value, text)
     if svg is not None:
         _draw(svg, first.names, found, f"{a} and {b}")
     if any(one.same is False for one in found):
@@ -173,8 +173,8 @@ async def compare(
 
 @click.command(
     help="Draw the calibration in a file as SVG: the errors of its views as bars (views), targets "
-    "and cameras in space (scene), how sure a lens is over its field (uncertainty), a plane with "
-    "its touches (plane)."
+    "and cameras in space (scene), a lens' uncertainty over its field (uncertainty), a "
+    "plane with its touches (plane)."
 )
 @click.argument("file", type=click.Path(dir_okay=False))
 @click.option(
@@ -184,7 +184,7 @@ async def compare(
     type=click.Path(dir_okay=False),
     required=True,
     callback=_svg,
-    help="Where the picture goes; .svg.",
+    help="File for the picture; .svg.",
 )
 @click.option(
     "--what",

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
 
 MAX_STILL_MOTION_PX: Final = 1.0
-"""Pixels by which the points of a still target may move from one frame to the next."""
+"""Largest motion of the points of a still target between two frames, in pixels."""
 
 MIN_NEW_VIEW_SHARE: Final = 0.05
-"""Share of the image's width by which points must have moved, on average, for a new view."""
+"""Least mean motion of the points for a new view, as a share of the image's width."""
 
 MAX_VIEWS: Final = 200
 
@@ -36,13 +36,13 @@ MAX_DESCRIPTION_BYTES: Final = 65_536
 
 @dataclass(slots=True)
 class Collecting:
-    """Takes views of a target that somebody moves before a camera, when it is held still."""
+    """Collects views of a moved target, whenever it is held still."""
 
     views: list[TargetView] = field(default_factory=list["TargetView"])
     _last: TargetView | None = None
 
     def offer(self, view: TargetView) -> bool:
-        """Take a view if the target stands still at a place where it was not seen before."""
+        """Add a view if the target is still, and at a new place; return whether it was added."""
         last, self._last = self._last, view
         still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
         far = MIN_NEW_VIEW_SHARE * view.size[0]
@@ -57,7 +57,7 @@ class Collecting:
 
 
 def _apart(one: TargetView, other: TargetView) -> float:
-    """Return by how many pixels common points are apart, root of the mean square."""
+    """Return the distance of common points in pixels, root of the mean square."""
     import numpy as np
 
     _, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
@@ -74,9 +74,9 @@ def _output(_context: object, _option: object, file: str) -> str:
 
 
 @click.command(
-    help="Calibrate a lens from pictures of a printed target: of files, of a folder's files, or of "
-    "a source of frames (see smartcam frames). Of a source a view is taken whenever the target is "
-    "held still where it was not seen before, and what comes next is suggested; it ends after "
+    help="Calibrate a lens from pictures of a printed target: from files, from a folder, or from a "
+    "source of frames (see smartcam frames). A source's view is taken whenever the target is held "
+    "still at a new place, and the next place is suggested; the command ends after "
     "--count views, or with --seconds. Pictures without the target are named and left out."
 )
 @click.argument("pictures", metavar="FILE...|FOLDER|URL", nargs=-1, required=True)
@@ -85,14 +85,14 @@ def _output(_context: object, _option: object, file: str) -> str:
     metavar="FILE",
     type=click.Path(dir_okay=False),
     required=True,
-    help="What is on the sheet, as smartcam sheet --describe writes it.",
+    help="Description of the sheet, as smartcam sheet --describe writes it.",
 )
 @option(
     "--output",
     required=True,
     callback=_output,
-    help="Where the lens goes: .yaml is a camera_info of ROS, .json has the views, too, and what "
-    "smartcam calibrate compare wants.",
+    help="File for the lens: .yaml is a camera_info of ROS, .json also has the views, and the data "
+    "that smartcam calibrate compare needs.",
 )
 @option("--force")
 @click.option(
@@ -100,23 +100,23 @@ def _output(_context: object, _option: object, file: str) -> str:
     type=click.Choice(["plumb_bob", "rational_polynomial", "equidistant"]),
     default="plumb_bob",
     show_default=True,
-    help="Of the distortion: for most lenses, for wide ones, for fisheyes.",
+    help="Model of the distortion: for most lenses, for wide ones, for fisheyes.",
 )
 @click.option(
     "--sheet",
     type=click.Choice(["auto", "exact", "free"]),
     default="auto",
     show_default=True,
-    help="Whether the target's points are where they were meant to be, or are adjusted, too; auto: "
-    "as views that are left out are shown better.",
+    help="Whether the target's points are exact, or are adjusted, too; auto: "
+    "the choice that predicts left-out views better.",
 )
 @option(
     "--count",
     type=click.IntRange(3, MAX_VIEWS),
-    help="How many views of a source.  [default: 15]",
+    help="Number of views of a source.  [default: 15]",
 )
-@option("--seconds", help="Calibrate after so many seconds from the views of a source so far.")
-@option("--timeout", help="Bound of the wait for a frame.  [default: 5]")
+@option("--seconds", help="Calibrate after this time with the views so far.")
+@option("--timeout", help="Longest wait for a frame.  [default: 5]")
 @runs(*OUTPUT)
 async def lens(
     pictures: tuple[str, ...],
@@ -153,7 +153,7 @@ async def lens(
 
 
 def read_target(path: str) -> Target:
-    """Return the target that a file describes; ConfigurationError: it does not."""
+    """Return the target that a file describes; ConfigurationError: a wrong file."""
     from smartcam.calibration import target_from_data
 
     try:
@@ -164,7 +164,7 @@ def read_target(path: str) -> Target:
     except (ValueError, RecursionError) as exc:
         raise ConfigurationError(f"--target {path}: not valid JSON: {exc}") from exc
     if not isinstance(data, dict):
-        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+        raise ConfigurationError(f"--target {path}: expected a file of smartcam sheet --describe")
     described: dict[str, Any] = data
     try:
         return target_from_data(described)
@@ -196,7 +196,7 @@ async def _from_files(
 
 
 def _files(pictures: Sequence[str]) -> Iterator[Path]:
-    """Yield the files that are named, and those of folders in the order of their numbers."""
+    """Yield the named files, and those of folders in the order of their numbers."""
     from smartcam._natural import natural
     from smartcam.calibration._inside import SUFFIXES
 
@@ -222,12 +222,12 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
 
 
 async def _from_source(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
-    """Return the views that are taken while somebody moves the target."""
+    """Return the views collected from a source while the target is moved."""
     from smartcam.calibration import find_target
     from smartcam.calibration._inside import LOOKS, suggestion
 
     wanted = options.count or 15
-    taken, told = Collecting(), set[str]()
+    taken, reported = Collecting(), set[str]()
     if not options.as_json:
         click.echo(f"view 1 of {wanted}: hold the target {LOOKS[0].text}; Ctrl-C gives up")
     try:
@@ -238,7 +238,7 @@ async def _from_source(source: FrameSource, target: Target, options: Options) ->
                     view = await asyncio.to_thread(find_target, frame, target, name=name)
                 except CalibrationError as exc:
                     taken.gone()
-                    _tell_once(exc, told)
+                    _report_once(exc, reported)
                     continue
                 if not taken.offer(view):
                     continue
@@ -254,14 +254,14 @@ async def _from_source(source: FrameSource, target: Target, options: Options) ->
     return taken.views
 
 
-def _tell_once(error: CalibrationError, told: set[str]) -> None:
-    """Say why no view can be had of frames that show something; raise what no frame can mend."""
+def _report_once(error: CalibrationError, reported: set[str]) -> None:
+    """Report once why a frame gives no view; raise an error that no frame can cure."""
     from smartcam.geometry import Code
 
     if error.code == Code.SHAPE:
         raise error
-    if error.code != Code.TARGET_NOT_FOUND and error.code not in told:
-        told.add(error.code)
+    if error.code != Code.TARGET_NOT_FOUND and error.code not in reported:
+        reported.add(error.code)
         click.echo(f"note: {error}", err=True)
 
 

@@ -31,7 +31,7 @@ WIDTH: Final = 88
 """Columns at which texts are wrapped."""
 
 COMMANDS: Final = ("undo", "repeat", "abort")
-"""Words that may be typed where an answer is asked for."""
+"""Words that may be typed instead of an answer."""
 
 
 async def drive(
@@ -42,8 +42,8 @@ async def drive(
 ) -> dict[str, Any]:
     """Ask until the wizard's end; return the last view.
 
-    ``anew``: begins the wizard anew. ``picture``: the file into which the picture of a step is
-    written. Raises ConfigurationError: a line of input is not valid, or there is no more.
+    ``anew``: function that begins the wizard again. ``picture``: file for the picture of a step.
+    Raises ConfigurationError: a line of input is not valid, or the input has ended.
     """
     lines = Lines()
     if session.resumed and not options.as_json:
@@ -71,7 +71,7 @@ def _asks_anew(line: str) -> bool:
 
 
 async def _goes_on(resumed: Mapping[str, Any], lines: Lines) -> bool:
-    """Show what was done before, and ask whether to go on with it."""
+    """Show the finished steps, and ask whether to continue with them."""
     click.echo(_resumed_text(resumed))
     while True:
         click.echo("Go on, or begin anew? [go on]: ", nl=False)
@@ -101,7 +101,7 @@ def _done_text(done: Mapping[str, Any]) -> str:
 
 
 def _ago(at: str | None) -> str:
-    """Return a moment and how long ago it was."""
+    """Return a time, and its age."""
     if at is None:
         return "at an unknown time"
     minutes = (datetime.now(UTC) - datetime.fromisoformat(at)).total_seconds() / 60
@@ -157,7 +157,7 @@ class _Instead(NamedTuple):
 async def _from_prompts(
     session: WizardSession, step: Step, view: dict[str, Any], lines: Lines
 ) -> dict[str, Any]:
-    """Ask for a step's answers, one by one, until it is left; what was answered is a default."""
+    """Ask for a step's answers, one by one, until it is left; earlier answers are defaults."""
     token, can = view["token"], view["can"]
     answers = dict(view["defaults"])
     wanted = [one.name for one in step.inputs]
@@ -185,7 +185,7 @@ async def _from_prompts(
 async def _answer(
     one: Input, answers: Mapping[str, Any], can: Collection[str], lines: Lines
 ) -> Any | _Instead:
-    """Return an answer that the step takes, or a command; a wrong one is asked for again."""
+    """Return an answer that the step accepts, or a command; ask again after a wrong one."""
     schema = one.schema()
     prompt = _prompt(schema, answers.get(one.name))
     while True:
@@ -235,7 +235,7 @@ _BOOLEANS = {"y": True, "yes": True, "n": False, "no": False}
 
 
 def _value(schema: Mapping[str, Any], text: str) -> Any:
-    """Return the value of a text; one that stands for nothing is the input's to refuse."""
+    """Return the value of a text; the input itself refuses a text without a value."""
     kind = schema.get("type")
     if kind == "boolean":
         return _BOOLEANS.get(text.lower(), text)
@@ -271,7 +271,7 @@ def _verdict_lines(view: Mapping[str, Any]) -> list[str]:
 
 
 def _note_lines(note: str) -> list[str]:
-    """Return the lines of what came out; a warning begins with its code."""
+    """Return the lines of a note; a warning begins with its code."""
     wrapped = textwrap.wrap(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
     if re.match(r"[A-Z][A-Z_]+: ", note):
         head = click.style("Warning:", fg="yellow", bold=True)
@@ -291,7 +291,7 @@ def _errors_text(view: Mapping[str, Any]) -> str:
 
 def _end_text(view: Mapping[str, Any]) -> str:
     if view["type"] == "abort":
-        return "\naborted; what was measured stands in the journal"
+        return "\naborted; the measurements stay in the journal"
     result = dict(view["result"])
     use, remarks = result.pop("use", {}), result.pop("remarks", [])
     rows = [f"  {name}: {_result_text(value)}" for name, value in result.items()]
@@ -323,8 +323,8 @@ def _listed(row: Mapping[str, Any]) -> tuple[str, ...]:
     if row["problem"] is not None:
         return row["name"], "-", "-", "-", f"cannot be read: {row['problem']}"
     error = "not known" if row["held_out_mm"] is None else f"{row['held_out_mm']:.2f} mm rms"
-    said = "stale" if row["stale"] else "still true"
-    check = "none" if row["checked_at"] is None else f"{_minute(row['checked_at'])}: {said}"
+    verdict = "stale" if row["stale"] else "still true"
+    check = "none" if row["checked_at"] is None else f"{_minute(row['checked_at'])}: {verdict}"
     return row["name"], row["kind"], _minute(row["written_at"]), error, check
 
 
@@ -336,38 +336,38 @@ def _minute(at: str) -> str:
 
 
 class Lines:
-    """Lines of standard input, one when it is asked for; the event loop goes on meanwhile.
+    """Lines of standard input, read one by one on demand while the event loop runs.
 
-    A thread waits for each. It reads the descriptor itself: one that is left waiting in Python's
-    own buffer at the end would stop the interpreter from ending.
+    A thread waits for each line. It reads the descriptor itself, since a thread that waits in
+    Python's own buffer would keep the interpreter from ending.
     """
 
     def __init__(self) -> None:
         self._buffer = b""
 
     async def next(self) -> str:
-        """Return the next line without its end; ConfigurationError: there is none.
+        """Return the next line without its end; ConfigurationError: the input has ended.
 
-        Cancellation: the thread goes on waiting, and ends with the process.
+        Cancellation: the thread waits on, and ends with the process.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str] = loop.create_future()
 
-        def tell(line: str) -> None:
+        def deliver(line: str) -> None:
             if not future.done():
                 future.set_result(line)
 
         def wait() -> None:
             line = self._read()
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                loop.call_soon_threadsafe(tell, line)
+                loop.call_soon_threadsafe(deliver, line)
 
         threading.Thread(target=wait, name="stdin", daemon=True).start()
         line = await future
         if not line:
             raise ConfigurationError(
-                "the input has ended before the calibration has; what was done is kept: "
-                "the same command goes on with it"
+                "the input ended before the calibration; the finished steps are kept: "
+                "the same command continues with them"
             )
         return line.strip()
 

@@ -39,7 +39,7 @@ async def status(url: str, options: Options) -> None:
     f"camera is an error (exit code 5). {CONNECTS}"
 )
 @click.argument("url")
-@click.option("--input", "input_hex", metavar="HEX", help="Input data for each inspection.")
+@click.option("--input", "input_hex", metavar="HEX", help="Input data for each inspection, as hex.")
 @runs(*RESULTS)
 async def trigger(url: str, input_hex: str | None, options: Options) -> None:
     import asyncio
@@ -91,7 +91,7 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
     each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
     url = await options.located(url)
     with options.camera(url) as unopened:
-        # subscribed before the session is there, so the first result is seen too
+        # subscribed before the session begins, so the first result is seen, too
         results = unopened.results()
         async with unopened as camera:
             if not (camera.capabilities.unasked_results or is_fleet(url)):
@@ -125,8 +125,8 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
 
 
 @click.command(
-    help="Load another application by its id, or by the name of its file where the camera can do "
-    f"that; returns when the camera is ready. It runs if the one before ran. {CONNECTS}"
+    help="Load another application by its id, or by its file's name if the camera can do that; "
+    f"returns when the camera is ready. It runs if the previous one ran. {CONNECTS}"
 )
 @click.argument("url")
 @click.argument("id_or_file", metavar="ID|FILE", type=application)
@@ -161,7 +161,7 @@ async def _then_show(
     options: Options,
     action: Callable[[smartcam.Camera], Awaitable[None]] | None = None,
 ) -> None:
-    """Connect, do something, show how the camera is then."""
+    """Connect, run an action, and show the camera's state afterwards."""
     url = await options.located(url)
     with options.camera(url) as unopened:
         async with unopened as camera:

@@ -1,4 +1,4 @@
-"""Make a shell complete the commands, by a line in its startup file."""
+"""Set up a shell to complete the commands, by a line in its startup file."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ LINES: Mapping[str, str] = {
     "zsh": _EVAL,
     "fish": "command -q {program}; and {variable}=fish_source {program} | source",
 }
-"""A line for each shell that makes it complete an installed program."""
+"""The line for each shell that lets it complete an installed program."""
 
 
 def install(shell: str) -> str:
-    """Add the missing lines to the shell's file, and return what was done.
+    """Add the missing lines to the shell's file, and return a report.
 
     Args:
         shell: name of the shell; "": that of the variable SHELL.
 
     Raises:
-        click.UsageError: the shell is none of those known, or its file cannot be written.
+        click.UsageError: the shell is unknown, or its file cannot be written.
     """
     name = shell or Path(os.environ.get("SHELL", "")).name
     if name not in LINES:

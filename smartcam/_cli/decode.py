@@ -1,4 +1,4 @@
-"""``smartcam decode``: bytes against a dialect or a layout, without a camera."""
+"""``smartcam decode``: decode bytes by a dialect or a layout, without a camera."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     "is a result container's data and needs --interpret-as."
 )
 @click.argument("data")
-@option("--interpret-as", help="How to read a result container's data.")
+@option("--interpret-as", help="Interpretation of a result container's data.")
 @option("--units")
 @click.option("--big-endian", is_flag=True, help="The container is big endian.")
 @click.option(
     "--dialect",
     "dialect_name",
     type=click.Choice(DIALECTS),
-    help="Whose frames they are.",
+    help="Dialect of the frames.",
 )
 @click.option("--quirks", metavar="NAMES", default="", help="The dialect's quirks, as in a URL.")
 @runs(*OUTPUT)
 async def decode(
     data: str, big_endian: bool, dialect_name: str | None, quirks: str, options: Options
 ) -> None:
-    """Print what bytes mean; a frame with a magic number shows its dialect by itself."""
+    """Print the meaning of bytes; a frame with a magic number shows its dialect by itself."""
     from smartcam.interpreters import resolve
     from smartcam.protocols import BVS
 
@@ -62,7 +62,7 @@ async def decode(
     if interpreter is None:
         raise ConfigurationError(
             f"decode: {hex_excerpt(payload[:8])} begins no frame (no magic number), so "
-            "--dialect must say whose frames they are, or --interpret-as what the container holds"
+            "--dialect must name their dialect, or --interpret-as the container's contents"
         )
     value = _interpret(payload, interpreter, byte_order)
     options.show({"value": value}, options.value_text(value))
@@ -119,7 +119,7 @@ def _decode_frames(
 ) -> None:
     from smartcam.protocols._inside import Framer
 
-    # no frame is longer than all that is there: for one that says so no memory is taken
+    # no frame is longer than the input, so no memory is reserved for a larger one
     framer = Framer(dialect.header, min(len(payload), dialect.header.max_payload))
     framer.feed(payload)
     offset = 0
@@ -140,7 +140,7 @@ def _next_frame(framer: Framer, dialect: FramedDialect) -> Frame | None:
     try:
         return framer.next_frame()
     except FrameError as exc:
-        if exc.offset == len(dialect.header.magic):  # of its length
+        if exc.offset == len(dialect.header.magic):  # the length is wrong
             return None
         raise
 
@@ -159,7 +159,7 @@ def _show_frame(
 
     raw = dialect.encode_frame(frame)
     for sender in _senders(dialect, frame):
-        name = type(dialect.decode(sender, frame)).__name__  # says plainly if it is too short
+        name = type(dialect.decode(sender, frame)).__name__  # raises if it is too short
         fields = view_fields(dialect, sender, raw)
         shown: dict[str, Any] = {
             "offset": offset,
@@ -182,7 +182,7 @@ def _show_frame(
 
 
 def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
-    """Return the senders that the frame can have, by id and size; both where neither fits."""
+    """Return the senders that the frame can have, by id and size; both if neither fits."""
     from smartcam.protocols.messages import Sender
 
     exact = [

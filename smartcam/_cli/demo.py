@@ -27,13 +27,13 @@ class Steps:
     _number: int = 0
 
     def step(self, text: str, **values: Any) -> None:
-        """Print the next one, with its number; ``values`` stand beside the text in JSON."""
+        """Print the next step, with its number; ``values`` are added in JSON."""
         self._number += 1
         number = self._number
         self._options.show({"step": number, "text": text, **values}, f"\n{number}. {text}")
 
     def detail(self, text: str, **values: Any) -> None:
-        """Print more about it."""
+        """Print a detail of the step."""
         self._options.show({"text": text, **values}, text)
 
 
@@ -73,7 +73,7 @@ async def _switch(camera: smartcam.Camera, say: Steps) -> None:
     events = camera.events()
     switching = asyncio.create_task(camera.switch_application(TANGRAM))
     await camera.wait_status(lambda status: smartcam.Status.BUSY in status)
-    # asked for while the camera is BUSY: it waits until the camera takes a trigger
+    # requested while the camera is BUSY: it waits until the camera accepts a trigger
     result = await camera.trigger()
     await switching
     while events.statistics().queued:

@@ -1,4 +1,4 @@
-"""``smartcam demo --fleet``: agents, cameras and programs, each on their own, step by step."""
+"""``smartcam demo --fleet``: agents, cameras and programs in separate processes, step by step."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 SHARED = "line1/cam1"
 CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
-"""For each agent, the line where its cameras stand and the number of these cameras."""
+"""For each agent, the line of its cameras and their number."""
 
 BY_ROBOT, BY_HAND = 9, 3
-"""Triggers of two programs, at the same time."""
+"""Triggers of two programs at the same time."""
 
 PATIENCE_TIMEOUT = 30.0
-"""Seconds for anything; only what has gone wrong takes as long."""
+"""Seconds for any step; only a failure takes as long."""
 
 SOON_TIMEOUT = 0.3
-"""Seconds that somebody waits for a camera that another program has for itself."""
+"""Seconds that a program waits for a camera that another program has reserved."""
 
 
 async def demo(options: Options) -> None:
@@ -43,7 +43,7 @@ async def demo(options: Options) -> None:
     from smartcam.fleet import open
     from smartcam.fleet._inside import ZenohEnd
 
-    ZenohEnd(BusLink())  # without the engine it ends here
+    ZenohEnd(BusLink())  # raises if the engine is missing
     say = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"
@@ -80,7 +80,7 @@ async def demo(options: Options) -> None:
 
 @contextlib.asynccontextmanager
 async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
-    """Run an agent in a process of its own; its cameras are there."""
+    """Run an agent in a process of its own; its cameras are ready on return."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "smartcam", "serve", str(file), "--json"),
         stdin=asyncio.subprocess.DEVNULL,
@@ -204,7 +204,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps
 
 
 async def _drain(events: Any) -> None:
-    """Take what is there already: everybody who was there at first."""
+    """Read the waiting events: agents and cameras that were there at the start."""
     while events.statistics().queued:
         await anext(events)
 

@@ -1,4 +1,4 @@
-"""``smartcam demo --inspect``: a software camera that checks drawn parts, beside the truth."""
+"""``smartcam demo --inspect``: a software camera checks drawn parts; results beside the truth."""
 
 from __future__ import annotations
 
@@ -104,8 +104,8 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     with naming(f"--folder {folder}"):
         await asyncio.to_thread(_write, folder, seed)
     say.step(
-        f"A folder with drawn pictures of {len(PARTS)} parts, and a file that says what is to be "
-        f"seen in them: {folder / 'cell.yaml'}",
+        f"A folder with drawn pictures of {len(PARTS)} parts, and a file with the expected "
+        f"findings: {folder / 'cell.yaml'}",
         folder=str(folder),
     )
     camera = load_cell(folder / "cell.yaml")["desk/drawn"]

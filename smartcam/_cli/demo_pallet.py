@@ -1,8 +1,8 @@
-"""``smartcam demo --pick --plain``: parts located in a plain camera's pictures, onto a pallet.
+"""``smartcam demo --pick --plain``: locate parts in a plain camera's pictures, and palletize them.
 
 A part and a mark are taught from drawn pictures. The robot touches the mark at nine places, and
-these pairs give the calibration; after that the tool ``locate`` gives each part's pose in the
-robot's frame, and its uncertainty. The robot's actions are then compared with the truth, which a
+these pairs give the calibration. Then the tool ``locate`` gives each part's pose in the
+robot's frame, and its uncertainty. The robot's actions are compared with the truth, which a
 real cell does not know.
 """
 
@@ -87,7 +87,7 @@ async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> No
     seed of all noise and places. Raises MissingExtraError: the extra ``inspection`` is not
     installed; ConfigurationError: the folder cannot be written.
     """
-    load("scipy", "calibration needs")  # first, since otherwise all steps before would be in vain
+    load("scipy", "calibration needs")  # first, so that it fails before the other steps
     say = Steps(options)
     with naming(f"--folder {folder}"):
         await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
@@ -200,7 +200,7 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
             demo.table.parts = [TablePart("mark", pose)]
             result = await camera.trigger(timeout=demo.options.step(10.0))
             (mark,) = result.value.locate
-            seen.append((mark.x, -mark.y))  # y up, as calibrations have it
+            seen.append((mark.x, -mark.y))  # y up, as in calibrations
             touched.append(demo.robot.touch_table(pose))
     demo.table.parts = []
     calibration = fit_plane(seen, touched, touch_sigma=TOUCH_SIGMA, tool_z=DOWN, y_down=True)

@@ -1,8 +1,8 @@
 """``smartcam demo --pick``: an emulated camera and a simulated robot, from touches to picks.
 
-The robot knows nothing of where the table is: it touches marks that the camera sees, and from these
-pairs comes the calibration. What the robot then does is compared with the truth, which a real cell
-does not know, and with what the calibration predicted, which a real cell does.
+The robot does not know where the table is: it touches marks that the camera sees, and these pairs
+give the calibration. The robot's picks are then compared with the truth, which a real cell does
+not know, and with the calibration's prediction, which a real cell knows.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TOUCH_SIGMA: Final = 2e-4
 """Standard deviation of a touch along each of the robot's axes, metres."""
 
 GRIP: Final = 2e-3
-"""Metres by which the gripper may miss a part and still take it."""
+"""Largest distance in metres from a part at which the gripper still takes it."""
 
 EDGE: Final = 0.025
 """Metres from the table's edge to the outer marks."""
@@ -57,7 +57,7 @@ class SimulatedRobot:
 
     Args:
         scene: the table.
-        seed: seed of where the table is, and of the noise of the touches.
+        seed: seed of the table's place, and of the noise of the touches.
     """
 
     def __init__(self, scene: TableScene, seed: int) -> None:
@@ -72,7 +72,7 @@ class SimulatedRobot:
         self.table: Transform = Transform.from_quaternion(
             "robot", "table", place, turn / np.linalg.norm(turn)
         )
-        """The truth; nothing but the comparison looks at it."""
+        """The truth; only the comparison uses it."""
 
     @property
     def tool_z(self) -> NDArray[Any]:
@@ -85,10 +85,10 @@ class SimulatedRobot:
         return true + self._random.normal(0.0, TOUCH_SIGMA, 3)
 
     def pick(self, part: Localization, predicted: float) -> Pick:
-        """Go to a pose in the robot's frame and close the gripper; a part that is there is taken.
+        """Go to a pose in the robot's frame and close the gripper; take the part that is there.
 
-        ``part``: its pose, the tool's z into the table. ``predicted``: rms of the error that is
-        expected there, metres.
+        ``part``: its pose, the tool's z into the table. ``predicted``: rms of the expected error,
+        metres.
         """
         from smartcam.geometry import Transform
 
@@ -109,13 +109,13 @@ class SimulatedRobot:
 async def pick(options: Options, picture: str, seed: int) -> None:
     """Calibrate, localize, pick all seven pieces, and write a picture (SVG).
 
-    ``seed``: of the camera's noise, of where the table is and of the touches' noise. Raises
+    ``seed``: seed of the camera's noise, the table's place and the touches' noise. Raises
     MissingExtraError: the extra ``calibration`` is not installed; ConfigurationError: the picture
     cannot be written.
     """
     from smartcam._extras import load
 
-    load("scipy")  # first, since all that comes before the calibration would be in vain
+    load("scipy")  # first, so that it fails before the other steps
     say = Steps(options)
     async with EmulatedCamera(active=TANGRAM, seed=seed) as emulator:
         robot = SimulatedRobot(emulator.scene, seed)
@@ -150,7 +150,7 @@ def nine_marks() -> dict[str, TablePose]:
 
 
 def _lay(scene: TableScene, things: dict[str, TablePose]) -> None:
-    """Clear the table and put these things onto it."""
+    """Clear the table and put these marks or parts onto it."""
     scene.pieces.clear()
     scene.pieces.update(things)
 
@@ -229,7 +229,7 @@ def _mm(*metres: float) -> list[str]:
 
 
 def _right(*texts: str) -> list[str]:
-    """Return texts in cells of one width, to the right."""
+    """Return texts in cells of one width, aligned to the right."""
     return [text.rjust(9) for text in texts]
 
 
@@ -243,4 +243,4 @@ def _write(path: str, calibration: PlaneCalibration, parts: list[Localization], 
     text = draw(calibration, parts, title="smartcam demo --pick")
     with naming(f"--picture {path}"):
         Path(path).write_text(text, encoding="utf-8", newline="\n")
-    say.step(f"What was touched, how well it fits and how good it is: {path}", picture=path)
+    say.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)

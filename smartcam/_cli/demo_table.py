@@ -1,7 +1,7 @@
 """A drawn table for ``smartcam demo --pick --plain``: a plain camera above it, a robot beside it.
 
-Parts lie on the table at true poses that only the comparison looks at. The camera's pictures are
-drawn from them: each pixel is the mean of what a blur makes of the parts, with noise.
+Parts lie on the table at true poses that only the comparison uses. The camera's pictures are
+drawn from them: each pixel is the mean of the blurred parts, with noise.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ SIZE_PX: Final = (1280, 1024)
 """Width and height of a picture."""
 
 FRAMES_PER_SECOND: Final = 8.0
-"""Pictures a second while somebody reads."""
+"""Pictures a second while there is a reader."""
 
 DARK, CONTRAST, NOISE = 60.0, 130.0, 2.0
-"""Grey levels: of the table, from it to the parts, and of the noise (standard deviation)."""
+"""Grey level of the table, its distance to the parts', and standard deviation of the noise."""
 
 BLUR_PX: Final = 0.8
 """Standard deviation of the lens' blur."""
@@ -53,7 +53,7 @@ TOUCH_SIGMA: Final = 2e-4
 """Standard deviation of a touch along each of the robot's axes, metres."""
 
 GRIP: Final = 2e-3
-"""Metres by which the gripper may miss a part and still take it."""
+"""Largest distance in metres from a part at which the gripper still takes it."""
 
 HEIGHT: Final = 0.008
 """Thickness of a part, metres."""
@@ -158,7 +158,7 @@ class DrawnTable:
         ]
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return a picture of the table as it is now, (H, W), with noise of its own."""
+        """Return a picture of the table as it is now, (H, W), with new noise."""
         parts = list(self.parts)
         if self._drawn is None or self._drawn[0] != parts:
             self._drawn = parts, self._levels(parts)
@@ -203,7 +203,7 @@ class DrawnTable:
         """Return the pose of a model's reference in its part's own frame.
 
         ``taught``: the part as it lay in the picture that was taught; ``reference``: the place of
-        the model's reference there, pixels. This is the truth that a real cell does not know.
+        the model's reference there, pixels. A real cell does not know this true pose.
         """
         there = self._on_table(*reference)
         ahead = self._on_table(reference[0] + 1.0, reference[1])
@@ -274,11 +274,11 @@ class Placed(NamedTuple):
 
 
 class TableRobot:
-    """A robot beside a level table, whose place it does not know; a pallet stands behind it.
+    """A robot beside a level table at an unknown place, with a pallet.
 
     Args:
         table: the table.
-        seed: seed of where the table and the pallet are, and of the noise of the touches.
+        seed: seed of the places of table and pallet, and of the noise of the touches.
     """
 
     def __init__(self, table: DrawnTable, seed: int) -> None:
@@ -327,7 +327,7 @@ class TableRobot:
         self._table.parts.remove(part)
         row, column, layer = pattern.at(number)
         true = self._pallet.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
-        # the part lies in the gripper as it was picked, and moves along with it
+        # the part keeps its place in the gripper, and moves along with it
         place = pattern[number]
         held = place.rotation[:2, :2] @ _turned([off[0].real, off[0].imag], -found[2])
         off_place = float(np.linalg.norm(place.translation[:2] + held - true[:2]))

@@ -1,8 +1,8 @@
 """``smartcam demo --tower``: a robot builds a tower of the black blocks that its camera finds.
 
-Nothing is known beforehand but what a block looks like: where one lies is found by its colour,
-where the tower is and how high by the depth. A person puts a block on top meanwhile, and takes one
-away. What was found is compared with the truth, which a real cell does not know.
+The robot only knows the looks of a block: it finds the place of a block by its colour, and the
+place and height of the tower by the depth. A person adds a block meanwhile, and removes one. The
+findings are compared with the truth, which a real cell does not know.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.depth._inside import ColourRegion, TableSight, TowerTable, WoodenBlock
 
 LAYERS: Final = 5
-"""Blocks that the robot puts onto the tower."""
+"""Number of blocks that the robot puts onto the tower."""
 
 PERSON: Final = {2: "add", 4: "remove"}
 """The disturbances of the tower by a person, by the number of blocks put on before."""
@@ -50,28 +50,28 @@ REACH: Final = (0.15, 0.50)
 """Least and greatest distance from the robot's foot at which it can grip, metres."""
 
 BLACK: Final = ColourRange(value=(0, 60))
-"""The colour of the blocks that the robot is to take."""
+"""The colour of the blocks that the robot has to take."""
 
 AREA: Final = (0.6, 1.7)
-"""Area of a block in the picture, in areas of its upper side: other sides may be seen, too."""
+"""Area of a block in the picture, in areas of its upper side: other sides may be visible, too."""
 
 SIDE_RATIO: Final = (2.2, 3.8)
 """Longer side of a block in the picture over the shorter one, from least to most."""
 
 MIN_FULLNESS: Final = 0.8
-"""A block fills at least this share of its rectangle."""
+"""Least share of its rectangle that a block fills."""
 
 RIM: Final = 2
-"""Pixels at a region's rim whose depth is a mixture."""
+"""Width of a region's rim, in pixels; depths there are mixed from two surfaces."""
 
 TOLERANCE: Final = (2e-3, math.radians(1.0), 1e-3)
-"""Largest errors of a block found: metres in the plane, radians, and metres of height."""
+"""Largest errors of a found block: metres in the plane, radians, and metres of height."""
 
 MISSED: Final = 7
 """Exit code after an error above the tolerance."""
 
 ARM: Final = "camera at the hand"
-"""Name of the camera whose pictures errors are about."""
+"""Name of the camera in error texts."""
 
 
 class BlockPose(NamedTuple):
@@ -81,11 +81,11 @@ class BlockPose(NamedTuple):
     y: float
     angle: float  # direction of the block's length, from x towards y
     height: float  # height of the block's upper side
-    sigma: float = 0.0  # sigma of the height, by the depth
+    sigma: float = 0.0  # standard deviation of the height, from the depth
 
 
 class Compared(NamedTuple):
-    """Something found, beside the truth: metres and radians."""
+    """A finding beside the truth: metres and radians."""
 
     what: str
     found: BlockPose
@@ -107,19 +107,19 @@ async def tower(
     colours: ColourRange = BLACK,
     layers: int = LAYERS,
 ) -> None:
-    """Build the tower, and tell how well it was seen.
+    """Build the tower, and report how accurate the findings were.
 
     Args:
         options: the options of the command.
-        seed: seed of where everything lies, and of all noise.
-        table: another one; None: one of the seed.
+        seed: seed of all places and all noise.
+        table: another table; None: one from the seed.
         colours: colours of the blocks.
-        layers: blocks to put onto the tower.
+        layers: number of blocks to put onto the tower.
 
     Raises:
-        FrameFormatError: there is no block, or no tower, to be seen.
+        FrameFormatError: no block, or no tower, is visible.
         MissingExtraError: the extra ``depth`` is not installed.
-        SystemExit: something was found less well than :data:`TOLERANCE`.
+        SystemExit: an error was larger than :data:`TOLERANCE`.
     """
     say = Steps(options)
     table = laid(seed, layers) if table is None else table
@@ -145,13 +145,13 @@ class Seen(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
-    reached: list[BlockPose]  # blocks of these that the gripper can grip
-    block: BlockPose  # the one that it takes
+    reached: list[BlockPose]  # those within reach of the gripper
+    block: BlockPose  # block to take
     top: BlockPose  # block on top of the tower
 
 
 def _look(table: TowerTable, colours: ColourRange) -> Seen:
-    """Look at the table, at the nearest block within reach, and at the tower.
+    """Measure the blocks on the table, the nearest block within reach, and the tower.
 
     Raises:
         FrameFormatError: there is no such block, or no tower.
@@ -172,10 +172,10 @@ def _look(table: TowerTable, colours: ColourRange) -> Seen:
 
 
 def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Compared]:
-    """Put the block on top; return what was found beside the truth.
+    """Put the block on top; return the findings beside the truth.
 
     Raises:
-        FrameFormatError: the gripper took nothing.
+        FrameFormatError: the gripper missed the block.
     """
     block, top = seen.block, seen.top
     true_top = table.tower()[-1]
@@ -191,8 +191,8 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Comp
         seen=len(seen.blocks),
         reached=len(seen.reached),
     )
-    told = [row._asdict() | {"found": row.found._asdict()} for row in rows]
-    say.detail(_text(rows), compared=told)
+    values = [row._asdict() | {"found": row.found._asdict()} for row in rows]
+    say.detail(_text(rows), compared=values)
     if table.held is None:
         raise FrameFormatError(
             f"{ARM}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on nothing",
@@ -207,7 +207,7 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Comp
     return rows
 
 
-# ---------------------------------------------------------------------- what the camera tells
+# ---------------------------------------------------------------------- findings
 
 
 def loose_blocks(
@@ -216,12 +216,12 @@ def loose_blocks(
     """Return the blocks of a colour that lie on the table, as seen from far above.
 
     Raises:
-        FrameFormatError: there is no block of the colour; it says what there is instead.
+        FrameFormatError: there is no block of the colour; the error describes the largest region.
     """
     lying: list[BlockPose] = []
     for one in _regions(sight, colours):
         height = sight.camera[2] - region_depth(depth, one.mask).median
-        if abs(height - BLOCK[2]) < EDGE:  # and not on the tower
+        if abs(height - BLOCK[2]) < EDGE:  # it is not on the tower
             lying.append(_pose(sight, one, height))
     if not lying:
         raise _nothing(sight, colours)
@@ -229,7 +229,7 @@ def loose_blocks(
 
 
 def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> BlockPose:
-    """Go above a block and return its pose; from there its sides are hardly seen.
+    """Go above a block and return its pose; from there its sides are hardly visible.
 
     Raises:
         FrameFormatError: the block is not there.
@@ -250,7 +250,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
 
 
 def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the place of whatever is higher than one block, x and y in metres.
+    """Return the place of a region higher than one block, x and y in metres.
 
     Raises:
         FrameFormatError: no place is higher.
@@ -271,15 +271,15 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     depth = smooth([average(one) for one in sight.depth][-1])
     middle = (sight.rgb.shape[1] / 2, sight.rgb.shape[0] / 2)
     high = min(_high(sight, depth), key=lambda one: math.dist(one.centre, middle))
-    level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of what is seen
+    level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of the region
     upper = high.mask & (np.abs(depth - level) < EDGE)
     top = find_regions(upper)[0]
     if not SIDE_RATIO[0] <= top.ratio <= SIDE_RATIO[1] or top.fullness < MIN_FULLNESS:
         raise FrameFormatError(
             f"{ARM}: expected a block on top of the tower, got {_shape(top)}", source=ARM
         )
-    told = region_depth(depth, _inner(top.mask), shared=smooth.shared)
-    return _pose(sight, top, sight.camera[2] - told.median)._replace(sigma=told.sigma)
+    measured = region_depth(depth, _inner(top.mask), shared=smooth.shared)
+    return _pose(sight, top, sight.camera[2] - measured.median)._replace(sigma=measured.sigma)
 
 
 def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
@@ -318,7 +318,7 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     inner = mask.copy()
     for axis in (0, 1):
         for step in (-RIM, RIM):
-            inner &= np.roll(mask, step, axis)  # a region that is whole touches no rim
+            inner &= np.roll(mask, step, axis)  # a whole region does not touch the rim
     return inner
 
 
@@ -329,7 +329,7 @@ def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
 
 
 def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
-    """Return an error that says what there is of a colour, where no block is."""
+    """Return an error that describes the regions of a colour, none of which is a block."""
     least, most = _area(sight)
     found = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
     got = f"{len(found)} regions of it, the largest {_shape(found[0])}" if found else "none of it"
@@ -344,7 +344,7 @@ def _shape(region: ColourRegion) -> str:
     return f"{region.area} pixels with sides of {region.ratio:.1f}:1"
 
 
-# ---------------------------------------------------------------------- beside the truth
+# ---------------------------------------------------------------------- comparison
 
 
 def _compared(what: str, found: BlockPose, true: WoodenBlock) -> Compared:
@@ -360,7 +360,7 @@ def _text(rows: list[Compared]) -> str:
     for what, found, beside, turned, higher in rows:
         places = (1e3 * found.x, 1e3 * found.y, math.degrees(found.angle), 1e3 * found.height)
         errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * found.sigma)
-        known = errors if found.sigma else errors[:2]  # a block's height is what blocks have
+        known = errors if found.sigma else errors[:2]  # this height was not measured
         shown = [f"{value:8.2f}" for value in (*places, *known)]
         cells.append((what, *shown, *[""] * (8 - len(shown))))
     return table_text((*head, *off), cells)

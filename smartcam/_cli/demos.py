@@ -1,4 +1,4 @@
-"""``smartcam demo``: which of the demonstrations is meant."""
+"""``smartcam demo``: choose the demonstration."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class PalletSize(_ParamType):
 @click.option(
     "--plain",
     is_flag=True,
-    help="With --pick: have a plain camera, in whose drawn pictures a taught part is located, and "
-    'put the parts onto a pallet. Needs the extra "inspection".',
+    help="With --pick: locate a taught part in the drawn pictures of a plain camera, and put the "
+    'parts onto a pallet. Needs the extra "inspection".',
 )
 @click.option(
     "--pallet",
@@ -56,26 +56,26 @@ class PalletSize(_ParamType):
     "--fleet",
     "shared",
     is_flag=True,
-    help="Have two agents share ten cameras, and three programs one of them, instead. Needs the "
+    help="Share ten cameras by two agents, and one of them by three programs, instead. Needs the "
     'extra "fleet".',
 )
 @click.option(
     "--tower",
     is_flag=True,
-    help="Have a simulated robot with a camera at its hand build a tower of the black blocks that "
-    'it finds, instead. Needs the extra "depth".',
+    help="Build a tower of black blocks by a simulated robot with a camera at its hand, "
+    'instead. Needs the extra "depth".',
 )
 @click.option(
     "--inspect",
     "inspected",
     is_flag=True,
-    help="Have a software camera read, check and compare drawn parts, instead, and draw what it "
-    'saw. Needs the extra "inspection".',
+    help="Read, check and compare drawn parts by a software camera, instead, and draw its "
+    'findings. Needs the extra "inspection".',
 )
 @click.option(
     "--folder",
     type=click.Path(file_okay=False),
-    help="With --inspect and --plain: where pictures, cell file and models go.  [default: "
+    help="With --inspect and --plain: folder for pictures, cell file and models.  [default: "
     "demo-inspect, demo-pick]",
 )
 @click.option(
@@ -83,14 +83,14 @@ class PalletSize(_ParamType):
     type=click.Path(dir_okay=False),
     default="pick.svg",
     show_default=True,
-    help="With --pick alone: where the picture of the calibration goes (SVG).",
+    help="With --pick alone: file for the picture of the calibration (SVG).",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=1,
     show_default=True,
-    help="With --pick, --tower and --inspect: of all noise, and of where things are.",
+    help="With --pick, --tower and --inspect: seed of all noise and places.",
 )
 @runs(*OUTPUT)
 async def demo(
@@ -105,7 +105,7 @@ async def demo(
     seed: int,
     options: Options,
 ) -> None:
-    """Watch smartcam do its main job against an emulated camera over real TCP."""
+    """Show smartcam's main job with an emulated camera over real TCP."""
     asked = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
     given = [name for name, wanted in asked.items() if wanted]
     if len(given) > 1:

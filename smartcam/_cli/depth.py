@@ -28,7 +28,7 @@ UP = ("x", "y", "z", "-x", "-y", "-z")
 def _ranges(
     _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, float, float]]:
-    """Return axis, low and high of ``AXIS:LOW:HIGH``; a limit that is left out is no limit."""
+    """Return axis, low and high of ``AXIS:LOW:HIGH``; an empty limit is no limit."""
     found = []
     for value in values:
         axis, _, limits = value.partition(":")
@@ -49,7 +49,7 @@ def _ranges(
     'the extra "depth".',
 )
 def depth() -> None:
-    """Have the commands of depth."""
+    """Register the commands of depth."""
 
 
 # ---------------------------------------------------------------------- show
@@ -58,14 +58,14 @@ def depth() -> None:
 _UNIT = click.option(
     "--unit",
     type=click.Choice(["m", "cm", "mm", "inch"]),
-    help="Of the file's lengths; files that smartcam wrote say theirs.",
+    help="Unit of the file's lengths; files that smartcam wrote contain it.",
 )
 
 
 @depth.command(
     help="Serve a page that shows a cloud until Ctrl-C: turn it with mouse or finger, zoom with "
-    "wheel or two fingers. The page's address goes to stdout. Above a million points it is thinned "
-    'for the page, which says so. Needs the extra "web".'
+    "wheel or two fingers. The page's address goes to stdout. A cloud above a million points "
+    'is thinned for the page, with a note. Needs the extra "web".'
 )
 @click.argument("file")
 @click.option(
@@ -102,7 +102,7 @@ async def show(
 
 
 @depth.command(
-    help="Write a cloud as another file, .ply or .pcd. What is filtered out goes in this order: "
+    help="Write a cloud as another file, .ply or .pcd. Filters are applied in this order: "
     "ranges, outliers, then one point for each voxel."
 )
 @click.argument("source")
@@ -126,11 +126,11 @@ async def show(
     "--voxel",
     type=click.FloatRange(min=0, min_open=True),
     metavar="METRES",
-    help="One point for each cube of this size.",
+    help="Keep one point for each cube of this size, metres.",
 )
 @_UNIT
 @click.option("--text", is_flag=True, help="Numbers as text in place of bytes.")
-@click.option("--force", is_flag=True, help="Take the place of a file that is there.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
 @runs(*OUTPUT)
 async def convert(
     source: str,

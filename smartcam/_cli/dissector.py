@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@option("--output", help="Write it to this file instead.")
+@option("--output", help="Write the dissector to this file instead.")
 @option("--debug", help="Show tracebacks, on stderr.")
 @runs()
 async def dissector(output: str | None, options: Options) -> None:

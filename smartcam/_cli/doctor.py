@@ -1,4 +1,4 @@
-"""``smartcam doctor``: what is wrong with a camera, in plain words and with the cure."""
+"""``smartcam doctor``: find out what is wrong with a camera, and name the cure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_BROKEN = 4
 
 
 @click.command(
-    help="Say what is wrong, in plain words and with the cure: name, session, status, application, "
+    help="Report each problem with its cure, in plain words: name, session, status, application, "
     "round trip, run state, results, clock. Changes nothing on the camera and triggers nothing, "
     f"unless --trigger is given. Exit code: that of the worst finding. {CONNECTS}"
 )
@@ -37,10 +37,10 @@ MAX_BROKEN = 4
 @option("--interpret-as", help="Compare results with this layout or interpreter.")
 @option("--y-down")
 @option("--count", type=click.IntRange(1, 10_000), help="How many triggers; 10 by default.")
-@option("--seconds", help="How long to watch what comes by itself; 3 by default.")
+@option("--seconds", help="Seconds to watch for unasked results; 3 by default.")
 @runs(*CAMERA)
 async def doctor(url: str, trigger: bool, options: Options) -> None:
-    """Print what an examination finds, as it finds it; end with the exit code of the worst."""
+    """Print each finding of an examination at once; end with the exit code of the worst."""
     from smartcam.doctor import examine
     from smartcam.doctor._inside import summary
 
@@ -81,7 +81,7 @@ def _text(finding: Finding) -> str:
 
 
 def _broken(finding: Finding) -> list[str]:
-    """Return the broken bytes that came, which tell an owner more than words."""
+    """Return the broken bytes that came, which help the owner of the camera more than words."""
     frames = [entry for trial in finding.details.get("frames", ()) for entry in trial]
     broken = {entry.hex: frame_text(entry) for entry in reversed(frames) if entry.direction == "!"}
     return list(broken.values())[:MAX_BROKEN]

@@ -1,4 +1,4 @@
-"""``smartcam find``: which addresses of a network listen where cameras do."""
+"""``smartcam find``: find addresses of a network that listen on the ports of cameras."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 DEFAULT_ADDRESSES, MAX_ADDRESSES = 65_536, 1 << 24
 MAX_OPEN_CONNECTIONS, MAX_OPENINGS_PER_SECOND, MAX_SECONDS = 1_000, 10_000.0, 60.0
-"""Bounds of a search, as the library has them: they stand here, too, for ``--help``."""
+"""Bounds of a search, equal to the library's; they are repeated for ``--help``."""
 
 PERIOD = 1.0
-"""Seconds between two looks of the line that tells how far the search is."""
+"""Seconds between two updates of the progress line."""
 
 DISTURBED = (
     "No document says that a camera of {} keeps its client when another one connects and says "
@@ -41,13 +41,13 @@ _EVIDENCE = {
     "said": "may be {protocols}: {greeting}",
     "ended": "hangs up at once: {protocols} with a client, or something else",
 }
-"""Texts on what was heard, by kind."""
+"""Texts on the received bytes, by kind of evidence."""
 
 
 @click.command(
-    help="Find what listens in networks where cameras do: opens the protocols' ports, sends "
-    "nothing, and tells what comes by itself. NETWORK: 192.168.0.0/24, 192.168.0.10-20, an "
-    "address, a host's name; several may be given. A camera that speaks UDP cannot be found so."
+    help="Find cameras in networks: opens the protocols' ports, sends nothing, and shows "
+    "greetings. NETWORK: 192.168.0.0/24, 192.168.0.10-20, an address, a host's name; several "
+    "may be given. Cameras that speak UDP are not found."
 )
 @click.argument("networks", metavar="NETWORK...", nargs=-1, required=True)
 @click.option(
@@ -55,47 +55,47 @@ _EVIDENCE = {
     "ports",
     type=click.IntRange(1, 0xFFFF),
     multiple=True,
-    help="Open this one, too, for each protocol; repeatable.",
+    help="Also open this port, for each protocol; repeatable.",
 )
 @click.option(
     "--protocol",
     "protocols",
     multiple=True,
     metavar="NAME",
-    help='Look for this one only, see "smartcam protocols"; repeatable.',
+    help='Only look for this protocol, see "smartcam protocols"; repeatable.',
 )
 @click.option(
     "--fleet",
     "fleet_file",
     type=click.Path(dir_okay=False),
     metavar="FILE",
-    help="A fleet file: its cameras are named, and not touched.",
+    help="A fleet file, whose cameras are listed by name, and not touched.",
 )
-@click.option("--leave", multiple=True, metavar="NETWORK", help="Do not touch these; repeatable.")
+@click.option("--leave", multiple=True, metavar="NETWORK", help="Leave these alone; repeatable.")
 @click.option(
     "--may-disturb",
     is_flag=True,
-    help="Allow --ask to take cameras that serve one client from it.",
+    help="Allow --ask to take cameras from their clients.",
 )
 @click.option(
     "--ask",
     is_flag=True,
-    help='Also speak to what was found, as "smartcam probe" does. That takes a camera from its '
-    "client: it wants --may-disturb, or --protocol with names of others.",
+    help='Also ask the cameras found, as "smartcam probe" does. That takes a camera from its '
+    "client, so it needs --may-disturb, or --protocol for cameras that serve several.",
 )
 @click.option(
     "--rate",
     type=click.FloatRange(0, MAX_OPENINGS_PER_SECOND, min_open=True),
     default=100.0,
     show_default=True,
-    help="Openings a second at most.",
+    help="Largest number of openings per second.",
 )
 @click.option(
     "--at-once",
     type=click.IntRange(1, MAX_OPEN_CONNECTIONS),
     default=64,
     show_default=True,
-    help="Connections at a time at most.",
+    help="Largest number of connections at a time.",
 )
 @click.option(
     "--timeout",
@@ -103,7 +103,7 @@ _EVIDENCE = {
     type=click.FloatRange(0, MAX_SECONDS, min_open=True),
     default=1.0,
     show_default=True,
-    help="Seconds until a port is open, and as many again to hear what comes by itself.",
+    help="Seconds until a port is open, and as many again to read unasked bytes.",
 )
 @click.option(
     "--max-addresses",
@@ -112,7 +112,7 @@ _EVIDENCE = {
     show_default=True,
     help="Refuse more.",
 )
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print cameras as a fleet file has them.")
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print cameras as entries of a fleet file.")
 @runs(*OUTPUT)
 async def find(
     networks: tuple[str, ...],
@@ -125,9 +125,9 @@ async def find(
     as_yaml: bool,
     **given: Any,
 ) -> None:
-    """Search and show what was found, after Ctrl-C what there is so far.
+    """Search and show the findings; after Ctrl-C, those so far.
 
-    Raises ConfigurationError: something given cannot work, or consent is missing.
+    Raises ConfigurationError: an argument is wrong, or consent is missing.
     """
     from smartcam.doctor._inside import CameraSearch
 
@@ -159,7 +159,7 @@ async def find(
 
 
 def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
-    """Return the hosts of a fleet file's cameras, with names and URLs of these; and all names."""
+    """Return the hosts of a fleet file's cameras, with their names and URLs; and all names."""
     with from_part("fleet", "a fleet file needs"):
         from smartcam.fleet import load_fleet
     from smartcam.settings import parse_address
@@ -179,7 +179,7 @@ def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
 def _show(
     found: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
 ) -> None:
-    """Print what was found, and what was left alone, as a table or as JSON."""
+    """Print the findings, and the addresses left alone, as a table or as JSON."""
     if options.as_json:
         for one in found:
             value = {name: getattr(one, name) for name in one.__dataclass_fields__}
@@ -204,7 +204,7 @@ def _ms(found: FoundPort) -> str:
 
 
 def evidence(found: FoundPort) -> str:
-    """Return a line that says who answers at an open port, or may do so."""
+    """Return a line about the device that answers, or may answer, at an open port."""
     if found.answer is not None:
         return f"a camera answers: {found.answer.url}"
     if found.evidence == "other":
@@ -216,10 +216,10 @@ def evidence(found: FoundPort) -> str:
 
 
 def summary(search: CameraSearch) -> str:
-    """Return a text of the outcome of the search, for people."""
+    """Return the outcome of the search as text."""
     outcomes = ("open", "refused", "no answer", "unreachable", "failed")
-    told = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
-    text = f"{search.opened} of {search.total} ports tried: {', '.join(told) or 'none'}"
+    outcome_counts = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
+    text = f"{search.opened} of {search.total} ports tried: {', '.join(outcome_counts) or 'none'}"
     if search.why:
         text += f" (failed: {search.why})"
     text += ". Cameras that are set to UDP do not show."
@@ -229,9 +229,9 @@ def summary(search: CameraSearch) -> str:
 
 
 def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
-    """Return lines for a fleet file; what is no camera, or did not answer, is a comment.
+    """Return lines for a fleet file; devices that are no camera, or did not answer, are comments.
 
-    ``taken``: names that the fleet has already.
+    ``taken``: names that the fleet uses already.
     """
     names, lines = set(taken), ["cameras:"]
     live = False
@@ -259,11 +259,11 @@ def _fresh(found: FoundPort, taken: set[str]) -> str:
 
 @contextlib.asynccontextmanager
 async def telling(search: CameraSearch) -> AsyncIterator[None]:
-    """Have a line on a terminal's stderr that tells how far the search is."""
+    """Show a progress line on a terminal's stderr."""
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield
         return
-    task = asyncio.create_task(_tell(search), name="smartcam.find.telling")
+    task = asyncio.create_task(_show_progress(search), name="smartcam.find.telling")
     try:
         yield
     finally:
@@ -272,7 +272,7 @@ async def telling(search: CameraSearch) -> AsyncIterator[None]:
         click.echo("\r\x1b[K", err=True, nl=False)
 
 
-async def _tell(search: CameraSearch) -> None:
+async def _show_progress(search: CameraSearch) -> None:
     while True:
         await asyncio.sleep(PERIOD)
         text = f"{search.opened} of {search.total} ports, {search.counts['open']} open"

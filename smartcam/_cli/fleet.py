@@ -43,9 +43,9 @@ _READING = ("--interpret-as", "--y-down", "--calibration", "--units")
 @click.group(
     cls=ListedGroup,
     help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
-    "file: then agent and cameras are in this process, for this command only. PATTERN means "
-    "cameras by their names: * is one part of a name, ** any number of them; default all. Needs "
-    'the extra "fleet", but for a file.',
+    "file, whose agent and cameras then run in this process, for this command only. PATTERN "
+    "selects cameras by their names: * is one part of a name, ** any number of them; default "
+    'all. Needs the extra "fleet", but for a file.',
 )
 def fleet() -> None:
     """Register the commands of a fleet."""
@@ -168,12 +168,12 @@ def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result:
 
 
 @fleet.command(
-    help="Have the agents of a fleet read their fleet files again. Cameras that did not change go "
-    "on; a file that is wrong leaves all as it was. Prints what has changed, one line per agent. "
-    "Exit code: 0 if all did it, else that of the first error."
+    help="Have the agents of a fleet read their fleet files again. Unchanged cameras go on; a "
+    "wrong file changes nothing. Prints the changes, one line per agent. Exit code: 0 if all "
+    "agents succeed, else that of the first error."
 )
 @click.argument("url")
-@click.option("--agent", metavar="NAME", help="This one only.")
+@click.option("--agent", metavar="NAME", help="Only this agent.")
 @runs("--timeout", *OUTPUT)
 async def reload(url: str, agent: str | None, options: Options) -> None:
     async with _opened(url, options) as opened:
@@ -196,8 +196,8 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
 
 @fleet.command(
     help="Show the accounts of outlets: results = delivered + spooled + dropped. PLACE is a "
-    "fleet's URL, whose agents are asked, or a fleet file: then its spools are read, whether an "
-    "agent runs or not."
+    "fleet's URL, whose agents are asked, or a fleet file, whose spools are read, with or "
+    "without a running agent."
 )
 @click.argument("place", metavar="URL|FLEET.yaml")
 @runs("--timeout", *OUTPUT)
@@ -237,8 +237,8 @@ async def _ask_outlets(url: str, options: Options) -> None:
     if options.as_json:
         for one in found:
             account = one._asdict()
-            said = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**said, "account": account}, "")
+            shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**shown, "account": account}, "")
         return
     rows = [
         (one.agent, one.outlet, *_account_row(one._asdict()), one.trouble or "well")
@@ -270,8 +270,8 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 
 @fleet.command(
     help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
-    "and a page for each. The page's address goes to stdout. A fleet of which no agent is there is "
-    'awaited. Needs the extra "web", too.'
+    "and a page for each. The page's address goes to stdout. A fleet without a running agent "
+    'is awaited. Needs the extra "web", too.'
 )
 @click.argument("url")
 @click.option(
@@ -298,15 +298,15 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
 @contextlib.asynccontextmanager
 async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
     """Open the fleet, once it has an agent."""
-    told = False
+    warned = False
     for delay in Backoff(maximum=2.0).delays():
         opened = _opened(url, options)
         try:
             await opened.open()
         except ConnectFailedError as exc:
-            if not told:
+            if not warned:
                 click.echo(f"{exc}; it is awaited", err=True)
-            told = True
+            warned = True
         else:
             try:
                 yield opened

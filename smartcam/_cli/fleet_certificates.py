@@ -1,4 +1,4 @@
-"""``smartcam fleet certificates``: who may what in a fleet."""
+"""``smartcam fleet certificates``: make certificates with the roles of a fleet."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
 @click.command(
     cls=JsonErrors,
     help="Make certificates for a fleet over TLS, each with a role: agents share cameras, viewers "
-    "look, operators command, too, and a router of Zenoh's passes on. DIR gets an authority the "
-    "first time, whose key stays there, and a folder for each name, with a text how to use it. "
-    "Run it again to add names, and to renew what ends within 30 days; all else stays as it is. "
-    'Needs the extra "fleet".',
+    "read, operators also command, and a router of Zenoh's forwards. DIR gets an authority "
+    "the first time, with its key, and a folder for each name, with instructions for its "
+    "use. Run it again to add names, and to renew certificates that end within 30 days; the "
+    'rest stays. Needs the extra "fleet".',
 )
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
 @_names("--agent", "agents", "An agent, by its name in fleet.yaml.")
-@_names("--viewer", "viewers", "A program that may look.")
+@_names("--viewer", "viewers", "A program that may read.")
 @_names("--operator", "operators", "A program that may command, too.")
 @_names("--router", "routers", "A router of Zenoh's, zenohd.")
 @click.option(
@@ -43,7 +43,7 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
     "hosts",
     multiple=True,
     metavar="HOST",
-    help="Name or address by which programs reach the agents and routers named here; default: this "
+    help="Name or address by which programs reach these agents and routers; default: this "
     "computer's name. localhost is always one.",
 )
 @click.option(
@@ -51,7 +51,7 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
     type=click.FloatRange(min=0, min_open=True, max=36_500),
     default=365.0,
     show_default=True,
-    help="How long new certificates are good for.",
+    help="Days that new certificates are valid.",
 )
 @runs(*OUTPUT)
 async def certificates(

@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from smartcam.web import ColourSite
 
 LINGER: Final = 3.0
-"""Seconds for which the device goes on streaming after the last request of a page."""
+"""Seconds for which the device continues streaming after the last request of a page."""
 
 
 @click.command(
     help="Serve a page that picks a range of colours in a camera's live picture, until Ctrl-C: the "
     "picture beside the mask, sliders for hue, saturation and value, a click that takes a colour "
     "from the picture, and the range to copy. The page's address goes to stdout. The device "
-    'streams while somebody looks. Needs the extras "web" and "depth".'
+    'streams while the page is open. Needs the extras "web" and "depth".'
 )
 @click.argument("url")
 @click.option(
     "--range",
     "begin",
     metavar="JSON",
-    help="What the page begins with, as it is copied there, such as '{\"value\": [0, 60]}'.",
+    help="Range at the beginning, as the page copies it, such as '{\"value\": [0, 60]}'.",
 )
 @page_options("", always=True)
 @option("--seconds")
-@option("--timeout", help="Bound of the wait for a frame.  [default: 5]")
+@option("--timeout", help="Longest wait for a frame.  [default: 5]")
 @runs(*OUTPUT)
 async def colours(url: str, begin: str | None, web: PageOptions, options: Options) -> None:
     """Serve the page."""

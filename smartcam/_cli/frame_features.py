@@ -1,4 +1,4 @@
-"""``smartcam frames features`` and ``frames force-address``: a device's features; its address."""
+"""``smartcam frames features`` and ``frames force-address``: features and address of a device."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     name="features",
     help="Read and set the features of a source's device: exposure time, gain, trigger and so on, "
     "by their names in GenICam's SFNC, of a GigE camera, a V4L2 device or a fleet's camera. "
-    "Without a name, all are listed with value, range and unit. NAME shows one, NAME=VALUE sets "
-    "it. They are done in their order; then come --load, --execute and --save.",
+    "Without a name, all are listed with value, range and unit. NAME shows one, NAME=VALUE "
+    "sets it, in the given order; then come --load, --execute and --save.",
 )
 @click.argument("url")
 @click.argument("features", nargs=-1, metavar="[NAME[=VALUE]]...")
 @click.option("--load", metavar="SET", help="Have the device load a user set, such as Default.")
 @click.option("--execute", multiple=True, metavar="COMMAND", help="Execute a command.")
 @click.option("--save", metavar="SET", help="Have the device keep its features in a user set.")
-@option("--timeout", help="Bound of each of these.  [default: 10]")
+@option("--timeout", help="Longest time for each of these.  [default: 10]")
 @runs(*OUTPUT)
 async def features_command(
     url: str,
@@ -62,9 +62,9 @@ async def features_command(
 @click.command(
     name="force-address",
     help="Give a GigE camera an IP address until it is switched off. MAC is its hardware address, "
-    "ADDRESS is like 192.168.0.20/24. It works where the camera's own address is of no network "
-    "here; `frames list` finds such a camera. Nobody may have the camera open. It asks before, "
-    "unless there is --yes.",
+    "ADDRESS is like 192.168.0.20/24. It also works if the camera's own address is outside "
+    "of all networks here; `frames list` finds such a camera. No program may have the camera "
+    "open. It asks first, unless there is --yes.",
 )
 @click.argument("mac")
 @click.argument("address")
@@ -79,7 +79,7 @@ async def force_address_command(
     checked_mac(mac)
     if not yes:
         if not sys.stdin.isatty():
-            raise click.UsageError("it changes the camera's address: say --yes")
+            raise click.UsageError("it changes the camera's address: confirm with --yes")
         click.confirm(f"give the camera {mac} the address {address}?", abort=True, err=True)
     found = await force_address(mac, address, gateway=gateway)
     value: dict[str, Any] = {"url": found.url, "name": found.name, "remark": found.remark}

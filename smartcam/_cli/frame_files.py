@@ -1,4 +1,4 @@
-"""Encode a frame as a file by its suffix, without a loss that the user did not ask for."""
+"""Encode a frame as a file by its suffix; refuse a loss that the user did not ask for."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Encoding:
         """Return a file's bytes; this takes milliseconds, so call it in a thread.
 
         Raises:
-            ConfigurationError: bits would be lost, which the user did not ask for.
+            ConfigurationError: bits would be lost without the user's consent.
             FrameFormatError: the frame's bytes are wrong.
             MissingExtraError: a codec is not installed.
         """

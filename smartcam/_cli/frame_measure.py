@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameReader, FrameSource
 
 STAMP_PERIOD: Final = 0.1
-"""Seconds between two looks for a stamp: the processor's time is to be the source's."""
+"""Seconds between two searches for a stamp, so that they take little of the processor's time."""
 
 STAMP_ROWS: Final = 16
-"""Rows of a picture that a stamp has."""
+"""Number of rows of a picture that a stamp covers."""
 
 STRANGE: Final = 60.0
-"""Seconds of latency that only another machine's clock makes; below 0 as well."""
+"""Latency in seconds above which the stamp must be another machine's clock; also below 0."""
 
 
 async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
-    """Read a source for some time, from its first frame on, and return what came out.
+    """Read a source for some time, from its first frame on, and return the figures.
 
     Raises:
         FrameSourceError: the source gave no frame, or ended with an error.
 
-    Cancellation: safe; it reads no longer.
+    Cancellation: safe; reading stops.
     """
     async with source.reader() as reader:
         try:
@@ -44,7 +44,7 @@ async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
             async with asyncio.timeout(seconds):
                 await taken.read(reader)
         except TimeoutError as exc:
-            if isinstance(exc, FrameSourceError):  # a FrameTimeoutError is both
+            if isinstance(exc, FrameSourceError):  # a FrameTimeoutError is a timeout, too
                 raise
         finally:
             elapsed = time.monotonic() - begun
@@ -65,21 +65,21 @@ def _picture(frame: Frame) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Stamps:
-    """Latencies by the stamp in the picture, read beside the reading."""
+    """Latencies by the stamps in pictures, read in a thread of their own."""
 
     latencies: list[float] = field(default_factory=list[float])
     _last: float = -math.inf
     _task: asyncio.Task[None] | None = None
 
     def offer(self, frame: Frame, now: float) -> None:
-        """Look for the stamp of a frame that came at ``now``, now and then."""
+        """Look for the stamp of some frames; ``now``: arrival of this frame."""
         if now - self._last < STAMP_PERIOD or not (self._task is None or self._task.done()):
             return
         self._last = now
         self._task = asyncio.create_task(self._look(frame, now))
 
     async def settle(self) -> None:
-        """Wait for the last look."""
+        """Wait for the last search."""
         if self._task is not None:
             await asyncio.wait([self._task])
 
@@ -94,13 +94,13 @@ def _stamp_of(frame: Frame) -> float | None:
 
     try:
         found = read_stamp(frame.grey()[:STAMP_ROWS])
-    except FrameSourceError:  # of no brightness, or wrong bytes: no stamp
+    except FrameSourceError:  # a frame without brightness, or wrong bytes: no stamp
         return None
     return None if found is None else found[1] / 1e9
 
 
 class _Taken:
-    """The frames taken from a reader, the first one among them."""
+    """The frames from a reader, including the first."""
 
     def __init__(self, first: Frame) -> None:
         self.stamps = _Stamps()
@@ -131,7 +131,7 @@ class _Taken:
         self.stamps.offer(frame, now)
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures; None if too few frames came to tell."""
+        """Return the figures; None for those that need more frames."""
         span = self._last.captured - self._first.captured
         return {
             "frames": self._delivered,
@@ -164,7 +164,7 @@ def _deviation(values: Sequence[float]) -> float | None:
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:
-    """Return median, 99th of a hundred, and the worst; milliseconds."""
+    """Return median, 99th percentile and maximum; milliseconds."""
     if not seconds:
         return None
     ordered = sorted(seconds)
@@ -177,9 +177,9 @@ def measured_text(value: dict[str, Any]) -> str:
     head = f"{value['source']}: {value['format']} {value['width']}x{value['height']}"
     rows = [
         f"{head}, {value['frames']} frames in {value['seconds']:.1f} s",
-        f"  rate      {_told(value['rate'], 'a second')}",
-        f"  interval  {_told(value['interval_ms'], 'ms')}, jitter "
-        f"{_told(value['jitter_ms'], 'ms rms')}, longest {_told(value['longest_ms'], 'ms')}",
+        f"  rate      {_figure(value['rate'], 'a second')}",
+        f"  interval  {_figure(value['interval_ms'], 'ms')}, jitter "
+        f"{_figure(value['jitter_ms'], 'ms rms')}, longest {_figure(value['longest_ms'], 'ms')}",
         f"  age       {_spread_text(value['age_ms'])}, since the {value['moment']}",
     ]
     if value["latency_ms"] is not None:
@@ -191,12 +191,12 @@ def measured_text(value: dict[str, Any]) -> str:
         rows.append("  latency   not known: the pictures have no stamp of this machine's clock")
     rows += [
         f"  lost      {value['lost']}, skipped {value['skipped']}",
-        f"  CPU       {_told(value['cpu_percent'], '% of a core')}",
+        f"  CPU       {_figure(value['cpu_percent'], '% of a core')}",
     ]
     return "\n".join(rows)
 
 
-def _told(number: float | None, unit: str) -> str:
+def _figure(number: float | None, unit: str) -> str:
     return "not known" if number is None else f"{number:.4g} {unit}"
 
 
@@ -204,6 +204,6 @@ def _spread_text(spread: dict[str, float | None] | None) -> str:
     if spread is None:
         return "not known"
     return (
-        f"median {_told(spread['median'], 'ms')}, p99 {_told(spread['p99'], 'ms')}, "
-        f"worst {_told(spread['worst'], 'ms')}"
+        f"median {_figure(spread['median'], 'ms')}, p99 {_figure(spread['p99'], 'ms')}, "
+        f"worst {_figure(spread['worst'], 'ms')}"
     )

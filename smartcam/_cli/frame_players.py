@@ -1,4 +1,4 @@
-"""Sources for players and recorders, beside the page: by RTSP, and by RTP."""
+"""Streams for players and recorders, beside the page: by RTSP, and by RTP."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource, RtpSender, RtspServer
 
 RTSP_USER = "smartcam"
-"""Name of the RTSP user where a password is set."""
+"""Name of the RTSP user, if a password is set."""
 
 MAX_NAME_LETTERS = 60
 """Largest number of letters of a source's name in a URL, before its number."""
 
 LOOK_INTERVAL = 0.1
-"""Seconds between two looks for a source that is not open yet."""
+"""Seconds between two checks whether a source is open."""
 
 DESCRIPTION_TIMEOUT = 5.0
-"""Seconds that the first frame may take: with it the description is complete."""
+"""Seconds to wait for the first frame, which completes the description."""
 
 
 class Players(NamedTuple):
@@ -37,7 +37,7 @@ class Players(NamedTuple):
     Attributes:
         rtsp: address to listen on for RTSP, None for none.
         rtp: address to send one source to, None for none.
-        sdp: file to write the description of that to, None for stdout.
+        sdp: file for the description of the RTP stream, None for stdout.
     """
 
     rtsp: tuple[str, int] | None = None
@@ -80,8 +80,8 @@ def rtsp_server(
 ) -> tuple[RtspServer, str | None]:
     """Return a server of sources, and its password, None for none.
 
-    ``token``: of the page, which is the password, too. Where there is none, and others can reach
-    the server, one is made.
+    ``token``: the page's token, which is the password, too. If there is none, and other machines
+    can reach the server, one is made.
     """
     from smartcam._accepting import is_loopback
     from smartcam.frames import RtspServer
@@ -97,7 +97,7 @@ def rtsp_server(
 def rtsp_urls(
     server: RtspServer, sources: Sequence[FrameSource], password: str | None
 ) -> dict[str, str]:
-    """Return the URLs by name, as a player takes them."""
+    """Return the URLs for players, by name."""
     who = "" if password is None else f"{RTSP_USER}:{password}@"
     return {name: server.url(name).replace("//", f"//{who}", 1) for name in names_of(sources)}
 
@@ -106,7 +106,7 @@ def rtsp_urls(
 
 
 async def send_rtp(source: FrameSource, players: Players, options: Options) -> None:
-    """Send a source by RTP whenever it is there, until cancelled; print what players need.
+    """Send a source by RTP whenever it is open, until cancelled; print the description for players.
 
     Raises ConfigurationError: the address is not valid, or the file cannot be written.
     """
@@ -114,14 +114,14 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
     host, port = players.rtp or ("", 0)
     to = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    told, noted, delays = "", "", Backoff().delays()
+    described, noted, delays = "", "", Backoff().delays()
     while True:
         try:
             async with RtpSender(source, to) as sender:
                 await _first_frame(sender)
-                if sender.sdp != told and (players.sdp is not None or not told):
-                    await _describe(to, sender.sdp, players.sdp, options, again=bool(told))
-                    told = sender.sdp
+                if sender.sdp != described and (players.sdp is not None or not described):
+                    await _describe(to, sender.sdp, players.sdp, options, again=bool(described))
+                    described = sender.sdp
                 noted, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
@@ -135,7 +135,7 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
 
 async def _first_frame(sender: RtpSender) -> None:
-    """Wait for the first frame, or a while in vain."""
+    """Wait for the first frame, but not for long."""
     for _ in range(round(DESCRIPTION_TIMEOUT / LOOK_INTERVAL)):
         if sender.statistics().frames:
             return

@@ -1,4 +1,4 @@
-"""Sources of frames, as commands open them."""
+"""Open sources of frames by the options of commands."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ if TYPE_CHECKING:
     from smartcam._cli.options import Options
     from smartcam.frames import FrameSource
 
-TIMEOUT = (
-    "Bound of the wait for a frame, and of a device that streams and gives no frame.  [default: 5]"
-)
+TIMEOUT = "Longest wait for a frame; a device that gives none for so long has failed.  [default: 5]"
 
 
 def is_source(text: str) -> bool:
@@ -19,7 +17,7 @@ def is_source(text: str) -> bool:
 
 
 def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
-    """Return an unopened source; one without a frame for ``--timeout`` counts as stuck.
+    """Return an unopened source; without a frame for ``--timeout`` seconds it counts as stuck.
 
     Raises ConfigurationError: the URL is wrong.
     """

@@ -38,11 +38,11 @@ MAX_GRABBED = 100_000
     cls=ListedGroup,
     help="Pictures of any camera. URL is v4l2:///dev/video0, gige://HOST, rtsp://HOST/PATH, "
     "http://HOST/PATH, insight://HOST, synthetic:// (which needs no camera), or the path of a "
-    "video; ?format=YUYV&size=640x480&fps=30 and the like say how it is to stream. A device "
-    "streams while somebody reads.",
+    "video; ?format=YUYV&size=640x480&fps=30 and the like set the stream. A device streams "
+    "while there is a reader.",
 )
 def frames() -> None:
-    """Have the commands of frames."""
+    """Register the commands of frames."""
 
 
 frames.add_command(record)
@@ -58,10 +58,10 @@ frames.add_command(force_address_command)
 @frames.command(
     name="list",
     help="List the devices that are found on this machine and its network: the URL that opens "
-    "each, its formats, and what keeps it from being opened.",
+    "each, its formats, and the reason why it cannot be opened.",
 )
-@click.option("--scheme", metavar="SCHEME", help="Only what is found by this one, such as v4l2.")
-@option("--timeout", help="Bound of the search.  [default: 5]")
+@click.option("--scheme", metavar="SCHEME", help="Only search for this scheme, such as v4l2.")
+@option("--timeout", help="Longest time of the search.  [default: 5]")
 @runs(*OUTPUT)
 async def list_(scheme: str | None, options: Options) -> None:
     from smartcam.frames._inside import FRAME_TIMEOUT
@@ -95,7 +95,7 @@ async def list_(scheme: str | None, options: Options) -> None:
 async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
     """Return the sources that a scheme's driver finds, None if the driver has no search.
 
-    The error of a broken driver is returned, and costs only the line of its scheme.
+    The error of a broken driver is returned, so that it affects only the line of its scheme.
     """
     from smartcam.frames import discover
     from smartcam.registry import FRAMES
@@ -123,7 +123,7 @@ def _show_broken(scheme: str, error: Exception, options: Options) -> None:
 
 
 def _found(one: FoundSource) -> dict[str, Any]:
-    """Return the name, formats and remark of a source found, as values for JSON."""
+    """Return the name, formats and remark of a found source, as values for JSON."""
     return {
         "url": one.url,
         "name": one.name,
@@ -160,10 +160,10 @@ def _suffix(_context: object, _option: object, file: str) -> str:
 
 
 @frames.command(
-    help="Write the newest frame to a file, or several. What the file is, its suffix says: .png "
-    "and .jxl (JPEG XL) lose nothing, with 16 bits where the camera sends more than 8; .jpg; .npy "
-    "(the array of numpy) and .raw have the pixels as the camera sends them. A camera that sends "
-    'JPEGs has them written as they come. Needs the extra "frames", but for .npy and .raw.'
+    help="Write the newest frame to a file, or several. The suffix sets the format: .png and .jxl "
+    "(JPEG XL) lose nothing, with 16 bits if the camera sends more than 8; .jpg; .npy (the "
+    "array of numpy) and .raw have the pixels as the camera sends them. JPEGs of a camera "
+    'are written unchanged. Needs the extra "frames", but for .npy and .raw.'
 )
 @click.argument("url")
 @option("--output", required=True, callback=_suffix)
@@ -171,27 +171,27 @@ def _suffix(_context: object, _option: object, file: str) -> str:
 @option(
     "--count",
     type=click.IntRange(1, MAX_GRABBED),
-    help="Write so many, one after the other; with more than one the names get numbers.",
+    help="Number of frames to write; with several, the names get numbers.",
 )
 @click.option(
     "--after-now",
     is_flag=True,
-    help="The first one whose exposure begins after it is asked for, not one that was on its way.",
+    help="Write the first frame whose exposure begins after the request.",
 )
 @click.option(
     "--trigger",
     is_flag=True,
-    help="Trigger the device for each one: the picture that this trigger caused, by software. The "
-    "URL has to have it wait for triggers, as gige://HOST?trigger=Software does.",
+    help="Trigger the device by software for each frame, and write the triggered picture. The "
+    "URL must set the device to triggers, such as gige://HOST?trigger=Software.",
 )
-@click.option("--grey", is_flag=True, help="The brightness alone.")
-@click.option("--8-bit", "eight", is_flag=True, help="Of more than 8 bits the upper 8.")
+@click.option("--grey", is_flag=True, help="Keep only the brightness.")
+@click.option("--8-bit", "eight", is_flag=True, help="Keep the upper 8 of more than 8 bits.")
 @click.option(
     "--quality",
     type=click.IntRange(1, 100),
     default=90,
     show_default=True,
-    help="Of a JPEG that is made here.",
+    help="Quality of a JPEG that is made here.",
 )
 @option("--timeout", help=TIMEOUT)
 @runs(*OUTPUT)
@@ -246,7 +246,7 @@ async def _next(coming: Any, source: FrameSource, done: int, wanted: int) -> Fra
 
 
 def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
-    """Return the description of a frame written to a file, as values for JSON and as a text."""
+    """Return the description of a written frame, as values for JSON and as text."""
     value = {
         "file": file,
         "size": size,
@@ -290,13 +290,13 @@ def _write(file: str, data: bytes) -> None:
 
 @frames.command(
     name="measure",
-    help="Read a source for some seconds and tell its rate and jitter, the age of a frame when it "
-    "is here, what was lost and skipped, and this process' part of a core. The latency is that of "
-    "pictures with a stamp, as synthetic:// draws it, seen by any camera or through any codec; "
-    "the clock must be this machine's.",
+    help="Read a source for some seconds and report its rate and jitter, the age of arriving "
+    "frames, lost and skipped frames, and this process' part of a core. The latency is that "
+    "of pictures with a stamp, as synthetic:// draws it, seen by any camera or through any "
+    "codec; the clock must be this machine's.",
 )
 @click.argument("url")
-@option("--seconds", default=5.0, show_default=True, help="How long, from the first frame on.")
+@option("--seconds", default=5.0, show_default=True, help="Seconds from the first frame on.")
 @option("--timeout", help=TIMEOUT)
 @runs(*OUTPUT)
 async def measure_command(url: str, options: Options) -> None:

@@ -1,4 +1,4 @@
-"""``smartcam frames record``: a camera's pictures in a file, or in files that follow each other."""
+"""``smartcam frames record``: record a camera's pictures in a file, or in a series of files."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class _Amount(_AmountType):
     "--output",
     metavar="FILE.mcap|FILE.mkv|FOLDER",
     required=True,
-    help="Where to write.",
+    help="File or folder to write.",
 )
 @option("--force")
 @option("--name", help="The camera's name in the file; default made of the URL.")
@@ -73,17 +73,17 @@ class _Amount(_AmountType):
 @click.option(
     "--size",
     type=_Amount("SIZE", BYTES),
-    help="Of a folder: the next file begins behind so much.  [default: 1 GB]",
+    help="Size of a file in a folder, before the next one begins.  [default: 1 GB]",
 )
 @click.option(
     "--age",
     type=_Amount("AGE", SECONDS),
-    help="Of a folder: the next file begins behind so long.  [default: 1 h]",
+    help="Time span of a file in a folder, before the next one begins.  [default: 1 h]",
 )
 @click.option(
     "--keep",
     type=_Amount("SIZE", BYTES),
-    help="Of a folder: of all files together; the oldest are deleted.  [default: 10 GB]",
+    help="Size of all files of a folder; the oldest are deleted.  [default: 10 GB]",
 )
 @option("--timeout", help=TIMEOUT)
 @runs(*OUTPUT, interrupted=0)
@@ -118,7 +118,7 @@ async def record(
 
 
 def _recorder(output: str, bounds: dict[str, float], *, force: bool) -> Recorder | RotatingRecorder:
-    """Return the recorder of a path: of a recording, a video, or a folder."""
+    """Return the recorder for a path: of a recording, a video, or a folder."""
     from smartcam.recording import Recorder, RotatingRecorder
 
     suffix = Path(output).suffix.lower()
@@ -145,7 +145,7 @@ def _tell_trouble(trouble: RecordingError | None) -> None:
 async def _record(
     source: FrameSource, recorder: Recorder | RotatingRecorder, name: str, options: Options
 ) -> None:
-    """Record, for as long as the options say."""
+    """Record for the time or number that the options set."""
     began = asyncio.Event()
 
     async def pictures() -> None:
@@ -162,7 +162,7 @@ async def _record(
 
 
 async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Options) -> None:
-    """End the recording and tell what is in it; a file without a picture is removed."""
+    """End the recording and report its contents; a file without a picture is removed."""
     from smartcam.recording import RotatingRecorder
 
     await asyncio.to_thread(recorder.close)
@@ -183,6 +183,6 @@ async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Option
 
 def _show(what: str, value: dict[str, Any], lost: int, options: Options) -> None:
     value["lost"] = lost
-    told = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
+    counts = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
     size = f"; {value['bytes']} bytes" if "bytes" in value else ""
-    options.show(value, f"{what}: {told}{size}")
+    options.show(value, f"{what}: {counts}{size}")

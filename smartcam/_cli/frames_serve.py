@@ -1,4 +1,4 @@
-"""``smartcam frames serve`` and ``show``: pictures of some sources, for people and for players."""
+"""``smartcam frames serve`` and ``show``: pictures of some sources, for viewers and players."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ MAX_SHOWN = 4
 """Largest number of sources side by side on a page."""
 
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
-"""Errors that stay: another try to open the source would fail as well."""
+"""Errors that stay: another try to open the source would fail, too."""
 
 FIRST_TRY_TIMEOUT = 3.0
-"""Seconds that the first try of each source is waited for, before the others are served."""
+"""Seconds to wait for the first try of each source, before the others are served."""
 
 PERIOD = 1.0
-"""Seconds between two looks at the viewers."""
+"""Seconds between two checks of the viewers."""
 
 
 def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
@@ -58,13 +58,12 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
             type=click.IntRange(1, 100),
             default=80,
             show_default=True,
-            help="Of the JPEGs that the page gets; those of a camera that sends some stay as they "
-            "are.",
+            help="Quality of the JPEGs for the page; JPEGs of a camera stay as they are.",
         ),
         click.option(
             "--changes",
             is_flag=True,
-            help="Whoever can open the page may set features of the devices and trigger them.",
+            help="Everyone who can open the page may set features of the devices and trigger them.",
         ),
         page_options("", always=True),
         option("--seconds"),
@@ -82,30 +81,30 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
 
 @click.command(
     help=f"Serve pictures of one source, or of up to {MAX_SHOWN}, until Ctrl-C or SIGTERM: a page "
-    "with all of them side by side, and for players and recorders RTSP or RTP. What is served "
-    "goes to stdout, who looks, on a terminal, to stderr. A device streams while somebody looks; "
-    'one that is not there is awaited, and the others go on. Needs the extras "web" and "frames", '
+    "with all of them side by side, and for players and recorders RTSP or RTP. The addresses "
+    "go to stdout, the readers, on a terminal, to stderr. A device streams while it has readers; "
+    'a missing device is awaited, and the others go on. Needs the extras "web" and "frames", '
     'for RTSP and RTP "video".'
 )
 @click.option(
     "--rtsp",
     metavar="HOST:PORT",
     callback=address,
-    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. Where the page has a token, "
-    f"that is the password, and {RTSP_USER} the user; on an address that others can reach, one is "
-    "made.",
+    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. The page's token is "
+    f"the password of the user {RTSP_USER}; without a token, an address that other machines can "
+    "reach gets a password.",
 )
 @click.option(
     "--rtp",
     metavar="HOST:PORT",
     callback=address,
-    help="Send the one source as H.264 by RTP to this address, whether somebody is there or not.",
+    help="Send the one source as H.264 by RTP to this address, with or without a receiver.",
 )
 @click.option(
     "--sdp",
     metavar="FILE",
     type=click.Path(dir_okay=False),
-    help="Write what a player of --rtp has to know to this file, and not to stdout.",
+    help="Write the description for players of --rtp to this file, not to stdout.",
 )
 @_serves(terminated=0)
 async def serve(
@@ -122,7 +121,7 @@ async def serve(
     if rtp is not None and len(urls) != 1:
         raise click.UsageError(f"--rtp sends one source: expected one URL, got {len(urls)}")
     if rtp is not None and not rtp[1]:
-        raise click.UsageError("--rtp: expected the port of who receives it, got 0")
+        raise click.UsageError("--rtp: expected the receiver's port, got 0")
     if sdp is not None and rtp is None:
         raise click.UsageError("--sdp needs --rtp")
     await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options, changes=changes)
@@ -130,9 +129,9 @@ async def serve(
 
 @click.command(
     help=f"Show one source, or up to {MAX_SHOWN} side by side, on a page until Ctrl-C: the newest "
-    "frame of each, its age, rates, what was skipped and lost. It is serve, with nothing but the "
-    "page: its address goes to stdout. A device streams while somebody looks; one that is not "
-    'there is awaited, and the page says so. Needs the extras "web" and "frames".'
+    "frame of each, its age, rates, skipped and lost frames. It is serve, with only the page: its "
+    "address goes to stdout. A device streams while the page is open; a missing device is "
+    'awaited, and the page shows that. Needs the extras "web" and "frames".'
 )
 @_serves(terminated=143)
 async def show(
@@ -151,9 +150,9 @@ async def serve_sources(
     *,
     changes: bool,
 ) -> None:
-    """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
+    """Serve sources until cancelled, or for ``--seconds``; one that fails affects no other.
 
-    Raises ConfigurationError, FrameFormatError, UnsupportedError: each source fails by one;
+    Raises ConfigurationError, FrameFormatError, UnsupportedError: every source has failed for good;
     ConfigurationError: the site cannot listen.
     """
     if len(urls) > MAX_SHOWN:
@@ -190,23 +189,23 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
 
 
 class _Tries:
-    """The outcomes of each source's first try; later ones that fail are told on stderr."""
+    """The outcomes of each source's first try; later failures are reported on stderr."""
 
     def __init__(self, count: int) -> None:
-        self._done = asyncio.Event()  # each was tried
+        self._done = asyncio.Event()  # set when every source was tried
         self._count = count
         self._first: dict[int, SmartCamError | None] = {}
-        self._told: dict[int, str] = {}
+        self._reported: dict[int, str] = {}
 
     def of(self, place: int) -> Callable[[SmartCamError | None], None]:
-        """Return the function that is told the outcome of each try to open a source."""
+        """Return the function that gets the outcome of each try to open a source."""
 
         def tried(error: SmartCamError | None) -> None:
             self._first.setdefault(place, error)
             text = "" if error is None else str(error)
-            if text and self._told.get(place, "") != text and not self._all_for_good():
+            if text and self._reported.get(place, "") != text and not self._all_for_good():
                 click.echo(f"note: {text}; it is awaited", err=True)
-            self._told[place] = text
+            self._reported[place] = text
             if len(self._first) == self._count:
                 self._done.set()
 
@@ -217,7 +216,7 @@ class _Tries:
         return len(wrong) == self._count and all(wrong)
 
     async def check(self) -> None:
-        """Wait until each was tried; raise the first error if all sources have failed for good."""
+        """Wait until every source was tried; raise the first error if all have failed for good."""
         await self._done.wait()
         error = self._first[0]
         if error is not None and self._all_for_good():
@@ -229,19 +228,19 @@ class _Tries:
         await asyncio.Event().wait()
 
 
-# ---------------------------------------------------------------------- who looks
+# ---------------------------------------------------------------------- viewers
 
 
 async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
-    """Tell on a terminal's stderr who looks, when that changes; until cancelled."""
+    """Report the viewers on a terminal's stderr, whenever they change; until cancelled."""
     if not sys.stderr.isatty():
         await asyncio.Event().wait()
-    told = viewers_text(site, server)
+    shown = viewers_text(site, server)
     while True:
         await asyncio.sleep(PERIOD)
         text = viewers_text(site, server)
-        if text != told:
-            told = text
+        if text != shown:
+            shown = text
             click.echo(f"{datetime.now().astimezone():%H:%M:%S} {text}", err=True)
 
 

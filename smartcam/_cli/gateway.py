@@ -1,4 +1,4 @@
-"""``smartcam gateway``: robots and PLCs ask a camera for parts, line by line."""
+"""``smartcam gateway``: serve parts of a camera to robots and PLCs, line by line."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ DEMO_APPLICATION = 7
 
 
 def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give the command the options that say how answers are written."""
+    """Add the options for the form of answers to the command."""
     options = [
         click.option(
             "--listen",
             metavar="tcp/HOST:PORT",
-            help="Where robots connect.  [default: tcp/127.0.0.1:7001]",
+            help="Address for robots.  [default: tcp/127.0.0.1:7001]",
         ),
         click.option(
             "--robot",
             type=click.Choice(["plain", "ur", "kuka", "fanuc", "siemens"]),
-            help="The make of the controller, for what is not said below.  [default: plain]",
+            help="Make of the controller, which sets the defaults below.  [default: plain]",
         ),
         click.option("--form", type=click.Choice(["text", "brackets", "xml"])),
         click.option(
             "--pose",
             type=click.Choice(["ur", "abb", "kuka", "fanuc", "meca500"]),
-            help="Whose way of writing how a part is turned.",
+            help="Make with the convention for orientations.",
         ),
         click.option("--length", type=click.Choice(["m", "mm"])),
         click.option("--angle", type=click.Choice(["rad", "deg"])),
         click.option("--decimals", type=click.IntRange(0, 9)),
         click.option("--separator", metavar="CHARACTER"),
         click.option("--line-end", type=click.Choice(["lf", "crlf", "cr", "none"])),
-        click.option("--width", type=click.IntRange(0, 1000), help="Bytes of each answer."),
+        click.option("--width", type=click.IntRange(0, 1000), help="Bytes of each answer, padded."),
         click.option(
             "--also",
             multiple=True,
             type=click.Choice(["quality", "photo_index", "feature_id"]),
-            help="What stands behind the pose; several times for several.",
+            help="Value that follows the pose; repeatable.",
         ),
-        click.option("--tool-flip", is_flag=True, help="Have z point into the table, as a tool's."),
-        click.option("--max-age", type=SECONDS, help="How old a result may be that NEXT asks of."),
-        click.option("--idle", type=SECONDS, help="When a silent robot is hung up on."),
-        click.option("--clients", type=click.IntRange(1, 100), help="Robots at a time."),
+        click.option("--tool-flip", is_flag=True, help="Make z point into the table, as a tool's."),
+        click.option("--max-age", type=SECONDS, help="Largest age of a result for NEXT, seconds."),
+        click.option("--idle", type=SECONDS, help="Seconds until a silent robot is disconnected."),
+        click.option("--clients", type=click.IntRange(1, 100), help="Most robots at a time."),
     ]
     for option in reversed(options):
         command = option(command)
@@ -65,12 +65,12 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @click.command(
     help="Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C. A "
-    "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each answer. "
-    "CAMERA is a URL, or a YAML file that says all that the options say. --demo has an emulated "
-    f'camera behind it. Needs the extra "calibration". {CONNECTS}'
+    "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each "
+    "answer. CAMERA is a URL, or a YAML file with all the options. --demo uses an emulated "
+    f'camera. Needs the extra "calibration". {CONNECTS}'
 )
 @click.argument("camera", metavar="[URL|FILE.yaml]", required=False)
-@click.option("--demo", is_flag=True, help="An emulated camera instead of CAMERA.")
+@click.option("--demo", is_flag=True, help="Use an emulated camera instead of CAMERA.")
 @_style_options
 @runs(
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
@@ -103,7 +103,7 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
 
 
 async def _have_open(server: Gateway, make: Callable[[], Camera], show: Callable[[], None]) -> None:
-    """Have the camera open, and show the gateway once it was tried for the first time."""
+    """Keep the camera open, and show the gateway once opening was tried for the first time."""
     from smartcam._cli.live import have_open
 
     first, shown = server.camera, False
@@ -140,11 +140,11 @@ def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> Gat
 
     from smartcam.exceptions import ConfigurationError
 
-    said = {name: value for name, value in style.items() if value not in (None, (), False)}
+    given = {name: value for name, value in style.items() if value not in (None, (), False)}
     if options.timeout is not None:
-        said["timeout"] = options.timeout
+        given["timeout"] = options.timeout
     try:
-        return file.settings(**said)
+        return file.settings(**given)
     except ValidationError as exc:
         (first, *_) = exc.errors()
         where = "".join(f"--{one}: " for one in first["loc"][:1]).replace("_", "-")
@@ -152,7 +152,7 @@ def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> Gat
 
 
 def _fill(options: Options, file: GatewayFile) -> None:
-    """Take from the file what the command line does not say."""
+    """Set options that the command line leaves out from the file."""
     from smartcam.settings import is_fleet
 
     for name in ("application", "interpret_as", "calibration", "name"):
@@ -165,7 +165,7 @@ def _fill(options: Options, file: GatewayFile) -> None:
 
 @contextlib.asynccontextmanager
 async def _emulated(options: Options) -> AsyncIterator[str]:
-    """Give the URL of an emulated camera, whose parts lie still."""
+    """Yield the URL of an emulated camera, whose parts do not move."""
     from smartcam.emulator import EmulatedCamera
 
     if options.application is None:
@@ -175,7 +175,7 @@ async def _emulated(options: Options) -> AsyncIterator[str]:
 
 
 def _tell_account(server: Gateway, options: Options) -> None:
-    """Print what became of all requests and parts."""
+    """Print the account of all requests and parts."""
     found = server.account
     if options.as_json:
         options.show({"account": dataclasses.asdict(found)}, "")

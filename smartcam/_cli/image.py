@@ -1,4 +1,4 @@
-"""``smartcam image``: a camera's last picture to a file."""
+"""``smartcam image``: write a camera's last picture to a file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from smartcam.exceptions import ConfigurationError
 
 @click.command(
     help="Write a camera's last picture to a file, as the camera sends it (In-Sight: a bitmap), "
-    "where it can be asked for one. A software camera begins with the command, so it is triggered "
-    f"first, and its picture is a PNG. {CONNECTS}"
+    "if its protocol has a request for it. A software camera begins with the command, so it is "
+    f"triggered first, and its picture is a PNG. {CONNECTS}"
 )
 @click.argument("url")
 @option("--output", required=True)

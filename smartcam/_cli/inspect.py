@@ -1,4 +1,4 @@
-"""``smartcam inspect``: an application of a software camera, tried on pictures in files."""
+"""``smartcam inspect``: try an application of a software camera on pictures in files."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ PAGE: Final = "index.html"
 
 
 @click.command(
-    help="Try an application of a software camera on pictures in files, and draw what it saw. CELL "
-    "is a cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
-    "PICTURES files, or folders of them. Prints the results; with --output, draws what the tools "
-    "saw."
+    help="Try an application of a software camera on pictures, and draw its findings. CELL is a "
+    "cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
+    "PICTURES files, or folders of them. Prints the results; --output also draws the tools' "
+    "findings."
 )
 @click.argument("cell")
 @click.argument("camera")
 @click.argument("which", metavar="APPLICATION")
 @click.argument("pictures", nargs=-1, required=True)
-@option("--output", help="Draw what was seen into this folder: PNG files, and a page of them all.")
+@option("--output", help="Draw the findings into this folder: PNG files, and a page of them all.")
 @click.option("--input", "given", metavar="HEX", default="", help="Input data of each trigger.")
 @option("--units")
 @runs(*OUTPUT)
@@ -50,7 +50,7 @@ async def inspect(
     given: str,
     options: Options,
 ) -> None:
-    """Inspect the pictures one by one, print what was found, and draw it."""
+    """Inspect the pictures one by one, print the results, and draw the findings."""
     from smartcam._suggestions import did_you_mean
     from smartcam.inspection import load_cell
     from smartcam.layout._inside import ShownUnits

@@ -1,4 +1,4 @@
-"""``smartcam protocols`` and ``interpreters``: what is there, plug-ins included."""
+"""``smartcam protocols`` and ``interpreters``: list them, including plug-ins."""
 
 from __future__ import annotations
 
@@ -82,13 +82,13 @@ def _interpreter(info: PluginInfo) -> tuple[object, str]:
     except PluginError as exc:
         return _broken(info, exc)
     except SmartCamError:
-        pass  # it has need of a layout
+        pass  # it needs a layout
     where = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
     return {**info._asdict(), "about": about}, f"{info.name:14} {about}{where}"
 
 
 def _first_line(loaded: object) -> str:
-    """Return the first line of what a plug-in says of itself, without its markup."""
+    """Return the first line of a plug-in's docstring, without its markup."""
     import inspect
     import re
 

@@ -1,4 +1,4 @@
-"""``smartcam live``: a page of a camera, also before the camera answers."""
+"""``smartcam live``: a page of a camera, even before the camera answers."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 @click.command(
     help="Serve a page of a camera until Ctrl-C: results as they come, status, account. The page's "
-    "address goes to stdout. A camera that is not there, or is lost, is awaited, and the page says "
-    f'so. Needs the extra "web". {CONNECTS}'
+    "address goes to stdout. A missing or lost camera is awaited, with a note on the "
+    f'page. Needs the extra "web". {CONNECTS}'
 )
 @click.argument("url")
 @click.option(
@@ -42,7 +42,7 @@ async def live(url: str, control: bool, web: PageOptions, options: Options) -> N
 async def serve_page(
     url: str, web: PageOptions, options: Options, *, control: bool = False
 ) -> None:
-    """Serve the page until the end; a camera that cannot be used at all ends it."""
+    """Serve the page until the end; a camera that can never be used ends it."""
     from smartcam.web import LiveSite
 
     units = options.unit_names
@@ -63,10 +63,10 @@ async def have_open(
     follow: Callable[[Camera, str], Awaitable[None]],
     opened: Callable[[], None] = lambda: None,
 ) -> None:
-    """Open the camera until it is there, and have it open until this is cancelled.
+    """Open the camera, try again until that succeeds, and keep it open until cancelled.
 
-    ``follow`` is told of each new camera that takes the place of one which could not be opened, and
-    why it could not. ``opened`` is called when it is open.
+    ``follow`` gets each new camera object that replaces one that could not be opened, and the
+    reason. ``opened`` is called when the camera is open.
     """
     policy = Backoff()
     for delay in policy.delays():

@@ -1,8 +1,8 @@
 """A log as lines of JSON, for programs that collect logs; ``docs/operations.md`` has the fields.
 
-Any thread may log. A line is put into a bounded queue, and a thread writes it: where nobody reads
-the pipe, that thread waits, and nobody else. What finds no room is dropped and counted, and told as
-soon as there is room.
+Any thread may log. A line is put into a bounded queue, and a thread writes it: if the pipe is not
+read, only that thread waits. Lines without room are dropped and counted, and their number is logged
+as soon as there is room.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ MAX_WAITING = 10_000
 """Largest number of lines that may wait to be written."""
 
 MAX_TEXT_CHARACTERS = 1 << 16
-"""Largest number of characters of a message, or of an exception's text; what is longer is cut."""
+"""Largest number of characters of a message, or of an exception's text; the rest is cut."""
 
 FAREWELL = 1.0
 """Seconds that the last lines may take at the end."""
 
 FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
-"""The fields of a line, in this order; a line has the last two only where they have a value."""
+"""The fields of a line, in this order; the last two are left out without a value."""
 
 
 class JsonLines(logging.Formatter):
-    """Makes a record a line.
+    """Formats a record as a line.
 
     Args:
         agent: function that returns the agent's name.
@@ -66,10 +66,10 @@ class JsonLines(logging.Formatter):
         return json.dumps(fields)
 
     def _camera(self, record: logging.LogRecord) -> str | None:
-        """Return the camera that a record is about: whose name it has as an argument, if any."""
-        said = getattr(record, "camera", None)
-        if isinstance(said, str):
-            return said
+        """Return the camera whose name a record has as an argument, None without one."""
+        camera = getattr(record, "camera", None)
+        if isinstance(camera, str):
+            return camera
         cameras = self._cameras()
         given = record.args if isinstance(record.args, tuple) else ()
         for one in given[:2]:
@@ -85,30 +85,30 @@ def _time(seconds: float) -> str:
 
 
 class LineHandler(logging.Handler):
-    """Has a thread write lines to a file; never waits for it.
+    """Writes lines to a file in a thread, and never waits for it.
 
     Args:
         descriptor: descriptor of the file.
-        most: lines that wait.
+        most: largest number of lines that wait.
 
     Attributes:
-        dropped: lines that found no room.
+        dropped: number of lines that found no room.
     """
 
     def __init__(self, descriptor: int, most: int = MAX_WAITING) -> None:
         super().__init__()
         self.dropped: int = 0
-        self._told = 0
+        self._reported = 0
         self._descriptor = descriptor
         self._lines: queue.Queue[str | None] = queue.Queue(most)
         self._ending = threading.Event()
         self._over = threading.Event()
-        # not to be waited for at the end of the process: it may hang in a pipe
+        # a daemon, since it may hang in a pipe at the end of the process
         self._thread = threading.Thread(target=self._write_all, name="smartcam.log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Take a record."""
+        """Add a record."""
         try:
             self._lines.put_nowait(self.format(record))
         except queue.Full:
@@ -117,11 +117,11 @@ class LineHandler(logging.Handler):
             self.handleError(record)
 
     def close(self) -> None:
-        """Write what waits, in bounded time. Idempotent."""
+        """Write the waiting lines, in bounded time. Idempotent."""
         if not self._ending.is_set():
             self._ending.set()
             with contextlib.suppress(queue.Full):
-                self._lines.put_nowait(None)  # wakes the thread; one that is busy sees it anyway
+                self._lines.put_nowait(None)  # wakes the thread, if it waits
             self._over.wait(FAREWELL)
         super().close()
 
@@ -131,11 +131,11 @@ class LineHandler(logging.Handler):
                 line = self._lines.get()
                 if line is not None:
                     self._write(line)
-                if (dropped := self.dropped) > self._told:
-                    self._write(self._lost(dropped - self._told))
-                    self._told = dropped
+                if (dropped := self.dropped) > self._reported:
+                    self._write(self._lost(dropped - self._reported))
+                    self._reported = dropped
         except OSError:
-            pass  # nobody reads any more
+            pass  # the reader is gone
         finally:
             self._over.set()
 
@@ -150,7 +150,7 @@ class LineHandler(logging.Handler):
         while left:
             try:
                 left = left[os.write(self._descriptor, left) :]
-            except BlockingIOError:  # somebody has made it so
+            except BlockingIOError:  # another program has made the pipe non-blocking
                 select.select([], [self._descriptor], [], 1.0)
 
 
@@ -163,7 +163,7 @@ def json_log(
     descriptor: int = 2,
     most: int = MAX_WAITING,
 ) -> Iterator[LineHandler]:
-    """Write all that this process logs as lines of JSON, as long as the block runs."""
+    """Write all logs of this process as lines of JSON, while the block runs."""
     root = logging.getLogger()
     handlers, before = root.handlers[:], root.level
     handler = LineHandler(descriptor, most)

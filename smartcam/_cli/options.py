@@ -1,4 +1,4 @@
-"""Options that commands share, and what is made of them."""
+"""Common options of commands, and the objects made of them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ DIALECTS = ("handbook", "thesis", "b16", "bid")
 F = TypeVar("F", bound="Callable[..., Any]")
 
 CONNECTS = (
-    "Connecting takes the camera from another client, where it serves one: the newcomer wins. One "
-    "of a fleet is shared."
+    "Connecting takes the camera from another client, if it serves one: the newcomer wins. A "
+    "camera of a fleet is shared."
 )
 
 
 class _Seconds(click.FloatRange):
-    """Seconds; NaN, which is below no bound and above none, is refused too."""
+    """Seconds; NaN, which no bound excludes, is refused, too."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         seconds = super().convert(value, param, ctx)
@@ -54,14 +54,14 @@ INTERPRET_AS = (
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--application": {
         "type": click.IntRange(0, 0xFFFFFFFF),
-        "help": "Have this application running and ready first (stop, switch, start as needed).",
+        "help": "Run this application first (stop, switch, start as needed).",
     },
     "--interpret-as": {"metavar": "SPEC", "help": INTERPRET_AS},
     "--y-down": {"is_flag": True, "help": "The camera's y axis points down."},
     "--calibration": {
         "metavar": "FILE",
         "type": click.Path(dir_okay=False),
-        "help": "Show localizations in the robot's frame, by what smartcam calibrate wrote.",
+        "help": "Show localizations in the robot's frame, by a file of smartcam calibrate.",
     },
     "--name": {
         "metavar": "NAME",
@@ -70,14 +70,14 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--units": {
         "metavar": "UNITS",
-        "help": "Show values in these units instead of SI, such as mm,deg; with --json they are SI "
-        "as ever.",
+        "help": "Show values in these units instead of SI, such as mm,deg; --json always has SI "
+        "units.",
     },
     "--count": {"type": click.IntRange(min=1), "help": "End after so many results."},
     "--seconds": {"type": SECONDS, "help": "End after so many seconds."},
     "--timeout": {
         "type": SECONDS,
-        "help": "Bound of each step: connect (default 10), switch until ready (10), trigger (5).",
+        "help": "Longest time for each step: connect (default 10), switch (10), trigger (5).",
     },
     "--trace": {
         "type": click.Path(dir_okay=False),
@@ -89,10 +89,10 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--debug": {
         "is_flag": True,
-        "help": "Log what happens and show tracebacks, on stderr.",
+        "help": "Log events and show tracebacks, on stderr.",
     },
     "--output": {"type": click.Path(dir_okay=False), "help": "The file to write."},
-    "--force": {"is_flag": True, "help": "Take the place of a file that is there."},
+    "--force": {"is_flag": True, "help": "Replace an existing file."},
 }
 """Options that several commands have."""
 
@@ -100,18 +100,18 @@ OUTPUT = ("--json", "--debug")
 """Options of the commands that print."""
 
 CAMERA = ("--timeout", "--trace", *OUTPUT)
-"""Options of the commands that connect to a camera, those that print among them."""
+"""Options of the commands that connect to a camera, including those for printing."""
 
 RESULTS = (
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--units"),
     *("--count", "--seconds"),
     *CAMERA,
 )
-"""Options of the commands that print results, those that connect among them."""
+"""Options of the commands that print results, including those for connecting."""
 
 
 def option(name: str, **changes: Any) -> Callable[[F], F]:
-    """Declare an option that several commands have; ``changes`` are what this one has otherwise."""
+    """Declare a common option; ``changes`` replace some of its properties for this command."""
     names = {"--json": (name, "as_json"), "--output": ("-o", name)}.get(name, (name,))
     return click.option(*names, **{**_OPTIONS[name], **changes})
 
@@ -119,11 +119,11 @@ def option(name: str, **changes: Any) -> Callable[[F], F]:
 def runs(
     *names: str, program: str = "smartcam", interrupted: int = INTERRUPTED, terminated: int = 143
 ) -> Callable[[Callable[..., Coroutine[Any, Any, None]]], Callable[..., None]]:
-    """Make a coroutine function a command's: it gets the shared ones of its options as ``options``.
+    """Turn a coroutine function into a command; it gets the common options as ``options``.
 
-    ``names``: of shared options that it has beside those declared above. ``program``: its name, for
-    the error line. ``interrupted``: exit code after Ctrl-C; 0 where that is the way to end, as it
-    is with a page. ``terminated``: exit code after SIGTERM.
+    ``names``: common options of the command, beside those declared above. ``program``: its name for
+    the error line. ``interrupted``: exit code after Ctrl-C; 0 if that is the usual end, as for
+    a page. ``terminated``: exit code after SIGTERM.
     """
 
     def decorate(main: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
@@ -161,7 +161,7 @@ def naming(what: str) -> Iterator[None]:
 
 
 def from_hex(text: str, where: str) -> bytes:
-    """Return the bytes of hex text (ConfigurationError: it is not hex); spaces are allowed."""
+    """Return the bytes of hex text, which may have spaces; ConfigurationError: it is not hex."""
     try:
         return bytes.fromhex(text)
     except ValueError as exc:
@@ -171,10 +171,10 @@ def from_hex(text: str, where: str) -> bytes:
 
 
 def application(text: str) -> int | str:
-    """Return an application's id, or the name of its file: whatever is no number.
+    """Return an application's id, or a text that is no number as the name of its file.
 
-    Raises click.BadParameter: an id that none can have; ValueError: signs and digits that make no
-    number.
+    Raises click.BadParameter: no application can have this id; ValueError: signs and digits that
+    make no number.
     """
     if not text.lstrip("+-").isdecimal():
         return text
@@ -186,7 +186,7 @@ def application(text: str) -> int | str:
 
 @dataclass(slots=True)
 class Options:
-    """The shared options as a command uses them."""
+    """The common options as a command uses them."""
 
     as_json: bool = False
     debug: bool = False
@@ -206,7 +206,7 @@ class Options:
         return default if self.timeout is None else self.timeout
 
     def check_y_down(self, calibration: AnyCalibration, what: str) -> None:
-        """Raise ConfigurationError if ``--y-down`` is not as it was when a calibration was made.
+        """Raise ConfigurationError if ``--y-down`` differs from that of a calibration.
 
         ``what``: the option that names the calibration.
         """
@@ -217,10 +217,10 @@ class Options:
             )
 
     async def located(self, url: str) -> str:
-        """Return a URL; of a bare HOST[:PORT] the one at which a camera answers there.
+        """Return a URL; for a bare HOST[:PORT], the URL at which a camera answers there.
 
-        Raises ConnectFailedError: none answers in any registered protocol; errors of
-        :meth:`reading`, before anybody is asked.
+        Raises ConnectFailedError: no camera answers in any registered protocol; errors of
+        :meth:`reading`, before any camera is asked.
         """
         from smartcam.settings import is_software
 
@@ -234,16 +234,16 @@ class Options:
 
     @contextmanager
     def camera(self, url: str, **other: Any) -> Iterator[Camera]:
-        """Give an unopened camera, as :meth:`cameras` makes them."""
+        """Yield an unopened camera, as :meth:`cameras` makes them."""
         with self.cameras(url, **other) as make:
             yield make()
 
     @contextmanager
     def cameras(self, url: str, **other: Any) -> Iterator[Callable[[], Camera]]:
-        """Give what makes unopened cameras; the trace file is open around it.
+        """Yield a function that makes unopened cameras; the trace file is open meanwhile.
 
         ``other``: options of :func:`smartcam.connect` that the command line does not have. Raises
-        CalibrationError: the calibration's file is damaged, newer, or holds something else;
+        CalibrationError: the calibration's file is damaged, newer, or of another kind;
         ConfigurationError: a file cannot be opened, or an option cannot work.
         """
         from smartcam.connecting import connect
@@ -270,10 +270,10 @@ class Options:
         return [FrameObserver(trace)]
 
     def reading(self, *, fleet: bool) -> dict[str, Any]:
-        """Return the options that say how results are read.
+        """Return the options for the interpretation of results.
 
-        ``fleet``: the agent of a fleet may know what is not said here, such as ``y_down``. Raises
-        CalibrationError: the calibration's file is damaged, newer, or holds something else;
+        ``fleet``: the agent of a fleet may know missing options, such as ``y_down``. Raises
+        CalibrationError: the calibration's file is damaged, newer, or of another kind;
         ConfigurationError: the calibration cannot be opened, or was made with another ``--y-down``.
         """
         options: dict[str, Any] = {"interpret_as": self.interpret_as}
@@ -281,7 +281,7 @@ class Options:
             options["y_down"] = self.y_down
         if self.calibration is not None:
             what = f"--calibration {self.calibration}"
-            # without "y_down" the camera sees to it, which hears what the agent knows
+            # without "y_down" the camera checks it, since it learns the agent's value
             calibration, doubt = self._calibrated(what, check_y_down="y_down" in options)
             options["calibration"] = calibration
             if doubt:
@@ -301,10 +301,10 @@ class Options:
 
     @contextmanager
     def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
-        """Give what writes the trace file, None if none is wanted.
+        """Yield the function that writes the trace file, None without ``--trace``.
 
-        Raises UnsupportedError: the camera at ``url`` is one of a fleet; ConfigurationError: the
-        file cannot be written.
+        Raises UnsupportedError: the camera at ``url`` is a camera of a fleet; ConfigurationError:
+        the file cannot be written.
         """
         if self.trace is None:
             yield None
@@ -325,7 +325,7 @@ class Options:
         failed: list[OSError] = []
 
         def write(entry: TraceEntry) -> None:
-            # called from the link, which would take an OSError for one of its own
+            # called from the link, which would take an OSError for its own
             if not failed:
                 try:
                     stream.write(json.dumps(jsonable(entry)) + "\n")
@@ -346,7 +346,7 @@ class Options:
     def unit_names(self) -> list[str] | None:
         """Names of the units in which values are shown; None: in SI.
 
-        Raises ConfigurationError: --units names what is no unit.
+        Raises ConfigurationError: --units has an unknown unit.
         """
         if self.units is None:
             return None
@@ -357,9 +357,9 @@ class Options:
         return names
 
     def result_text(self) -> Callable[[Camera, Result], str]:
-        """Return the function that makes a text of a camera's result for people, with units.
+        """Return the function that formats a camera's result as text, with units.
 
-        Raises ConfigurationError: --units names what is no unit.
+        Raises ConfigurationError: --units has an unknown unit.
         """
         from smartcam._cli.texts import result_text
         from smartcam._client._inside import own_interpreter
@@ -375,9 +375,9 @@ class Options:
         return as_text
 
     def value_text(self, value: object) -> str:
-        """Return the text of a value that was read as --interpret-as says, with units.
+        """Return the text of a value interpreted by --interpret-as, with units.
 
-        Raises ConfigurationError: --units names what is no unit.
+        Raises ConfigurationError: --units has an unknown unit.
         """
         from smartcam._cli.texts import value_text
         from smartcam.interpreters import resolve
@@ -387,14 +387,14 @@ class Options:
         return value_text(value, ShownUnits(self.unit_names or ()), layout)
 
     def remark(self, camera: Camera) -> None:
-        """Say on stderr what who asks this camera for results should know."""
+        """Print the dialect's remark for users of results on stderr, if there is one."""
         from smartcam._client._inside import remarks
 
         for text in remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)
 
     def show(self, value: object, text: str | Callable[[Any], str]) -> None:
-        """Print ``value`` as a line of JSON, or for people ``text`` (of it); flushed."""
+        """Print ``value`` as a line of JSON, or ``text`` (of it) for people; flushed."""
         if self.as_json:
             import json
 

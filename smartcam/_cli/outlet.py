@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 @click.command(
     help="Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C. "
-    "What a far end does not take waits in a spool beside the file, also for the next start. The "
-    "file has the section outlets: of a fleet file. Prints a line when an outlet has trouble, and "
-    f"the accounts at the end. {CONNECTS}"
+    "Undelivered results wait in a spool beside the file, also for the next start. The file "
+    "has the section outlets: of a fleet file. Prints a line for each trouble, "
+    f"and the accounts at the end. {CONNECTS}"
 )
 @click.argument("url")
 @click.argument("file", metavar="FILE.yaml")
@@ -115,7 +115,7 @@ class _OutletSource:
 
         options = self._options
         spec = options.interpret_as or "raw"
-        if self.camera is not None:  # a camera that knows its own layouts has them there
+        if self.camera is not None:  # a camera with layouts of its own has them here
             spec = self.camera.settings.interpret_as
         read = Interpretation(spec, lenient=False, y_down=options.y_down)
         return columns_of(read.interpreter(application))
@@ -138,7 +138,7 @@ class _OutletSource:
 
 async def _results(name: str, results: Any, outlets: Outlets) -> None:
     """Pass on results; results that the subscription lost are reported as an error."""
-    told = 0
+    reported = 0
     while True:
         try:
             result = await anext(results)
@@ -152,10 +152,10 @@ async def _results(name: str, results: Any, outlets: Outlets) -> None:
             outlets.offer_result(result)
         account = results.statistics()
         lost = account.dropped + account.missed
-        if lost > told:
-            text = f"{lost - told} results did not arrive"
+        if lost > reported:
+            text = f"{lost - reported} results did not arrive"
             outlets.offer_error(name, datetime.now(UTC), text, "Missed")
-            told = lost
+            reported = lost
 
 
 async def _events(events: Any, outlets: Outlets) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class PageOptions:
-    """The page that the options ask for.
+    """The page of the options.
 
     Args:
         web: whether there is a page.
@@ -31,8 +31,8 @@ class PageOptions:
     def __init__(
         self, *, web: bool, web_host: str | None, web_port: int | None, web_token: str | None
     ) -> None:
-        said = {"--web-host": web_host, "--web-port": web_port}
-        needless = [name for name, value in said.items() if value is not None]
+        values = {"--web-host": web_host, "--web-port": web_port}
+        needless = [name for name, value in values.items() if value is not None]
         if needless and not web:
             raise click.UsageError(f"{needless[0]} needs --web")
         self.wanted: bool = web
@@ -53,19 +53,19 @@ def page_options(
     flag = click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".')
     options = [
         *([] if always else [flag]),
-        click.option("--web-host", metavar="HOST", help="Its address.  [default: 127.0.0.1]"),
+        click.option("--web-host", metavar="HOST", help="Page's address.  [default: 127.0.0.1]"),
         click.option(
             "--web-port",
             type=click.IntRange(0, 65535),
-            help="Its port; 0, the default, a free one.",
+            help="Port of the page; 0, the default, takes a free one.",
         ),
         click.option(
             "--web-token",
             metavar="TOKEN",
             envvar="SMARTCAM_WEB_TOKEN",
             show_envvar=True,
-            help="What everybody must know who uses it. Without one this machine's users need "
-            "none; on an address that others can reach, one is made.",
+            help="Token that users of the page need. By default users of this machine need "
+            "none; on an address that other machines can reach, one is made.",
         ),
     ]
 

@@ -1,4 +1,4 @@
-"""``smartcam probe``: which transport and dialect does a camera speak."""
+"""``smartcam probe``: find out the transport and dialect of a camera."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from smartcam.observers import TraceEntry
 
 MAX_HEX = 128
-"""Hex digits of a frame that a line shows; ``--json`` and ``--trace`` have all."""
+"""Largest number of hex digits of a frame on a line; ``--json`` and ``--trace`` have all."""
 
 
 @click.command(
-    help="Find out how a camera speaks; HOST or URL. Tries what the URL says, then every protocol, "
+    help="Find out how a camera speaks; HOST or URL. Tries the URL's options, then every protocol, "
     f"transport and dialect, the most probable first, until one is answered. {CONNECTS}"
 )
 @click.argument("host_or_url")
-@click.option("--all", "go_on", is_flag=True, help="Try the rest too where one is answered.")
+@click.option("--all", "go_on", is_flag=True, help="Try the rest, too, after one is answered.")
 @option(
     "--timeout",
-    help="Bound of all tries together (default 10); each has an equal share of what is left.",
+    help="Longest time of all tries together (default 10); each gets an equal share of the rest.",
 )
 @runs("--trace", *OUTPUT)
 async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
     """Try protocols, transports and dialects, one after the other on fresh links.
 
-    Raises ConnectFailedError: none answered; names each try.
+    Raises ConnectFailedError: no try was answered; the error names each try.
     """
     from smartcam.doctor._inside import no_session, trials
     from smartcam.settings import parse_address
@@ -55,7 +55,7 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
 
 
 def frame_text(entry: TraceEntry) -> str:
-    """Return an entry as a line: what it is, its fields, its bytes; broken bytes as text too."""
+    """Return an entry as a line: message, fields, bytes; broken bytes as text, too."""
     data = entry.hex[:MAX_HEX] + ("..." if len(entry.hex) > MAX_HEX else "")
     if entry.direction != "!":
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
@@ -66,9 +66,9 @@ def frame_text(entry: TraceEntry) -> str:
 
 
 def _show_trial(trial: Trial, options: Options) -> None:
-    told = ("transport", "dialect", "step", "outcome", "frames", "omitted")
+    names = ("transport", "dialect", "step", "outcome", "frames", "omitted")
     address = {"protocol": trial.address.protocol, "port": trial.address.port}
-    value = {**address, **{name: getattr(trial, name) for name in told}}
+    value = {**address, **{name: getattr(trial, name) for name in names}}
     outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
     of = f"{trial.address.protocol} at port {trial.address.port}: " if trial.other else ""
     lines = [f"{of}{trial.transport} {trial.dialect}: {outcome}"]

@@ -1,4 +1,4 @@
-"""``smartcam record``, ``replay``, ``pcap``, ``bag``: a camera's run in a file, and out of it."""
+"""``smartcam record``, ``replay``, ``pcap``, ``bag``: record a camera, and use recordings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
-    """Return a time with its zone."""
+    """Parse a time with its zone."""
     try:
         return None if value is None else datetime.fromisoformat(value).astimezone(UTC)
     except (ValueError, OverflowError) as exc:
@@ -50,20 +50,20 @@ def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> da
 
 
 JUDGED: Final = "judged"
-"""Word for the pictures that results were made of."""
+"""Value of --pictures for the pictures that results were made of."""
 
 NO_PICTURES: Final = "none"
 
 _camera = click.option(
-    "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
+    "--camera", metavar="NAME", help="Camera of the recording; default all of them."
 )
 
 
 @click.command(
     help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
-    "frames, results, events, errors; of a fleet's camera no frames, and the results of every "
-    "program's triggers. With --bag also, or only, as a rosbag2 for ROS 2. A lost link is made "
-    "again, and the recording goes on. "
+    "frames, results, events, errors; of a fleet's camera no frames, and the results of "
+    "every program's triggers. --bag writes a rosbag2 for ROS 2, too, or instead. After a "
+    "lost link the recording goes on. "
     f"{CONNECTS}"
 )
 @click.argument("url")
@@ -76,23 +76,23 @@ _camera = click.option(
 )
 @option("--force")
 @click.option(
-    "--every", type=SECONDS, metavar="SECONDS", help="Send a trigger every so many seconds."
+    "--every", type=SECONDS, metavar="SECONDS", help="Seconds between two triggers to send."
 )
 @click.option(
     "--pictures",
     metavar="judged|none|SOURCE",
-    help="judged: of each result the picture that it was made of, of software cameras (as usual) "
-    "and of a fleet's cameras with frames. none: no pictures. SOURCE: beside the results those of "
-    "a source of frames, such as gige://HOST.",
+    help="judged: each result's own picture, for software cameras (the default) and a fleet's "
+    "cameras with frames. none: no pictures. SOURCE: also the pictures of a source of "
+    "frames, such as gige://HOST.",
 )
 @click.option(
     "--read-images",
     is_flag=True,
-    help="With --every: read the camera's picture after each result, and keep it with that.",
+    help="With --every: read the camera's picture after each result, and record it.",
 )
 @option("--name", help="The camera's name in the file; default HOST:PORT.")
 @option("--application")
-@option("--interpret-as", help="How to read results; default raw: bytes, kept as hex.")
+@option("--interpret-as", help="Interpretation of results; default raw: bytes, kept as hex.")
 @runs("--y-down", "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
 async def record(
     url: str,
@@ -138,15 +138,15 @@ class _Plan(NamedTuple):
     """The triggers and pictures of a recording."""
 
     every: float | None  # seconds between triggers; None: none are sent
-    source: FrameSource | None  # whose pictures are recorded as well
-    judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
+    source: FrameSource | None  # source whose pictures are recorded, too
+    judged: JudgedPictures | None  # finds each result's picture among the camera's frames
     read_images: bool  # whether the camera's picture is read after each trigger
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
-    """Return the finder of each result's picture; None if the camera tells which one it is.
+    """Return the finder of each result's picture; None if the camera itself names the picture.
 
-    Raises UnsupportedError: nobody knows the pictures of the camera's results.
+    Raises UnsupportedError: the pictures of the camera's results cannot be found.
     """
     from smartcam.settings import is_fleet, is_software, masked
 
@@ -231,7 +231,7 @@ async def _record(
 
 @contextlib.asynccontextmanager
 async def _judged_source(camera: Camera, plan: _Plan) -> AsyncIterator[FrameSource | None]:
-    """Give the open source of the pictures among which those of results are looked for."""
+    """Yield the open source of the frames among which results' pictures are searched."""
     if plan.judged is None:
         yield None
         return
@@ -247,7 +247,7 @@ def _jobs(
 
     jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
     count = options.count
-    images = recorders[0] if plan.read_images else None  # and the last one is read, too
+    images = recorders[0] if plan.read_images else None  # so that the last picture is read, too
     jobs.append(_count(results, recorders[0], plan.judged, count if images is None else None))
     if plan.every is not None:
         step = options.step(DEFAULT_TRIGGER_TIMEOUT)
@@ -258,7 +258,7 @@ def _jobs(
 
 
 def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
-    """Note what the frames would tell, which a shared camera's agent keeps, and what it knows."""
+    """Record facts that a shared camera's frames would show, as far as the agent knows them."""
     from smartcam._client._inside import in_pixels, own_interpreter
 
     dialect = camera.capabilities.dialect
@@ -296,12 +296,12 @@ async def _watch_disk(recorder: Recorder) -> None:
 async def _count(
     results: Any, recorder: Recorder, judged: JudgedPictures | None, count: int | None
 ) -> None:
-    """Return when there are so many results, and pictures of them; or at the camera's end."""
+    """Return after so many results, with their pictures; or at the camera's end."""
     while count is None or recorder.counts.results < count:
         try:
             await anext(results)
         except InterpretationError:
-            pass  # it is recorded as an error
+            pass  # the loss is recorded as an error
         except StopAsyncIteration:
             return
     if judged is not None:
@@ -309,15 +309,15 @@ async def _count(
 
 
 async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str) -> None:
-    """Record a source's pictures, as the camera's; the end of a source ends the recording."""
+    """Record a source's pictures as the camera's; the end of the source ends the recording."""
     await recorder.record(source, camera=camera)
 
 
 async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: int) -> None:
-    """Keep the picture that a result was made of; of another trigger's it would be a wrong one."""
+    """Record a result's picture, before another trigger replaces the picture."""
     try:
         image = await camera.read_image()
-    except CommandRejectedError:  # it has none, which the recorded frames say
+    except CommandRejectedError:  # it has none, as the recorded frames show
         return
     if recorder.counts.results == results:
         await asyncio.to_thread(recorder.add_image, camera.name, image, result=result)
@@ -331,10 +331,10 @@ async def _trigger(
     count: int | None,
     judged: JudgedPictures | None,
 ) -> None:
-    """Send triggers; what goes wrong with one is recorded, as long as the first ones went well.
+    """Send triggers; errors are recorded, once the first triggers have succeeded.
 
-    ``images``: the recorder that also gets the picture of each result, of ``count`` of them.
-    ``judged``: finds the picture of each result once there are pictures, which is waited for.
+    ``images``: the recorder that also gets the picture of each of ``count`` results.
+    ``judged``: finder of each result's picture; triggers wait until there are pictures.
     """
     if judged is not None:
         await judged.wait_streaming()
@@ -358,20 +358,20 @@ async def _trigger(
         except ConnectionLostError:
             with contextlib.suppress(ResponseTimeoutError):
                 await camera.wait_connected()
-        # a trigger that took longer than planned leaves some out, and none comes in a hurry
+        # a trigger that took too long skips the next ones, instead of hurrying
         when += every * max(1, -(-(loop.time() - when) // every))
         await asyncio.sleep(when - loop.time())
 
 
 async def _end_all(recorders: list[Recorder], camera: Camera, options: Options) -> None:
-    """End each file; where one of them failed, the others are ended all the same."""
+    """End each file, even if ending another has failed."""
     async with contextlib.AsyncExitStack() as stack:
         for recorder in reversed(recorders):
             stack.push_async_callback(_end, recorder, camera, options)
 
 
 async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
-    """End the file, and tell what is in it; without a session there is no file."""
+    """End the file, and report its contents; without a session there is no file."""
     path = recorder.path
     await asyncio.to_thread(recorder.close)
     bag = _as_bag(recorder)
@@ -383,37 +383,37 @@ async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
     elif camera.statistics().sessions:
         counts, size = recorder.counts._asdict(), path.stat().st_size
         always = ("frames", "results", "events", "errors")
-        told = ", ".join(
+        text = ", ".join(
             f"{kind.replace('_', ' ')} {number}"
             for kind, number in counts.items()
             if number or kind in always
         )
-        options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {told}; {size} bytes")
+        options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {text}; {size} bytes")
     elif path.is_file() and not path.is_symlink():
         path.unlink()
 
 
 def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
-    told = counts._asdict()
-    text = ", ".join(f"{kind} {number}" for kind, number in told.items())
-    options.show({"bag": str(path), **told}, f"{path}: {text}")
+    values = counts._asdict()
+    text = ", ".join(f"{kind} {number}" for kind, number in values.items())
+    options.show({"bag": str(path), **values}, f"{path}: {text}")
 
 
 @click.command(
     help="Emulate the recorded cameras: each trigger gets the recorded containers, byte for byte "
-    "and after the same time, and what came by itself comes again. Prints one line per camera, its "
-    "URL. When a recording is over its triggers get no result, unless --loop. A folder that an "
-    "agent recorded (record: in its fleet file) is played as a fleet: its cameras under their "
-    "names, through an agent, whose fleet URLs are printed; --port is the agent's then. A TIME is "
-    "2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
+    "and after the same time, and unasked messages come again. Prints one line per camera, "
+    "its URL. After the end of a recording triggers get no result, unless --loop. A folder "
+    "that an agent recorded (record: in its fleet file) is played as a fleet: its cameras "
+    "under their names, through an agent, with their fleet URLs; --port is the agent's then. "
+    "A TIME is 2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
 )
 @click.argument("recording", metavar="RUN.mcap|FOLDER", type=click.Path())
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
-@click.option("--loop", is_flag=True, help="Begin again when it is over.")
+@click.option("--loop", is_flag=True, help="Begin again at the end of the recording.")
 @click.option(
-    "--from", "since", metavar="TIME", callback=_time, help="Play what came from then on."
+    "--from", "since", metavar="TIME", callback=_time, help="Begin at this time of the recording."
 )
-@click.option("--until", metavar="TIME", callback=_time, help="Play what came until then.")
+@click.option("--until", metavar="TIME", callback=_time, help="End at this time of the recording.")
 @_camera
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
@@ -424,7 +424,7 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
     help="Port; 0 takes a free one. Further cameras take the next ones.",
 )
 @click.option(
-    "--transport", type=click.Choice(("tcp", "udp")), help="Over; default the recorded one."
+    "--transport", type=click.Choice(("tcp", "udp")), help="Transport; default the recorded one."
 )
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def replay(
@@ -479,7 +479,7 @@ async def replay(
 
 
 async def _play_fleet(played: FleetReplay, options: Options) -> None:
-    """Play a folder, until it is cut off."""
+    """Play a folder until cancelled."""
     with from_part("fleet", "a folder of a fleet's recordings needs"):
         from smartcam._cli.serve import share
 
@@ -509,7 +509,7 @@ def _over() -> None:
 async def pcap(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
-    """Show a recording to Wireshark."""
+    """Convert a recording for Wireshark."""
     from smartcam.recording import write_pcap
 
     count = write_pcap(_loaded(recording), output, camera=camera, overwrite=force)
@@ -518,21 +518,21 @@ async def pcap(
 
 @click.command(
     help="Make a rosbag2 of a recording: an MCAP file with ROS 2 messages in a folder, in the "
-    "recorded order and with the recorded times. Values are as recorded; with --interpret-as or "
-    "--calibration each result's bytes are read again, and those that do not fit go in with why."
+    "recorded order and with the recorded times. Values are as recorded; --interpret-as or "
+    "--calibration interprets each result's bytes again, and keeps the errors."
 )
 @click.argument("recording", metavar="RUN.mcap", type=click.Path())
 @click.option(
     "-o", "--output", metavar="FOLDER", type=click.Path(), required=True, help="The bag's folder."
 )
-@option("--force", help="Take the place of a bag that is there.")
+@option("--force", help="Replace an existing bag.")
 @_camera
-@option("--interpret-as", help="How to read the results again; default as recorded.")
+@option("--interpret-as", help="New interpretation of the results; default as recorded.")
 @runs("--y-down", "--calibration", *OUTPUT)
 async def bag(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
-    """Show a recording to ROS 2."""
+    """Convert a recording for ROS 2."""
     with from_part("ros2", "a bag needs"):
         from smartcam.recording._inside import BagConversion
 
@@ -550,7 +550,7 @@ async def bag(
     with contextlib.closing(conversion.steps()) as steps:
         for place, _ in enumerate(steps):
             if not place % 32:
-                await asyncio.sleep(0)  # where it can be cut off
+                await asyncio.sleep(0)  # a place where it can be cancelled
     counts = conversion.counts
     if counts.unread:
         click.echo(
@@ -562,7 +562,7 @@ async def bag(
 
 
 def _loaded(path: str, since: datetime | None = None, until: datetime | None = None) -> Recording:
-    """Return a recording; where it stops being readable stands on stderr."""
+    """Return a recording; report on stderr where it stops being readable."""
     from smartcam.recording import load_recording
 
     loaded = load_recording(Path(path), since=since, until=until)

@@ -1,4 +1,4 @@
-"""``smartcam results``: what is in a store of results, here or beside a fleet's agents."""
+"""``smartcam results``: show the contents of a store of results, in a file or beside agents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _UNITS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days"}
 _AGE = re.compile(r"(\d{1,6}(?:\.\d{1,3})?) ?(s|min|h|d)", re.ASCII)
 
 DEFAULT_COUNT = 1000
-"""Results that are shown where ``--count`` says nothing."""
+"""Number of results that are shown without ``--count``."""
 
 
 def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
@@ -35,16 +35,16 @@ def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
 
 
 @click.command(
-    help="Show the results in a store: those of a shift, those that failed. PLACE is the file that "
-    "an outlet of the kind sqlite writes, or a fleet's URL: then the fleet's agents are asked what "
-    "their stores have. The oldest result comes first. With --failed those that did not pass, by "
-    "the names of their truth values, with errors and gaps. The last line of a store counts all of "
-    "the time."
+    help="Show the results in a store: those of a shift, those that failed. PLACE is the file of "
+    "an outlet of the kind sqlite, or a fleet's URL, whose agents then show their stores. "
+    "The oldest result comes first. --failed shows the results that did not pass, by the "
+    "names of their truth values, with errors and gaps. The last line of a store counts all "
+    "of the time."
 )
 @click.argument("place", metavar="FILE|URL")
 @click.option("--since", metavar="AGE|TIME", callback=_since, help="8h, 30min, 2d, or a time.")
 @click.option("--failed", is_flag=True, help="Errors, gaps, and results that did not pass.")
-@click.option("--camera", metavar="PATTERN", help="Of these cameras: line1/cam1, line1/**.")
+@click.option("--camera", metavar="PATTERN", help="Only these cameras: line1/cam1, line1/**.")
 @runs("--count", "--timeout", *OUTPUT)
 async def results(
     place: str, since: datetime | None, failed: bool, camera: str | None, options: Options
@@ -64,7 +64,7 @@ async def results(
 async def _ask(
     url: str, since: datetime | None, failed: bool, camera: str, most: int, options: Options
 ) -> None:
-    """Show what the stores of a fleet's agents have."""
+    """Show the contents of the stores of a fleet's agents."""
     with from_part("fleet", "the results of a fleet need"):
         import smartcam.fleet
     async with smartcam.fleet.open(url, connect_timeout=options.step(10.0)) as fleet:
@@ -98,9 +98,9 @@ def _show(rows: list[dict[str, Any]], summary: dict[str, Any], name: str, option
 
 def _text(row: dict[str, Any]) -> str:
     at = datetime.fromisoformat(row["at"]).astimezone()
-    said = row["error"] or row["value"] or ""
+    content = row["error"] or row["value"] or ""
     lost = f" ({row['lost']} lost)" if row["lost"] else ""
     application = "" if row["application"] is None else f" application {row['application']}"
     picture = f"  {row['picture']}" if row["picture"] else ""
     camera = row["camera"] or "all cameras"
-    return f"{at:%Y-%m-%d %H:%M:%S} {camera}{application}: {said}{lost}{picture}"
+    return f"{at:%Y-%m-%d %H:%M:%S} {camera}{application}: {content}{lost}{picture}"

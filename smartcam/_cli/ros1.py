@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    help="Have cameras seen in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
-    'services that "smartcam ros2" has, without what ROS 1 has not. A fleet file is served as by '
-    '"smartcam serve", and a fleet\'s URL, fleet://HOST, means the cameras of a fleet that is '
-    "served already. Prints one line per camera, its node. A bridge that is not there, or is lost, "
-    "is tried on, which is told on stderr, with --json on stdout, by the same object again. Needs "
-    'the extras "ros2" and "web", and no ROS on this machine.'
+    help="Show cameras in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
+    'services of "smartcam ros2", without those that ROS 1 cannot have. A fleet file is '
+    'served as by "smartcam serve"; a fleet\'s URL, fleet://HOST, means the cameras of a '
+    "running fleet. Prints one line per camera, with its node. A missing or lost bridge is "
+    "tried again, which is reported on stderr, with --json as the same object on stdout. "
+    'Needs the extras "ros2" and "web", and no ROS on this machine.'
 )
 @click.argument("place", metavar="FLEET")
 @click.option(
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
     metavar="URL",
     help="The rosbridge, such as ws://192.168.0.5:9090.",
 )
-@click.option("--namespace", help="In front of the cameras' names, such as /plant.")
+@click.option("--namespace", help="Prefix of the cameras' names, such as /plant.")
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def ros1(place: str, bridge: str, namespace: str | None, options: Options) -> None:
-    """Have cameras seen in ROS 1."""
+    """Make cameras nodes in ROS 1."""
     from smartcam.ros1._inside import checked_url
 
-    checked_url(bridge)  # before cameras are taken
+    checked_url(bridge)  # fails before cameras are taken
     begun: set[str] = set()
 
     def tell(node: RosbridgeNode) -> None:
         if node.full_name in begun:
-            _tell(node, bridge, options)
+            _report(node, bridge, options)
 
     from smartcam.settings import is_fleet
 
@@ -69,9 +69,9 @@ async def _served(
     from smartcam.ros1._inside import bridged
 
     file, folder = load_fleet(path), Path(path).parent
-    said = {one.name: one.entry.ros2 for one in file.plan()}
-    found = {name: one.load_calibration(folder) for name, one in said.items()}
-    places = {name: one.load_hand_eye(folder) for name, one in said.items()}
+    sections = {one.name: one.entry.ros2 for one in file.plan()}
+    found = {name: one.load_calibration(folder) for name, one in sections.items()}
+    places = {name: one.load_hand_eye(folder) for name, one in sections.items()}
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_tried()
@@ -80,7 +80,7 @@ async def _served(
             tell,
             server.address,
             _section(namespace or section.namespace, autostart=section.autostart),
-            cameras=said,
+            cameras=sections,
             calibrations={name: one for name, one in found.items() if one is not None},
             places={name: one for name, one in places.items() if one is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
@@ -122,8 +122,8 @@ def _node(node: RosbridgeNode, bridge: str) -> dict[str, Any]:
     }
 
 
-def _tell(node: RosbridgeNode, bridge: str, options: Options) -> None:
-    """Say that a bridge has come, or is gone."""
+def _report(node: RosbridgeNode, bridge: str, options: Options) -> None:
+    """Report that a bridge is connected, or lost."""
     at = datetime.now(UTC)
     if options.as_json:
         options.show({**_node(node, bridge), "at": at}, "")

@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 ROS_ARGS = "--ros-args"
-"""The option from which on all is for ROS, as of any program of ROS."""
+"""The option after which all arguments are for ROS, as in any program of ROS."""
 
 THROUGH = {"zenoh": "zenoh", "native": "rclpy"}
 """Values of ``--rmw``, and their names in a fleet file."""
 
 
 class RosCommand(click.Command):
-    """A command that leaves what follows ``--ros-args`` to ROS."""
+    """A command that leaves the arguments after ``--ros-args`` to ROS."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Keep the arguments for ROS, and read the others."""
+        """Keep the arguments for ROS, and parse the others."""
         at = args.index(ROS_ARGS) if ROS_ARGS in args else len(args)
         left = super().parse_args(ctx, args[:at])
         ctx.params["ros_args"] = tuple(args[at:])
@@ -35,13 +35,12 @@ class RosCommand(click.Command):
 
 @click.command(
     cls=RosCommand,
-    help="Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C or "
-    "SIGTERM; with --rmw native through the rclpy that is installed, over any middleware, and what "
-    "follows --ros-args is ROS' then. "
-    'A fleet file is served as by "smartcam serve", and a fleet\'s URL, fleet://HOST, '
-    "means the cameras of a fleet that is served already. Prints one line per camera, its node. "
-    'What "ros2" in a fleet file says counts where an option says nothing. Needs the extra "ros2", '
-    "and no ROS but for --rmw native.",
+    help="Show cameras in ROS 2, as nodes for programs that use rmw_zenoh, until Ctrl-C or "
+    "SIGTERM; with --rmw native through the installed rclpy, over any middleware, and "
+    'options after --ros-args are those of ROS then. A fleet file is served as by "smartcam '
+    "serve\"; a fleet's URL, fleet://HOST, means the cameras of a running fleet. Prints one "
+    'line per camera, with its node. Options win over "ros2" in a fleet file. Needs the '
+    'extra "ros2", and ROS only for --rmw native.',
 )
 @click.argument("place", metavar="FLEET")
 @click.option(
@@ -49,16 +48,16 @@ class RosCommand(click.Command):
     type=click.IntRange(0, 0xFFFFFFFF),
     help="The domain's number; default ROS_DOMAIN_ID, or 0.",
 )
-@click.option("--namespace", help="In front of the cameras' names, such as /plant.")
+@click.option("--namespace", help="Prefix of the cameras' names, such as /plant.")
 @click.option(
     "--distribution",
     type=click.Choice(["humble", "jazzy", "kilted", "lyrical", "rolling"]),
-    help="Of ROS, whose type hashes are spoken; default jazzy, or the installed one.",
+    help="ROS distribution whose type hashes are used; default jazzy, or the installed one.",
 )
 @click.option(
     "--rmw",
     type=click.Choice(list(THROUGH)),
-    help="Who speaks: smartcam itself as rmw_zenoh does, or the installed ROS; default zenoh.",
+    help="zenoh: smartcam itself, like rmw_zenoh; native: the installed ROS.  [default: zenoh]",
 )
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def ros2(
@@ -70,15 +69,15 @@ async def ros2(
     ros_args: tuple[str, ...],
     options: Options,
 ) -> None:
-    """Have cameras seen in ROS 2."""
-    said: dict[str, object] = {
+    """Make cameras nodes in ROS 2."""
+    chosen: dict[str, object] = {
         "domain": domain,
         "namespace": namespace,
         "distribution": distribution,
         "through": None if rmw is None else THROUGH[rmw],
         "args": ros_args or None,
     }
-    given = {name: value for name, value in said.items() if value is not None}
+    given = {name: value for name, value in chosen.items() if value is not None}
     from smartcam.settings import is_fleet
 
     if is_fleet(place):

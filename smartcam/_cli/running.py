@@ -1,4 +1,4 @@
-"""Running a command: signals, exit codes, errors in one line."""
+"""Run a command: signals, exit codes, errors in one line."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (CameraFaultError, 5),
     (TriggerError, 5),
 )
-"""First match decides. 0 done; 1 a fault of smartcam; 2 wrong usage; 3 no session or a broken one,
-or a source of frames that is not there, in use or gone; 4 a wait in a session, or for a frame, ran
-out; 5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
-interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut
-off by Ctrl-C or SIGTERM."""
+"""The first match decides. 0 done; 1 a fault of smartcam; 2 wrong usage; 3 no session or a broken
+one, or a source of frames that is missing, in use or gone; 4 a wait in a session, or for a frame,
+timed out; 5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
+interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143:
+ended by Ctrl-C or SIGTERM."""
 
 
 TAKEN = (
@@ -88,17 +88,17 @@ def run(
     Disconnect).
 
     Args:
-        main: what to run.
+        main: coroutine of the command.
         program: name of the program in the error line.
         debug: log to stderr and show tracebacks.
-        as_json: tell an error as a line of JSON.
-        interrupted: exit code after Ctrl-C; 0 where that is the way to end.
+        as_json: print an error as a line of JSON.
+        interrupted: exit code after Ctrl-C; 0 if that is the usual end.
         terminated: exit code after SIGTERM.
     """
     if debug:
         logging.basicConfig(level=logging.DEBUG, stream=sys.stderr)
     else:
-        # without a handler Python prints warnings on its own, beside our one line
+        # without a handler Python would print warnings beside our one line
         logging.getLogger("smartcam").addHandler(logging.NullHandler())
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a camera's texts may have letters that the terminal's encoding lacks
@@ -109,25 +109,25 @@ def run(
     except (KeyboardInterrupt, asyncio.CancelledError):
         sys.exit(terminated if signal.SIGTERM in ended_by else interrupted)
     except BrokenPipeError:
-        # the reader went away, as `head` does; nothing may be written at exit either
+        # the reader has gone, as after `head`; nothing may be written at exit either
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except click.ClickException:
-        raise  # a wrong use, which click tells
+        raise  # wrong usage, which click reports
     except Exception as exc:  # noqa: BLE001 - the last place: one line instead of a traceback
         if debug:
             traceback.print_exc()
         text = _one_line(exc)
         word = tinted("error", "error:")
-        told = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: {word} {text}"
-        click.echo(told, err=True)
+        line = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: {word} {text}"
+        click.echo(line, err=True)
         sys.exit(exit_code(exc))
     sys.exit(0)
 
 
 async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None) -> None:
-    """Run jobs until the first is over, or for so many seconds; raise what it raised."""
+    """Run jobs until the first ends, or for so many seconds; raise its error."""
     tasks = [asyncio.create_task(job) for job in jobs]
     try:
         done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
@@ -137,7 +137,7 @@ async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None
     finally:
         for task in tasks:
             task.cancel()
-        # what a second one raised is the same loss again, and is not to be complained about
+        # the error of a second job is the same loss, and must not be reported again
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
@@ -146,13 +146,13 @@ def _one_line(error: Exception) -> str:
         return f"unexpected {error!r}; --debug shows where"
     lines = str(error).splitlines()
     if isinstance(error, LayoutError):
-        del lines[1:]  # the text with a mark below it; the first line tells the position
+        del lines[1:]  # the layout with a mark; the first line has the position
     text = " ".join(line.strip() for line in lines)
     cause = error.__cause__
     hung_up = (
         isinstance(error, ConnectionLostError)
         and isinstance(cause, ConnectionError)
-        and not isinstance(cause, LinkError)  # such as an agent that is gone
+        and not isinstance(cause, LinkError)  # such as a lost agent
     )
     return f"{text}. {TAKEN}" if hung_up else text
 
@@ -160,7 +160,7 @@ def _one_line(error: Exception) -> str:
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
     """Let the first SIGINT or SIGTERM cancel ``main``; a second one ends the program as usual.
 
-    The handlers are set here and not left to asyncio, which sets none where SIGINT was ignored at
+    The handlers are set here and not left to asyncio, which sets none if SIGINT was ignored at
     the start, as it is for a job in a shell script's background.
     """
     loop = asyncio.get_running_loop()

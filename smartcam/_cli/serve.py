@@ -35,20 +35,20 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
 
 
 @click.command(
-    help="Have the sessions with the cameras of a fleet file, and share them with any number of "
-    "programs, until Ctrl-C or SIGTERM. Prints one line per camera, its fleet URL, which every "
-    "command takes that takes a camera's. A camera that is not there says so on its line, and is "
-    "tried on; what comes and goes later is told on stderr, with --json on stdout, by the same "
-    "object again. SIGHUP has the file read again, but where stdin is a terminal. Needs the extra "
-    '"fleet"; with operations: in the file "operations", too.'
+    help="Connect to the cameras of a fleet file, and share them with any number of programs, "
+    "until Ctrl-C or SIGTERM. Prints one line per camera, with its fleet URL, which every "
+    "command accepts as a camera. A missing camera has the reason on its line, and is tried "
+    "again. Later changes are reported on stderr, with --json as the same object on stdout. "
+    'SIGHUP reads the file again, unless stdin is a terminal. Needs the extra "fleet"; with '
+    'operations: in the file "operations", too.'
 )
 @click.argument("file", required=False, metavar="FLEET.yaml")
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of fleet files, and end.")
 @click.option(
     "--log",
     type=click.Choice(["text", "json"]),
-    help="How what happens is told on stderr; default: as the file says, or text. json: one object "
-    "a line, from all that logs, and nothing else.",
+    help="Form of the log on stderr; default: as the file says, or text. json: one object "
+    "a line, and nothing else.",
 )
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
@@ -62,7 +62,7 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
     raise_descriptor_limit()
-    if log == "json":  # a file that is wrong is told so, too
+    if log == "json":  # an error in the file is logged so, too
         with _logged(None, options):
             server = smartcam.fleet.serve(file)
     else:
@@ -75,7 +75,7 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
 
 @contextlib.contextmanager
 def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
-    """Have all logs of the block written as lines of JSON, and an error that ends it."""
+    """Write all logs of the block as lines of JSON, and the error that ends it."""
     section = None if server is None else server.file.operations
     level = logging.getLevelName(
         "DEBUG" if options.debug else section.level.upper() if section else "INFO"
@@ -93,13 +93,13 @@ def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
 
 
 class Serving:
-    """A server in its process: what it says of itself, and the signals that it hears.
+    """A server in its process: its output, and the signals that it handles.
 
     Args:
         server: the agent.
         options: options of the command.
-        as_lines: what happens is logged, and not printed for people.
-        show: says what is there, once it is; None: a line of each camera.
+        as_lines: events are logged, and not printed for people.
+        show: function that reports the start; None: a line for each camera.
     """
 
     def __init__(
@@ -143,20 +143,20 @@ class Serving:
                 if self._as_lines:
                     self._log(event)
                 if self._options.as_json or not self._as_lines:
-                    tell(server, event, self._options)
+                    report_event(server, event, self._options)
 
     async def _enter(self, stack: contextlib.AsyncExitStack) -> None:
-        """Start the agent; one whose router is away is tried again, as a camera is."""
-        policy, told = Backoff(), False
+        """Start the agent; try again while its router is away, like a camera."""
+        policy, warned = Backoff(), False
         for delay in policy.delays():
             try:
                 await stack.enter_async_context(self._server)
             except ConnectFailedError as exc:
                 if self._server.file.endpoints[0] or not policy.transient(exc):
-                    raise  # it cannot listen, or would never be let in
-                if not told:
+                    raise  # it cannot listen, or would never be accepted
+                if not warned:
                     self._warn(f"{exc}; it is tried on")
-                told = True
+                warned = True
             else:
                 return
             await asyncio.sleep(delay)
@@ -168,7 +168,7 @@ class Serving:
             click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
 
     def _tell_outlet(self, name: str, why: str) -> None:
-        if not self._as_lines:  # else it was logged
+        if not self._as_lines:  # otherwise it was logged
             text = why or "delivers again"
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
 
@@ -177,15 +177,15 @@ class Serving:
         if not server.file.cameras:
             url = server.address.url
             router: dict[str, Any] = {"url": url, "router": True}
-            self._say("", router, f"{url}  a router, without cameras", connected=True)
+            self._print("", router, f"{url}  a router, without cameras", connected=True)
         for name in [*server.hosts]:
             value = _camera(server, name)
             why = "" if value["connected"] else f"  not connected: {value['reason']}"
-            self._say(name, value, f"{value['url']}{why}", connected=value["connected"])
+            self._print(name, value, f"{value['url']}{why}", connected=value["connected"])
 
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
-        """Serve health and numbers as long as the block runs, where the file says so."""
+        """Serve health and metrics while the block runs, if the file has ``operations``."""
         section = self._server.file.operations
         if section is None or section.place is None:
             yield
@@ -196,7 +196,7 @@ class Serving:
             logger.info("health and numbers are at port %d of %s", site.port, section.place[0])
             yield
 
-    def _say(self, camera: str, value: dict[str, Any], text: str, *, connected: bool) -> None:
+    def _print(self, camera: str, value: dict[str, Any], text: str, *, connected: bool) -> None:
         if self._as_lines:
             level = logging.INFO if connected else logging.WARNING
             logger.log(level, "shared: %s", text, extra={"camera": camera})
@@ -206,7 +206,7 @@ class Serving:
     def _log(self, event: CameraEvent) -> None:
         extra = {"camera": event.camera}
         if event.camera not in self._server.hosts:
-            return  # given up on purpose
+            return  # ended on purpose
         if isinstance(event, Disconnected):
             logger.warning("not connected: %s", event.reason, extra=extra)
         elif isinstance(event, (Connected, Reconnected)):
@@ -215,11 +215,11 @@ class Serving:
     # ------------------------------------------------------------------ reloads
 
     async def _reload_when(self, wanted: asyncio.Event) -> None:
-        """Read the file again whenever it is wanted; several wishes at a time are one."""
+        """Read the file again whenever it is wanted; several requests at a time count as one."""
         while True:
             await wanted.wait()
             wanted.clear()
-            with contextlib.suppress(SmartCamError):  # which was told
+            with contextlib.suppress(SmartCamError):  # the error was reported
                 await self._server.reload()
 
     def _on_reload(self, outcome: FleetChanges | SmartCamError | None) -> None:
@@ -229,14 +229,14 @@ class Serving:
             return
         if self._ready:
             self._notifier.ready(self._status())
-        if not self._as_lines:  # else it was logged
+        if not self._as_lines:  # otherwise it was logged
             failed = isinstance(outcome, Exception)
             text = (
                 f"not reloaded, all stays as it was: {outcome}"
                 if failed
                 else f"reloaded: {outcome}"
             )
-            with contextlib.suppress(OSError):  # nobody reads it
+            with contextlib.suppress(OSError):  # stdout is closed
                 click.echo(text, err=True)
 
     def _status(self) -> str:
@@ -251,7 +251,7 @@ class Serving:
 
 @contextlib.contextmanager
 def _hangup() -> Iterator[asyncio.Event]:
-    """Give what SIGHUP sets. In a terminal it means that the terminal is gone, and ends us."""
+    """Yield an event that SIGHUP sets. In a terminal SIGHUP ends the program instead."""
     wanted, loop = asyncio.Event(), asyncio.get_running_loop()
     number = getattr(signal, "SIGHUP", None)
     if number is None or (sys.stdin is not None and sys.stdin.isatty()):
@@ -264,12 +264,12 @@ def _hangup() -> Iterator[asyncio.Event]:
     finally:
         with contextlib.suppress(NotImplementedError):
             loop.remove_signal_handler(number)
-            signal.signal(number, signal.SIG_IGN)  # while it ends, there is nothing to read again
+            signal.signal(number, signal.SIG_IGN)  # the program is ending
 
 
 @contextlib.asynccontextmanager
 async def _while_here(work: Any) -> AsyncIterator[None]:
-    """Run a coroutine in a task, as long as the block runs."""
+    """Run a coroutine in a task while the block runs."""
     task = asyncio.get_running_loop().create_task(work)
     try:
         yield
@@ -315,7 +315,7 @@ async def share(server: FleetServer, options: Options) -> None:
         why = "" if value["connected"] else f"  not connected: {value['reason']}"
         options.show(value, f"{value['url']}{why}")
     async for event in events:
-        tell(server, event, options)
+        report_event(server, event, options)
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:
@@ -333,8 +333,8 @@ def _camera(server: FleetServer, name: str) -> dict[str, Any]:
     }
 
 
-def tell(server: FleetServer, event: CameraEvent, options: Options) -> None:
-    """Say that a camera has come, or is gone."""
+def report_event(server: FleetServer, event: CameraEvent, options: Options) -> None:
+    """Report that a camera was connected, or lost."""
     known = event.camera in server.hosts
     if not (known and isinstance(event, (Connected, Disconnected, Reconnected))):
         return

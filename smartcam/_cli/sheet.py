@@ -45,7 +45,7 @@ def _count(name: str, about: str, least: int = 3) -> Callable[[F], F]:
 def _makes(
     function: Callable[..., Coroutine[Any, Any, None]],
 ) -> Callable[..., None]:
-    """Make a coroutine function a sheet's command, with what all sheets share."""
+    """Turn a coroutine function into a sheet's command, with the options of all sheets."""
     command = runs(*OUTPUT)(function)
     for option in (
         click.option(
@@ -54,14 +54,14 @@ def _makes(
             nargs=2,
             type=float,
             metavar="X Y",
-            help="How long the rulers along x and y are on the printed sheet, mm: --describe then "
+            help="Measured lengths of the printed rulers along x and y, mm: --describe then "
             "writes the target's real lengths.",
         ),
         click.option(
             "--describe",
             metavar="FILE",
             type=click.Path(dir_okay=False),
-            help="Write the target's description there, as JSON.",
+            help="File for the target's description, as JSON.",
         ),
         click.option(
             "-o",
@@ -70,7 +70,7 @@ def _makes(
             metavar="FILE",
             type=click.Path(dir_okay=False),
             multiple=True,
-            help="Where the sheet goes; .svg or .pdf. May be given twice.",
+            help="File for the sheet; .svg or .pdf. May be given twice.",
         ),
         click.option(
             "--page",
@@ -114,7 +114,7 @@ async def checkerboard(**given: Any) -> None:
     help="OpenCV's name of the markers' dictionary.",
 )
 @click.option(
-    "--legacy-pattern", is_flag=True, help="As OpenCV before 4.6 has it: differs with even rows."
+    "--legacy-pattern", is_flag=True, help="As in OpenCV before 4.6: differs with even rows."
 )
 @_makes
 async def charuco(square: float, marker: float | None, **given: Any) -> None:
@@ -126,8 +126,8 @@ async def charuco(square: float, marker: float | None, **given: Any) -> None:
 @sheet.command("marker_grid")
 @_count("--columns", "Markers along x.", least=1)
 @_count("--rows", "Markers along y.", least=1)
-@_length("--marker", "Side of a marker, its black border with it.", required=True)
-@_length("--gap", "Between two markers.", required=True)
+@_length("--marker", "Side of a marker, with its black border.", required=True)
+@_length("--gap", "Distance between two markers.", required=True)
 @click.option(
     "--dictionary",
     metavar="NAME",
@@ -138,7 +138,7 @@ async def charuco(square: float, marker: float | None, **given: Any) -> None:
 @click.option(
     "--kalibr",
     is_flag=True,
-    help="An AprilGrid as Kalibr has it: tags of 36h11 with a border of two modules, numbered from "
+    help="An AprilGrid of Kalibr: tags of 36h11 with a border of two modules, numbered from "
     "the lower left, with squares between their corners.",
 )
 @_makes
@@ -154,10 +154,10 @@ async def marker_grid(dictionary: str, kalibr: bool, **given: Any) -> None:
 @sheet.command()
 @_count("--columns", "Dots of a row.")
 @_count("--rows", "Rows.")
-@_length("--spacing", "Between the middles of two neighbours of a row.", required=True)
-@_length("--diameter", "Of a dot.  [default: half of the spacing, asymmetric: 0.4 of it]")
+@_length("--spacing", "Distance of the centres of two neighbours in a row.", required=True)
+@_length("--diameter", "Diameter of a dot.  [default: half of the spacing, asymmetric: 0.4 of it]")
 @click.option("--asymmetric", is_flag=True, help="Shift every other row, rows half as far apart.")
-@_length("--origin-diameter", "Of the dot at the origin, where it is larger than the others.")
+@_length("--origin-diameter", "Diameter of the dot at the origin, if it is larger than the others.")
 @_makes
 async def circles(spacing: float, diameter: float | None, asymmetric: bool, **given: Any) -> None:
     """Dots in rows and columns."""
@@ -167,7 +167,7 @@ async def circles(spacing: float, diameter: float | None, asymmetric: bool, **gi
 
 
 @sheet.command()
-@_length("--diameter", "Of the origin mark.", default=20.0, show_default=True)
+@_length("--diameter", "Diameter of the origin mark.", default=20.0, show_default=True)
 @_makes
 async def rays(**given: Any) -> None:
     """Rays A and B and an origin mark, which a smart camera can localize."""
@@ -184,7 +184,7 @@ async def _make(
     options: Options,
     **described: Any,
 ) -> None:
-    """Lay out a sheet of what is described and write what is asked for."""
+    """Lay out a sheet with its target and write the files of the options."""
     if not outputs and describe is None:
         raise click.UsageError("nothing to write: give -o FILE.svg, -o FILE.pdf or --describe FILE")
     if measured is not None and describe is None:

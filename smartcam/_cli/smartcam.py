@@ -1,7 +1,7 @@
-"""The ``smartcam`` command: which commands there are, and where they stand.
+"""The ``smartcam`` command: the list of its commands, with their modules.
 
-What a command needs is imported when it is used. Its line of ``--help`` stands here, so that the
-list needs none of them.
+The modules of a command are imported when it is used. The list has each command's line of
+``--help``, so that showing it imports none of them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 EPILOG = (
-    "Exit codes: 0 done; 1 a fault of ours; 2 wrong usage, a bad layout text included; 3 no "
+    "Exit codes: 0 done; 1 a fault of smartcam; 2 wrong usage, or a bad layout text; 3 no "
     "session: nothing listens, silence or garbage, connection lost, no such source of frames; 4 a "
     "wait in a session, or for a frame, ran out; 5 the camera refused, is not running or has no "
     "such pixels; 6 a result is not interpretable; 7 a calibration that was checked is stale, or "
@@ -36,7 +36,7 @@ class Listed(NamedTuple):
     Attributes:
         module: module of this package that has a function with the command's name.
         summary: the first sentence of its help.
-        extra: the extra that brings the module, where smartcam alone does not.
+        extra: the extra that brings the module, "" if smartcam alone has it.
     """
 
     module: str
@@ -58,7 +58,7 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         "image": Listed(
             "image",
             "Write a camera's last picture to a file, as the camera sends it (In-Sight: a "
-            "bitmap), where it can be asked for one.",
+            "bitmap), if its protocol has a request for it.",
         ),
         "status": Listed("camera", "Show a camera's status; changes nothing on it."),
         "start": Listed("camera", "Enter run mode; returns when the camera is ready."),
@@ -75,29 +75,29 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         ),
         "switch": Listed(
             "camera",
-            "Load another application by its id, or by the name of its file where the camera can "
-            "do that; returns when the camera is ready.",
+            "Load another application by its id, or by its file's name if the camera can do "
+            "that; returns when the camera is ready.",
         ),
     },
     "A fleet": {
         "serve": Listed(
             "serve",
-            "Have the sessions with the cameras of a fleet file, and share them with any number "
-            "of programs, until Ctrl-C or SIGTERM.",
+            "Connect to the cameras of a fleet file, and share them with any number of programs, "
+            "until Ctrl-C or SIGTERM.",
             extra="fleet",
         ),
         "fleet": Listed("fleet", "Show and use the cameras of a fleet together.", extra="fleet"),
         "ros2": Listed(
             "ros2",
-            "Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C "
-            "or SIGTERM; with --rmw native through the rclpy that is installed, over any "
-            "middleware, and what follows --ros-args is ROS' then.",
+            "Show cameras in ROS 2, as nodes for programs that use rmw_zenoh, until Ctrl-C or "
+            "SIGTERM; with --rmw native through the installed rclpy, over any middleware, and "
+            "options after --ros-args are those of ROS then.",
             extra="ros2",
         ),
         "ros1": Listed(
             "ros1",
-            "Have cameras seen in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics "
-            'and services that "smartcam ros2" has, without what ROS 1 has not.',
+            "Show cameras in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
+            'services of "smartcam ros2", without those that ROS 1 cannot have.',
             extra="ros2",
         ),
     },
@@ -111,7 +111,7 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         ),
         "inspect": Listed(
             "inspect",
-            "Try an application of a software camera on pictures in files, and draw what it saw.",
+            "Try an application of a software camera on pictures, and draw its findings.",
             extra="inspection",
         ),
         "depth": Listed(
@@ -123,12 +123,12 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
     "Finding out": {
         "find": Listed(
             "find",
-            "Find what listens in networks where cameras do: opens the protocols' ports, sends "
-            "nothing, and tells what comes by itself.",
+            "Find cameras in networks: opens the protocols' ports, sends nothing, and shows "
+            "greetings.",
         ),
         "doctor": Listed(
             "doctor",
-            "Say what is wrong, in plain words and with the cure: name, session, status, "
+            "Report each problem with its cure, in plain words: name, session, status, "
             "application, round trip, run state, results, clock.",
         ),
         "probe": Listed("probe", "Find out how a camera speaks; HOST or URL."),
@@ -167,7 +167,7 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         "replay": Listed(
             "record",
             "Emulate the recorded cameras: each trigger gets the recorded containers, byte for "
-            "byte and after the same time, and what came by itself comes again.",
+            "byte and after the same time, and unasked messages come again.",
         ),
         "pcap": Listed(
             "record",
@@ -191,24 +191,24 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         ),
         "demo": Listed(
             "demos",
-            "Watch smartcam do its main job against an emulated camera over real TCP.",
+            "Show smartcam's main job with an emulated camera over real TCP.",
         ),
     },
 }
 """Commands by topic, in the order of ``--help``."""
 
 LISTED = {name: listed for commands in TOPICS.values() for name, listed in commands.items()}
-"""All of them."""
+"""All commands by name."""
 
 ALIASES = {"emulate": "emulator"}
 """Other names of commands, which no list shows."""
 
 
 class CommandTable(MutableMapping[str, click.Command]):
-    """The commands by name, each imported when it is asked for.
+    """The commands by name, each imported when it is used.
 
     Args:
-        listed: where they stand.
+        listed: modules and summaries of the commands.
     """
 
     def __init__(self, listed: Mapping[str, Listed]) -> None:
@@ -236,7 +236,7 @@ class CommandTable(MutableMapping[str, click.Command]):
 
 
 def _module(name: str, listed: Listed) -> ModuleType:
-    """Return the module of a command; a usage error where the extra that brings it is missing."""
+    """Return the module of a command; raise a usage error if its extra is missing."""
     from smartcam._extras import from_part
     from smartcam.exceptions import MissingExtraError
 
@@ -254,7 +254,7 @@ class CommandsByTopic(ListedGroup):
         super().__init__(name, commands=CommandTable(LISTED), **given)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command by its name, or by another one that it has."""
+        """Return a command by one of its names."""
         return super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -264,11 +264,11 @@ class CommandsByTopic(ListedGroup):
                 formatter.write_dl([(name, listed.summary) for name, listed in commands.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands and options that begin like this."""
+        """Return the commands and options that begin with this text."""
         from click.shell_completion import CompletionItem
 
         found = [
-            # what click shows of a command, which is not imported for it
+            # click's help text of the command, without importing the command
             CompletionItem(
                 name, help=click.Command(name, help=LISTED[name].summary).get_short_help_str()
             )
@@ -299,14 +299,14 @@ def _install_completion(ctx: click.Context, _option: click.Parameter, shell: str
     expose_value=False,
     is_eager=True,
     callback=_install_completion,
-    help="Have the shell complete smartcam and smartcam-emulator, and end; default: the shell that "
-    "SHELL names.",
+    help="Install the shell's completion of smartcam and smartcam-emulator, and end; default: the "
+    "shell that SHELL names.",
 )
 def command() -> None:
     """Talk to industrial smart cameras.
 
     A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP,
-    insight://[USER[:PASSWORD]@]HOST[:PORT]; ?dialect=NAME pins what is otherwise found out (see
+    insight://[USER[:PASSWORD]@]HOST[:PORT]; ?dialect=NAME pins the dialect (see
     "smartcam protocols"). fleet://HOST[:PORT]/NAME is a camera that "smartcam serve" shares with
     any number of programs. "smartcam emulator" (or smartcam-emulator) is a camera to try all of
     it with.

@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from smartcam.inspection import SoftwareDevice
 
 PROTOCOL = "bvs"
-"""The protocol of the emulated cameras, by default."""
+"""The default protocol of the emulated cameras."""
 
 SHOWN = 7
-"""The application that runs for a page where no scenario is given."""
+"""The application that runs for a page without a scenario."""
 
-_SAID = {
+_OPTION_NAMES = {
     "scenario": "scenario",
     "dialect": "--dialect",
     "transport": "--transport",
     "seed": "--seed",
     "web": "--web",
 }
-"""Names, in errors, of the options that not every emulated camera takes."""
+"""Names, in errors, of the options that not every emulated camera accepts."""
 
 
 @click.command("emulator", cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
@@ -45,23 +45,23 @@ _SAID = {
     "--port",
     type=click.IntRange(0, 65535),
     help="Port; 0 takes a free one, a camera's own is 36701 (BVS) or 23 (In-Sight). Further "
-    "cameras take the next ones. Default what the scenario says, else 0.",
+    "cameras take the next ones. Default: the scenario's, else 0.",
 )
 @click.option(
     "--protocol",
     metavar="NAME",
-    help="Whose cameras: a name of `smartcam protocols`, where it brings an emulated camera; "
-    f"default what the scenario says, else {PROTOCOL}.",
+    help="Protocol: a name in `smartcam protocols` that brings an emulated camera; "
+    f"default: the scenario's, else {PROTOCOL}.",
 )
 @click.option(
     "--dialect",
     type=click.Choice(DIALECTS),
-    help=f"Speak; default what the scenario says, else {DIALECTS[0]}.",
+    help=f"Dialect; default: the scenario's, else {DIALECTS[0]}.",
 )
 @click.option(
     "--transport",
     type=click.Choice(("tcp", "udp")),
-    help="Over; default what the scenario says, else tcp.",
+    help="Transport; default: the scenario's, else tcp.",
 )
 @click.option(
     "--cameras", type=click.IntRange(1, 10_000), default=1, show_default=True, help="How many."
@@ -71,13 +71,13 @@ _SAID = {
     "quirks",
     multiple=True,
     metavar="NAME[=VALUE]",
-    help="Choose what is not known of real cameras; without a value it is on. Repeatable; goes "
-    "before the scenario's.",
+    help="Set unknown behaviour of real cameras; without a value it is on. Repeatable; overrides "
+    "the scenario's.",
 )
 @click.option(
     "--seed",
     type=int,
-    help="Of all that is left to chance; default what the scenario says, else 0.",
+    help="Seed of all random numbers; default: the scenario's, else 0.",
 )
 @click.option(
     "--program",
@@ -87,7 +87,7 @@ _SAID = {
 )
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scenario files, and end.")
 @click.option(
-    "--generators", is_flag=True, help="List what can make an application's values, and end."
+    "--generators", is_flag=True, help="List the generators of applications' values, and end."
 )
 @page_options("Serve a page that shows and controls the cameras; its address goes to stderr.")
 @runs(*OUTPUT, program="smartcam-emulator", interrupted=0, terminated=0)
@@ -177,7 +177,7 @@ emulator = command
 
 
 def _list_generators(options: Options) -> None:
-    """Print a line for each generator; a broken plug-in costs only its own."""
+    """Print a line for each generator; a broken plug-in affects only its own line."""
     from smartcam.emulator._inside import find_generator
     from smartcam.registry import GENERATORS
 
@@ -228,7 +228,7 @@ def _scenarios(
 ) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
-    Raises ConfigurationError: the file is wrong, or copies are wanted of several cameras;
+    Raises ConfigurationError: the file is wrong, or ``copies`` is given for several cameras;
     MissingExtraError: PyYAML is not installed.
     """
     from smartcam.emulator import load_scenarios
@@ -254,7 +254,7 @@ def _scenarios(
 
 
 def _plain(protocol: str, *, shown: bool) -> Scenario:
-    """Return a camera without a scenario; one with a page has something to show."""
+    """Return a camera without a scenario; with a page, an application runs on it."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
@@ -277,14 +277,14 @@ def _quirk(text: str) -> tuple[str, Any]:
 
 
 def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
-    """Refuse what a camera of this protocol does not take; click.UsageError names what it does."""
+    """Refuse options that a camera of this protocol does not take, with a list of the others."""
     from smartcam.emulator._inside import emulated_class
 
     takes = emulated_class(plan.protocol).takes
-    for name, text in _SAID.items():
+    for name, text in _OPTION_NAMES.items():
         given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         if given and name not in takes:
-            able = ", ".join(text for name, text in _SAID.items() if name in takes)
+            able = ", ".join(text for name, text in _OPTION_NAMES.items() if name in takes)
             raise click.UsageError(f"--protocol {plan.protocol} takes no {text}; it takes {able}")
 
 

@@ -1,7 +1,7 @@
 """Notify systemd: one datagram each to the socket that NOTIFY_SOCKET names; see sd_notify(3).
 
-Where there is no such variable, nothing is done. Nothing here blocks or raises: who is told of a
-program must not be able to stop it.
+Without this variable, nothing is done. Nothing here blocks or raises, since a monitor must not be
+able to stop the program.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ MAX_STATUS_CHARACTERS = 500
 
 MAX_UNSENT = 32
 STATUS_PERIOD = 5.0
-"""Seconds between two looks at the status, where no watchdog asks for more."""
+"""Seconds between two checks of the status, unless a watchdog needs more."""
 
 
 class Notifier:
-    """Tells systemd how a program is.
+    """Reports the state of a program to systemd.
 
     Args:
-        environment: where NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID are looked for.
+        environment: environment with NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID.
 
     Attributes:
-        wanted: whether anybody is to be told.
-        watchdog: seconds within which systemd wants to hear of the program; None: it does not.
+        wanted: whether systemd wants reports.
+        watchdog: seconds within which systemd expects a sign of life; None: it expects none.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -44,36 +44,36 @@ class Notifier:
         self.wanted: bool = self._address is not None
         self.watchdog: float | None = _watchdog(given)
         self._socket: socket.socket | None = None
-        self._unsent: list[bytes] = []  # messages that must not be lost, while the socket is full
+        self._unsent: list[bytes] = []  # messages kept while the socket is full
         self._failed = False
         self._status = ""
 
     def ready(self, status: str) -> None:
-        """Say that the program is ready, or ready again after a reload."""
+        """Report that the program is ready, or ready again after a reload."""
         self._send("READY=1", self._status_line(status), keep=True)
 
     def reloading(self, status: str) -> None:
-        """Say that a reload has begun; :meth:`ready` says that it is over."""
+        """Report that a reload has begun; :meth:`ready` reports its end."""
         now = time.monotonic_ns() // 1000
         self._send("RELOADING=1", f"MONOTONIC_USEC={now}", self._status_line(status), keep=True)
 
     def stopping(self) -> None:
-        """Say that the program ends."""
+        """Report that the program ends."""
         self._send("STOPPING=1", self._status_line("stopping"), keep=True)
 
     def status(self, status: str) -> None:
-        """Report the state in words to systemd, where it has changed."""
+        """Report the state as text, if it has changed."""
         before = self._status
         line = self._status_line(status)
         if self._status != before:
             self._send(line)
 
     def alive(self) -> None:
-        """Say that the event loop runs."""
+        """Report that the event loop runs."""
         self._send("WATCHDOG=1")
 
     def close(self) -> None:
-        """Tell no more."""
+        """Stop reporting."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -83,7 +83,7 @@ class Notifier:
         return f"STATUS={self._status}"
 
     def _send(self, *lines: str, keep: bool = False) -> None:
-        """Send a datagram; one to ``keep`` goes later where there is no room now."""
+        """Send a datagram; with ``keep``, send it later if there is no room now."""
         if self._address is None:
             return
         self._unsent.append("\n".join(lines).encode(errors="replace"))
@@ -98,17 +98,17 @@ class Notifier:
         except OSError as exc:
             if not keep:
                 del self._unsent[-1]
-                self._status = ""  # to be said again
+                self._status = ""  # to be sent again
             del self._unsent[:-MAX_UNSENT]
             if not self._failed:
-                logger.warning("systemd cannot be told by NOTIFY_SOCKET: %s", exc)
+                logger.warning("reports to systemd by NOTIFY_SOCKET fail: %s", exc)
             self._failed = True
 
     @contextlib.contextmanager
     def telling(self, status: Callable[[], str]) -> Iterator[None]:
-        """Have the event loop report again and again, as long as the block runs.
+        """Make the event loop report periodically, while the block runs.
 
-        It says so at half of the watchdog's time. A loop that hangs says nothing, and is killed.
+        It reports at half of the watchdog's time. A loop that hangs does not, and is killed.
         """
         if not self.wanted:
             yield
@@ -133,13 +133,13 @@ class Notifier:
 
 
 def _address(given: str) -> str | None:
-    """Return the address of a socket; one without a place in the file system begins with ``@``."""
+    """Return the address of a socket; an abstract one begins with ``@``."""
     if given.startswith("@") and len(given) > 1:
         return "\0" + given[1:]
     if given.startswith("/"):
         return given
     if given:
-        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nobody is told", given)
+        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nothing is reported", given)
     return None
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.web import TeachSite
 
 LINGER: Final = 3.0
-"""Seconds that the device streams on after a picture."""
+"""Seconds that the device continues streaming after a picture."""
 
 
 @click.command(
@@ -53,7 +53,7 @@ LINGER: Final = 3.0
 @click.option(
     "--learn",
     is_flag=True,
-    help="Set tolerances from the PICTURES, which show good parts, and say what they follow from.",
+    help="Set tolerances from the PICTURES, which show good parts, and print the reasons.",
 )
 @click.option("--save", is_flag=True, help="Write the file.")
 @page_options("", always=True)
@@ -70,7 +70,7 @@ async def teach(
     web: PageOptions,
     options: Options,
 ) -> None:
-    """Serve the page, or do as the options say."""
+    """Serve the page, or carry out the options."""
     with from_part("inspection", "smartcam teach needs"):
         from smartcam.inspection import Teaching
 
@@ -105,7 +105,7 @@ def _change(
     save: bool,
     options: Options,
 ) -> None:
-    """Change the tools, try them, and write them if that is wanted."""
+    """Change the tools, try them, and save them if that is asked for."""
     from smartcam.inspection import Picture
     from smartcam.inspection._inside import learned
 
@@ -142,7 +142,7 @@ def _show(file: str, found: Inspection, options: Options) -> None:
 
 
 def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the tools with other settings.
+    """Return the tools with changed settings.
 
     Raises ConfigurationError: a change is not valid.
     """

@@ -1,4 +1,4 @@
-"""Colour, and a line that shows how a wait goes, for terminals only."""
+"""Colours, and a line that shows the progress of a wait, on terminals only."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
 
 VERDICT_COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
-"""The colour of each word that judges; the word says the same without its colour."""
+"""The colour of each word of a verdict; the word alone has the full meaning."""
 
 PERIOD = 1.0
-"""Seconds between two looks of a line that counts."""
+"""Seconds between two updates of the counting line."""
 
 
 def tinted(word: str, text: str | None = None) -> str:
     """Return a word, or a text, in the word's colour; :func:`click.echo` removes it in files.
 
-    Plain where NO_COLOR is set or the terminal is dumb.
+    The text is plain if NO_COLOR is set or the terminal is dumb.
     """
     text = word if text is None else text
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
@@ -33,7 +33,7 @@ def tinted(word: str, text: str | None = None) -> str:
 
 
 class CountingLine:
-    """A line on the terminal's stderr that tells once a second what came; none elsewhere.
+    """A line on the terminal's stderr that counts results, once a second; none without a terminal.
 
     ::
 
@@ -79,7 +79,7 @@ class CountingLine:
 
 @contextlib.asynccontextmanager
 async def counting(camera: Camera[Any]) -> AsyncIterator[CountingLine]:
-    """Have a line that counts a camera's results, where stderr is a terminal."""
+    """Show a line that counts a camera's results, if stderr is a terminal."""
     line = CountingLine(camera)
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield line

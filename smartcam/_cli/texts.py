@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 MAX_SIGNIFICANT_DIGITS = 6
-"""Significant digits of the largest number in a column that people read."""
+"""Number of significant digits of the largest number in a column."""
 
 SMALLEST, LARGEST = 1e-3, 1e6
-"""Columns whose largest number lies between them have all their points below each other."""
+"""Columns whose largest number lies between these have aligned decimal points."""
 
 
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return rows as aligned columns; numbers to the right, their points below each other."""
+    """Return rows as aligned columns; numbers to the right, with aligned decimal points."""
     cells = [*zip(*map(_column, zip(*rows, strict=True)), strict=True)]
     widths = [max(len(text) for text in column) for column in zip(head, *cells, strict=True)]
     numeric = [bool(rows) and isinstance(value, (int, float)) for value in (rows or [head])[0]]
@@ -48,7 +48,7 @@ def _column(values: Sequence[object]) -> list[str]:
         return [_cell(value) for value in values]
     decimals = max(0, MAX_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest)))
     if any(0 < abs(value) < 10**-decimals for value in floats):
-        return [_cell(value) for value in values]  # one of them would be shown as nothing
+        return [_cell(value) for value in values]  # some would have no digits left
     texts = [f"{value:.{decimals}f}" for value in floats]
     needless = min(len(text) - len(text.rstrip("0")) for text in texts) if decimals else 0
     return [text[: len(text) - needless].removesuffix(".") for text in texts]
@@ -67,7 +67,7 @@ def camera_value(emulator: WireCamera) -> dict[str, Any]:
 
 
 def application_text(application: int | None) -> str:
-    """Return the application in words; a job of a camera may have none of the ids."""
+    """Return the application in words; a camera's job may have no id."""
     from smartcam.protocols.messages import UNNAMED_APPLICATION
 
     if application == UNNAMED_APPLICATION:
@@ -76,7 +76,7 @@ def application_text(application: int | None) -> str:
 
 
 def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunningError:
-    """Return an error with what to do beside it; ``verb`` is the command that met it."""
+    """Return an error with its cure; ``verb`` is the command that raised it."""
     return NotRunningError(
         f"{error}. To start it: smartcam start {shlex.quote(camera.url)}, or {verb} with "
         f"--application {camera.active_application}"
@@ -86,7 +86,7 @@ def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunning
 def result_text(result: Result, units: ShownUnits, layout: Layout | None) -> str:
     """Return a result: a line about it, then its value.
 
-    ``units``: those in which values are shown. ``layout``: that of a table, which knows no units.
+    ``units``: units in which values are shown. ``layout``: layout of a table, which has no units.
     """
     latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
     sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
@@ -97,7 +97,7 @@ def result_text(result: Result, units: ShownUnits, layout: Layout | None) -> str
 
 
 def value_text(value: Any, units: ShownUnits, layout: Layout | None) -> str:
-    """Return an interpreter's value as text; arguments as :func:`result_text` has them."""
+    """Return an interpreter's value as text; arguments as for :func:`result_text`."""
     from smartcam.layout._inside import units_of
     from smartcam.models import Localization, jsonable
 
@@ -128,7 +128,7 @@ def _field_text(
     units: ShownUnits,
     lists: Mapping[str, Mapping[str, str]],
 ) -> str:
-    """Return a field's line; of a list of records a table. ``lists``: the units of their fields."""
+    """Return a field's line; for a list of records, a table. ``lists``: units of their fields."""
     if _is_table(value):
         return f"  {name}:\n{_records_text(value, lists[name], units)}"
     symbol = symbols.get(name, "")
@@ -148,7 +148,7 @@ def _head(name: str, symbol: str, units: ShownUnits) -> str:
 
 
 def _localizations_text(parts: list[Localization], units: ShownUnits) -> str:
-    """Return a row for each: in the plane where all of them lie there, else in space."""
+    """Return a row for each part: in the plane if all of them lie in it, else in space."""
     head: tuple[str, ...]
     rows: list[tuple[object, ...]]
     if any(pose.position.z or any(pose.orientation[:2]) for *_, pose in parts):
@@ -167,5 +167,5 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     text = str(value)
-    # a camera's text stays in its cell: no line breaks, nothing that a terminal obeys
+    # a camera's text stays in its cell: no line breaks, no control characters
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

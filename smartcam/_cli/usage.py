@@ -1,4 +1,4 @@
-"""A wrong use of a command, and what may go wrong before it runs."""
+"""Handle wrong usage of a command, and errors before it runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INTERRUPTED = 130
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """End the program as Ctrl-C ends it later, where it comes while something is imported."""
+    """End the program after Ctrl-C during an import as it would end later."""
     try:
         yield
     except KeyboardInterrupt:
@@ -27,21 +27,21 @@ def importing() -> Iterator[None]:
 def error_json(error: Exception, text: str, code: int, **more: str) -> str:
     """Return an error as JSON: its class, its text, the exit code, and its public attributes.
 
-    ``more``: what stands in front.
+    ``more``: fields to put first.
     """
-    said = {name: value for name, value in vars(error).items() if not name.startswith("_")}
+    attributes = {name: value for name, value in vars(error).items() if not name.startswith("_")}
     if isinstance(error, click.ClickException):
-        said = {}  # click's own, with its context
+        attributes = {}  # click's own, with its context
     import json
 
     from smartcam.models import jsonable
 
-    value = {**more, "error": type(error).__name__, "text": text, "exit_code": code, **said}
+    value = {**more, "error": type(error).__name__, "text": text, "exit_code": code, **attributes}
     return json.dumps(jsonable(value))
 
 
 class JsonErrors(click.Command):
-    """A command that tells a wrong use as JSON where ``--json`` is given."""
+    """A command that reports wrong usage as JSON if ``--json`` is given."""
 
     def make_context(
         self,
@@ -61,7 +61,7 @@ class JsonErrors(click.Command):
 
 
 class ListedGroup(JsonErrors, click.Group):
-    """A command with others below it, which are listed with their whole summaries."""
+    """A group of commands, which are listed with their whole summaries."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list."""
@@ -70,7 +70,7 @@ class ListedGroup(JsonErrors, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is meant; a usage error says which one might have been."""
+        """Return the command of that name; a usage error suggests one."""
         if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             from smartcam._suggestions import did_you_mean
 
@@ -84,7 +84,7 @@ MAX_SUMMARY_CHARACTERS = 400
 
 
 def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-    """Write the commands of a group with their whole summaries, but hidden ones."""
+    """Write the commands of a group with their whole summaries, without hidden ones."""
     found = [(name, group.commands[name]) for name in group.list_commands(ctx)]
     rows = [
         (name, command.get_short_help_str(MAX_SUMMARY_CHARACTERS))
@@ -113,17 +113,17 @@ _KINDS = {
     "float": "a number",
     "float range": "a number",
 }
-"""Words for what an option takes, by click's names."""
+"""Words for the kind of an option's value, by click's names."""
 
 
 @contextlib.contextmanager
 def _numbers_explained() -> Iterator[None]:
-    """Make the error for what is no number say so in words."""
+    """Explain in words, in the error for a wrong value, that a number is expected."""
     try:
         yield
     except click.BadParameter as exc:
-        given, told, kind = exc.message.partition(" is not a valid ")
-        words = _KINDS.get(kind.rstrip(".")) if told else None
+        given, matched, kind = exc.message.partition(" is not a valid ")
+        words = _KINDS.get(kind.rstrip(".")) if matched else None
         if words is not None:
             point = given.strip("'").replace(",", ".")
             end = f"; did you mean {point}?" if _is_number(point) else "."
@@ -144,7 +144,7 @@ def _is_number(text: str) -> bool:
 
 @contextlib.contextmanager
 def _options_suggested() -> Iterator[None]:
-    """Make the error for an unknown option say which one may have been meant."""
+    """Suggest the option that was probably meant, in the error for an unknown one."""
     try:
         yield
     except click.NoSuchOption as exc:

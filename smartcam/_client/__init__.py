@@ -1,1 +1,1 @@
-"""The client's inside: from a link's bytes to the tasks that wait for them. Nothing is public."""
+"""The client's inside: from a link's bytes to the waiting tasks. Nothing is public."""

@@ -1,4 +1,4 @@
-"""Attempts at a session: how far each came, and what that says about the cause, with a cure."""
+"""Attempts at a session: the step that each reached, the probable cause, and a cure."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ _ERRNO = re.compile(r"\[Errno (-?\d+)\]")
 
 
 class SessionRefusedError(RemoteProtocolError):
-    """The answer to Connect says no; a camera of another dialect may mean something else."""
+    """The answer to Connect is a refusal; a camera of another dialect may mean something else."""
 
 
 @dataclass(slots=True)
 class Try:
-    """One attempt: what was tried and how far it came.
+    """One attempt, and the step that it reached.
 
     Attributes:
-        dialect: name of the dialect spoken; the names of all that begin a session alike until the
-            camera's is known.
+        dialect: name of the dialect; until the camera's is known, the names of all dialects that
+            begin a session alike.
         transport: ``tcp`` or ``udp``.
-        step: name of the last step, which was waited for.
-        outcome: text that says how the attempt ended.
+        step: name of the last step that was begun.
+        outcome: text on the end of the attempt.
         received: number of bytes received.
         hung_up: True if the other side ended the link without a byte.
         error: reason why there is no session, None if there is one.
@@ -66,13 +66,13 @@ class Try:
         return self.step != OPENING
 
     def reach(self, step: str) -> None:
-        """Note that this is what is waited for now."""
+        """Note the step that begins now."""
         self.step = step
         if self.on_step is not None:
             self.on_step(step)
 
     def end(self, error: Exception, waited: float) -> None:
-        """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
+        """Note the error that ended the attempt; ``UnicodeError``: the host's name is not valid."""
         self.error = error
         timeout = isinstance(error, TimeoutError)
         self.hung_up = self.step == CONNECTING and not timeout and not self.received
@@ -105,9 +105,9 @@ class Try:
 
 
 class Reason(NamedTuple):
-    """A reason for which there may be no session. Its texts are filled in by :func:`words`."""
+    """A possible reason for a missing session; :func:`words` fills in its texts."""
 
-    # function that says, by what an attempt saw, whether this is the cause
+    # function that returns, by an attempt's observations, whether this is the cause
     fits: Callable[[Try], bool]
     text: str  # text of the problem
     cure: str  # text of the cure
@@ -182,16 +182,16 @@ REASONS: tuple[Reason, ...] = (
         "{interface}, and for another client or dialect.",
     ),
 )
-"""The first that fits one of the attempts is it: bytes that came tell more than silence."""
+"""Causes; the first that fits an attempt counts, and received bytes come before silence."""
 
 
 def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
-    """Return why attempts failed, and the one that shows it."""
+    """Return the reason why attempts failed, and the attempt that shows it."""
     return next((reason, one) for reason in REASONS for one in tries if reason.fits(one))
 
 
 def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
-    """Return the words that the placeholders in a reason's texts stand for."""
+    """Return the words for the placeholders in a reason's texts."""
     names = [transport.value for transport in protocol.schemes.values()]
     this, others = one.transport.upper(), [name for name in names if name != one.transport]
     return {

@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam.protocols.messages import StatusReport
 
-# as plain integers: what an IntFlag does in Python costs more than all else that a status needs
+# as plain integers: operations of an IntFlag cost more than the rest of handling a status
 _BUSY = int(Status.BUSY)
 _RUNNING_OR_BUSY = int(Status.RUNNING | Status.BUSY)
 
 
 class Wanted(NamedTuple):
-    """The application and run state that the camera was asked for.
+    """The application and run state that the program wants.
 
     Attributes:
-        application: the application that was named, None if none was.
-        running: the run state that was asked for, None if none was.
+        application: the application that was named, None without one.
+        running: the run state that was requested, None without one.
     """
 
     application: int | None
@@ -38,7 +38,7 @@ class CameraState:
         name: the camera's name.
         application: id of the application that results are expected from, None for any.
         listeners: listeners to which a change of the application is reported.
-        shared: True if others use the camera, too, who may expect other applications.
+        shared: True if other programs use the camera, too, and may expect other applications.
 
     Attributes:
         status: last status, also after the link is lost; None before the first.
@@ -46,10 +46,10 @@ class CameraState:
         endian: byte order in the last status.
         active: id of the application that is active as far as is known.
         wanted: id of the application that the camera was asked to load.
-        expected: id of the application that results must come from, whoever gets them; None for
+        expected: id of the application that all results must come from; None for
             any.
-        active_in_doubt: True after somebody else loaded an application.
-        loads_by_others: number of times that somebody else loaded an application.
+        active_in_doubt: True after another client or a person loaded an application.
+        loads_by_others: number of times that another client or a person loaded one.
         statuses_heard: number of statuses received.
         status_asked_at: loop time at which the camera was last asked for its status.
     """
@@ -67,24 +67,24 @@ class CameraState:
         self.loads_by_others: int = 0
         self.statuses_heard: int = 0
         self.status_asked_at: float = 0.0
-        self._statuses_due = 0  # that will have come once every question for one is answered
+        self._statuses_due = 0  # number of statuses received once all requests are answered
         self._name = name
         self._listeners = listeners
         self._told: int | None = None  # the last status of this session
         self._loaded_by_us = False
 
     def begin_session(self) -> None:
-        """Forget what only the session before has told."""
+        """Forget facts that only the previous session has reported."""
         self._told, self.active_in_doubt = None, False
         self._statuses_due = self.statuses_heard
 
     def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
-        """Take a status.
+        """Handle a status.
 
         Args:
             report: report of the status.
-            awaited: kinds of the answers that are awaited; a switch by this client is known by the
-                kind of its answer.
+            awaited: kinds of the pending answers; a switch by this client shows by the kind of its
+                answer.
 
         Returns:
             The status before, None if this session had none.
@@ -107,32 +107,32 @@ class CameraState:
         return was
 
     def stays(self, application: int, bits: int, endian: int) -> bool:
-        """Return True if this is what the camera has last told in this session."""
+        """Return True if this is the last status that the camera has sent in this session."""
         same = self.bits == bits and self._told == bits and self.endian == endian
         return same and self.active == application
 
     def report_round(self, report: StatusReport) -> None:
-        """Take two statuses of a camera that runs, of which the second is as the one before."""
+        """Handle two statuses of a running camera; the second equals the present status."""
         self.statuses_heard += 2
         self.status = report.status
 
     @property
     def owes_status(self) -> bool:
-        """True if the camera was asked for its status, and has not answered as often."""
+        """True if a request for the status is not answered yet."""
         return self.statuses_heard < self._statuses_due
 
     def status_asked(self, now: float, count: int = 1) -> None:
-        """Note that the camera was asked for its status: it owes so many more."""
+        """Note requests for the status: so many more answers are pending."""
         self.status_asked_at = now
         self._statuses_due = max(self._statuses_due, self.statuses_heard) + count
 
     def status_lost(self) -> None:
-        """Note that what the camera owes will not come."""
+        """Note that the pending statuses will not come."""
         self._statuses_due = self.statuses_heard
 
     @property
     def active_text(self) -> str:
-        """Name of the active application for texts; a job of a camera may have none of the ids."""
+        """Name of the active application for texts; a camera's job may have no id."""
         unnamed = self.active is None or self.active == UNNAMED_APPLICATION
         return "the active application" if unnamed else f"application {self.active}"
 
@@ -156,14 +156,14 @@ class CameraState:
         self.active_in_doubt = False
 
     def want(self, wanted: Wanted) -> None:
-        """Note what the camera is to be."""
+        """Note the application and run state that the program wants."""
         self.wanted: Wanted = wanted
         self.expected: int | None = None if self.shared else wanted.application
 
     def want_application(self, application: int) -> None:
-        """Note from which application results are expected."""
+        """Note the application that results are expected from."""
         self.want(self.wanted._replace(application=application))
 
     def want_running(self, running: bool) -> None:
-        """Note which run state was asked for."""
+        """Note the requested run state."""
         self.want(self.wanted._replace(running=running))

@@ -1,7 +1,7 @@
 """Run one command at a time, and go back after a temporary switch.
 
-Going back to the application before is a job of the session's task group: it is finished even when
-the caller was cancelled, it is bounded, and every later command waits for it. A switch back that a
+Going back to the former application is a job of the session's task group: it is finished even if
+the caller is cancelled, it is bounded, and every later command waits for it. A switch back that a
 lost link prevented is done first in the next session; so is restoring the wanted state.
 """
 
@@ -102,7 +102,7 @@ class CommandLock:
         self._jobs = None
 
     async def vacated(self) -> None:
-        """Wait until every command of the ended session has noticed that; bounded."""
+        """Wait until every command of the ended session has ended, too; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._switch_timeout), self._lock:
                 pass
@@ -114,7 +114,7 @@ class CommandLock:
 
         Raises:
             ResponseTimeoutError: others had it for ``timeout`` seconds.
-            SmartCamError: going back failed before this command, and why.
+            SmartCamError: the reason why going back failed before this command.
         """
         return Hold(self, timeout)
 
@@ -231,7 +231,7 @@ class CommandLock:
             timeout: seconds to wait for it.
 
         Raises:
-            SmartCamError: the application could not be loaded, and why.
+            SmartCamError: the reason why the application could not be loaded.
             ResponseTimeoutError: loading takes longer.
 
         Cancellation: it is finished nevertheless, as after the timeout.
@@ -342,8 +342,8 @@ class CommandLock:
     async def _acquire(self) -> None:
         """Take the lock after every job that goes back.
 
-        The command that had the turn before may have left such a job behind while this command was
-        in line.
+        The command with the turn before may have started such a job while this command was in
+        line.
         """
         while True:
             await self.settle()

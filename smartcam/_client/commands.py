@@ -1,6 +1,6 @@
 """Command the camera: start, stop, load another application.
 
-Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
+Every ``deadline`` is loop time. The command lock decides whose command runs, one at a time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _QUERY = m.Query()
 
 @dataclass(eq=False)
 class Commands:
-    """Changes what the camera runs.
+    """Changes the application and the run state of the camera.
 
     Attributes:
         unconfirmed: a Start or Stop was sent whose status has not come.
@@ -46,14 +46,14 @@ class Commands:
         self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
 
     def begin_session(self, link: Link) -> None:
-        """Begin a session: nothing is owed on it, its status is heard."""
+        """Begin a session: no answer is pending, and its status was received."""
         self._connection.begin_session(link)
         self._requests.begin_session()
         self._status.begin_session()
         self.unconfirmed = False
 
     def end_session(self) -> None:
-        """End the session: nothing is asked any more."""
+        """End the session: nothing is requested any more."""
         self._status.end_session()
 
     @property
@@ -80,7 +80,7 @@ class Commands:
         await self._leave_run_mode(deadline)
 
     async def void_inspection(self, deadline: float) -> None:
-        """Stop and start again; hear all that the camera sent before the start.
+        """Stop and start again; receive everything that the camera sent before the start.
 
         Cancellation: it may stay stopped; it is halted then.
         """
@@ -103,17 +103,17 @@ class Commands:
     async def _confirm(
         self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, what: str
     ) -> None:
-        self.unconfirmed = True  # and it stays so where the wait is interrupted
+        self.unconfirmed = True  # and it stays True if the wait is interrupted
         await self._requests.command(command, deadline)
         await self._status.refresh(deadline)
         await self._status.until(predicate, deadline, what)
         self.unconfirmed = False
 
     async def catch_up(self, deadline: float) -> None:
-        """Know the status again where a start or stop was interrupted.
+        """Learn the status again if a start or stop was interrupted.
 
-        What these two have caused comes before the answer to a Query that was sent after them, or
-        is to be asked for.
+        Statuses caused by these two come before the answer to a later Query, or must be
+        requested.
         """
         if self._connection.features.polled:
             await self._status.refresh(deadline)
@@ -126,11 +126,11 @@ class Commands:
     async def query(self, deadline: float) -> int:
         """Return the active application.
 
-        During a switch a Query tells the old id, so an owed switch answer is awaited first; or it
-        is answered as too busy, and asked again.
+        During a switch a Query reports the old id, so a pending switch answer is awaited first; or
+        the camera is too busy, and is asked again.
 
         Raises:
-            ResponseTimeoutError: no answer, or none but that the camera is busy.
+            ResponseTimeoutError: no answer, or the camera was busy all the time.
         """
         requests = self._requests
         if requests.owes(m.SwitchAnswer):
@@ -143,13 +143,13 @@ class Commands:
             await self._status.pause(deadline, "the busy camera to name its application")
 
     async def query_loaded(self, deadline: float) -> int:
-        """Return the active application; while one is being loaded a Query tells the old one."""
-        await self._status.refresh(deadline)  # whether it runs is asked next
+        """Return the active application; while another is being loaded, that is the old one."""
+        await self._status.refresh(deadline)  # the run state is needed next
         await self._status.until(_is_not_loading, deadline, "the application to be loaded")
         return await self.query(deadline)
 
     async def ensure(self, application: int, deadline: float) -> None:
-        """Have an application running and ready, by the least that is needed."""
+        """Make sure that an application is running and ready, with the fewest commands."""
         self.check_id(application)
         if await self.query_loaded(deadline) != application:
             await self.switch(application, deadline, start=True)
@@ -166,7 +166,7 @@ class Commands:
         Args:
             application: id of the application, or the name of its file.
             deadline: loop time.
-            start: enter run mode afterwards, where there is one.
+            start: enter run mode afterwards, if the camera has one.
 
         Raises:
             UnsupportedError: the dialect loads no applications, or none by name.
@@ -176,8 +176,8 @@ class Commands:
         dialect = self._connection.dialect
         stops = dialect.has(m.Stop)
         was_running = self.runs and stops
-        # Never allowed, several applications may carry it (SC manual p. 34, published): so nothing
-        # is stopped for it.
+        # 0 is never allowed: several applications may have it (SC manual p. 34, published). So
+        # nothing is stopped for it.
         never = application == 0 and 0 not in dialect.application_ids
         active: int | None
         if stops and never:
@@ -212,7 +212,7 @@ class Commands:
     async def _load(
         self, request: m.Request, application: int | str, deadline: float
     ) -> tuple[int, int | None]:
-        """Have an application loaded; return the answer's code and the one that is active then."""
+        """Load an application; return the answer's code, and the application active then."""
         requests = self._requests
         answer = await requests.ask(request, m.SwitchAnswer, deadline)
         while requests.is_busy(answer):
@@ -226,7 +226,7 @@ class Commands:
 
         Raises:
             ConfigurationError: the dialect can have no such application.
-            UnsupportedError: the camera loads none, or none by name.
+            UnsupportedError: the camera loads no applications, or none by name.
         """
         name = self._connection.name
         if isinstance(application, str):

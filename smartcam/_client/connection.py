@@ -1,4 +1,4 @@
-"""The link of the session that there is, and what its protocol has."""
+"""The link of the present session, and the features of its protocol."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Features:
         ordered: messages come in order and none is lost (TCP).
         numbered: a trigger may be given a sequence number.
         acknowledged: a trigger is answered.
-        polled: the status is told when it is asked for, not by itself.
-        fences: a Query goes out with each trigger, and what the camera says around its answer
-            shows whether it took the trigger.
-        shows_triggers: the status tells of each trigger that is taken.
-        ends_triggers: a trigger that brings nothing is ended before its deadline.
-        tells_all: every change of the status is told, in order, and nothing else shows what became
+        polled: the status is sent on request, not by itself.
+        fences: a Query goes out with each trigger; the messages around its answer show whether
+            the camera took the trigger.
+        shows_triggers: the status shows each accepted trigger.
+        ends_triggers: a trigger without a result is ended before its deadline.
+        tells_all: every change of the status is sent, in order, and nothing else shows the outcome
             of a trigger.
     """
 
@@ -51,7 +51,7 @@ class Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
-        fences = ordered and not dialect.in_order  # there the answer itself is enough
+        fences = ordered and not dialect.in_order  # in order, the answer itself is enough
         tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
         return Features(
             ordered=ordered,
@@ -71,7 +71,7 @@ class Connection:
 
     Attributes:
         name: the camera's name.
-        link: the last one, None before the first.
+        link: the last link, None before the first.
         features: features of its protocol.
     """
 
@@ -84,7 +84,7 @@ class Connection:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def begin_session(self, link: Link) -> None:
-        """Speak over this link from now on."""
+        """Use this link from now on."""
         self.link = link
         self.features = Features.of(link)
         self._loop = asyncio.get_running_loop()
@@ -98,7 +98,7 @@ class Connection:
         """Return the link.
 
         Raises:
-            LinkError: there is no session, and why.
+            LinkError: the reason why there is no session.
         """
         if self._waits.end is not None:
             self._waits.raise_end()
@@ -116,10 +116,10 @@ class Connection:
         return self.require_link().machine.dialect
 
     def require(self, message_type: type[m.Message]) -> None:
-        """See to it that the dialect has a message, before anything is done for it.
+        """Check that the dialect has a message, before anything is done for it.
 
         Raises:
-            UnsupportedError: the dialect has not.
+            UnsupportedError: the dialect has no such message.
             LinkError: there is no session.
         """
         if not self.dialect.has(message_type):

@@ -1,27 +1,27 @@
 """Decide to which trigger a result belongs, since the wire carries no correlation.
 
-A container is a trigger's result only where what the camera says shows that it took this trigger
-(:class:`TriggerEvidence` and the classes behind it). That nothing speaks against it is not enough.
+A container is a trigger's result only if the camera's messages show that it took this trigger
+(:class:`TriggerEvidence` and its subclasses). The absence of contrary evidence is not enough.
 
-Where every status is told (TCP, all dialects but ``bid``), a Query goes out in front of the trigger
-and one behind it, in the same write. The camera does one message after the other and says things in
-order (inferred). Waiting for Trigger goes away whenever an inspection begins, and Overtriggered
-rises whenever a trigger is dropped (a status comes after every change: SC manual p. 29, published).
-So where exactly one inspection begins between the two answers, and Overtriggered was clear all the
-time, that inspection is the trigger's. Its results come behind its beginning and before the next
-one's. Where two begin, nobody can tell whose each is.
+If every status is sent (TCP, all dialects but ``bid``), a Query goes out before the trigger and
+one after it, in the same write. The camera handles one message after the other and sends in order
+(inferred). Waiting for Trigger falls whenever an inspection begins, and Overtriggered rises
+whenever a trigger is dropped (a status comes after every change: SC manual p. 29, published).
+So if exactly one inspection begins between the two answers, and Overtriggered was clear all the
+time, that inspection is the trigger's. Its results come after its beginning and before the next
+inspection's. If two inspections begin, the trigger's cannot be identified.
 
-Where the status has to be asked for (``bid``), the trigger itself is answered, which is the fence:
-what comes before that is older. The status is asked for in front of the trigger and behind it, in
-the same write: the first one has to say that the camera waits for a trigger, the second one that it
-has dropped none, which it would say until it is reset.
+If the status must be requested (``bid``), the trigger itself is answered, and its answer is the
+fence: containers before it are older. The status is requested before the trigger and after it, in
+the same write: the first status must show that the camera waits for a trigger, the second that it
+has dropped none, since that bit stays until it is reset.
 
-Where the layout of the trigger has an ``@sequence`` field, the number has to be right, too: it is
+If the layout of the trigger has an ``@sequence`` field, the number has to be right, too: it is
 set with Set sequence number right before the trigger.
 
 A trigger that was given up leaves a *debt*; the next trigger settles it first
-(:meth:`~smartcam._client.triggering.Triggers.trigger`). Only what comes after the inspection of the
-trigger that was given up began pays it.
+(:meth:`~smartcam._client.triggering.Triggers.trigger`). Only results after the beginning of that
+trigger's inspection pay it.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ Debt = Literal["late", "streamed"]
 NUMBER_STEP = 1000
 """Step by which each trigger's number is lower than the number of the trigger before.
 
-Runs that somebody else triggers in between count up from our number, away from the next one.
+Runs triggered by others in between count up from this number, away from the next one.
 """
 
 FEWEST_NUMBERS = 64
-"""Triggers at least before the numbers of a narrow field repeat; its step is made smaller."""
+"""Least number of triggers before the numbers of a narrow field repeat, by a smaller step."""
 
 RANGE_OF_FIRST_NUMBER = (1 << 31) - 1
-"""Count of the numbers from which a new client draws its first one at random."""
+"""Number of values from which a new client draws its first number at random."""
 
 MAX_OWED = 1024
-"""Given-up triggers that are remembered; an older one's result counts as streamed."""
+"""Largest number of given-up triggers kept; the result of an older one counts as streamed."""
 
 
 class TriggerEvidence:
     """Evidence that the camera took one trigger; this class is for cameras that give no evidence.
 
-    That is so over UDP, where statuses and their order may be lost, and where commands are done
-    one after the other, so that an answer needs no proof (In-Sight).
+    Such cameras use UDP, where statuses and their order may be lost, or handle commands one after
+    the other, so that an answer needs no proof (In-Sight).
 
     Attributes:
-        began: number of inspections that were seen to begin and may belong to the trigger. Where
-            every status is reported and ``proven`` is True, the first one does.
-        reached: True if whatever comes now is not older than the trigger.
-        proven: True if the camera took this trigger, as far as can be known.
-        doubtful: True if it can no longer be known which trigger the camera took.
+        began: number of observed beginnings of inspections that may belong to the trigger. If every
+            status is reported and ``proven`` is True, the first one does.
+        reached: True if containers that come now are not older than the trigger.
+        proven: True if the messages prove that the camera took this trigger.
+        doubtful: True if the messages can no longer show which trigger the camera took.
     """
 
     __slots__ = ("began", "doubtful", "proven", "reached")
@@ -74,13 +74,13 @@ class TriggerEvidence:
         """Note that a Query which was written with the trigger is answered."""
 
     def on_trigger_answer(self) -> None:
-        """Note that the trigger itself is answered: the camera has heard it."""
+        """Note that the trigger itself is answered: the camera has received it."""
 
     def on_status(self, status: int) -> None:
         """Note a status."""
 
     def take_round(self) -> bool:
-        """Note all that comes of a trigger at once; False where each is to be noted by itself."""
+        """Note all messages of a trigger at once; False if each must be noted by itself."""
         return False
 
     def on_beginning(self) -> bool:
@@ -90,7 +90,7 @@ class TriggerEvidence:
 
 
 class EvidenceByAcknowledgement(TriggerEvidence):
-    """Evidence of a camera that answers each trigger which it takes: what came before is older."""
+    """Evidence of a camera that answers each accepted trigger: containers before it are older."""
 
     __slots__ = ()
 
@@ -104,9 +104,9 @@ class EvidenceByAcknowledgement(TriggerEvidence):
 
 
 class EvidenceByFence(TriggerEvidence):
-    """Evidence without statuses: whatever comes before the Query's answer is older.
+    """Evidence without statuses: containers before the Query's answer are older.
 
-    That shows nothing of what comes behind it, which is why it has to be asked for.
+    It shows nothing about later containers.
     """
 
     __slots__ = ()
@@ -116,31 +116,31 @@ class EvidenceByFence(TriggerEvidence):
         self.reached = False
 
     def on_query_answer(self) -> None:
-        """Note that the camera has taken the Query in front of the trigger."""
+        """Note that the camera has answered the Query before the trigger."""
         self.reached = True
 
 
 class EvidenceByStatus(TriggerEvidence):
     """Evidence by every status, in order: the inspections between two Queries are counted.
 
-    A camera that answers the second Query before it shows an inspection is believed: what it shows
-    next is the trigger's.
+    If a camera answers the second Query before it shows an inspection, the next inspection that it
+    shows is the trigger's.
     """
 
     __slots__ = ("_answers",)
 
-    def __init__(self) -> None:  # without its base's: each trigger makes one
+    def __init__(self) -> None:  # without its base's, to be fast: each trigger makes one
         self.began = 0
         self.reached = self.proven = self.doubtful = False
-        self._answers = 0  # to the Queries in front of the trigger and behind it
+        self._answers = 0  # answers to the Queries before the trigger and after it
 
     def on_query_answer(self) -> None:
-        """Note an answer; at the second one, exactly one inspection has begun, or one will."""
+        """Note an answer; at the second answer, exactly one inspection has begun, or will begin."""
         self._answers += 1
         self.proven = self._answers == 2 and self.began > 0
 
     def on_beginning(self) -> bool:
-        """Count the inspection; two between the answers cannot be told apart."""
+        """Count the inspection; two between the answers cannot be distinguished."""
         if not self._answers:
             return False
         self.began += 1
@@ -160,7 +160,7 @@ class EvidenceByStatus(TriggerEvidence):
 
 
 class EvidenceByAnswer(TriggerEvidence):
-    """Evidence by the trigger's answer and the statuses asked for around it (``bid`` over TCP)."""
+    """Evidence by the trigger's answer and the requested statuses around it (``bid`` over TCP)."""
 
     __slots__ = ("_queried", "_waited")
 
@@ -172,16 +172,16 @@ class EvidenceByAnswer(TriggerEvidence):
         self._waited: bool | None = None
 
     def on_query_answer(self) -> None:
-        """Note that the next status was asked for in front of the trigger, or is as fresh."""
+        """Note that the next status was requested before the trigger, or is as fresh."""
         self._queried = True
 
     def on_trigger_answer(self) -> None:
-        """Take the trigger's answer: earlier containers are older; a busy camera leaves a doubt."""
+        """Note the trigger's answer: earlier containers are older; a busy camera leaves a doubt."""
         self.reached = True
         self.doubtful = not self._waited
 
     def on_status(self, status: int) -> None:
-        """See whether the camera waited for the trigger, and that it has dropped none."""
+        """Check that the camera waited for the trigger, and has dropped none."""
         if self.reached:
             if status & _OVERTRIGGERED:
                 self.doubtful = True
@@ -196,13 +196,13 @@ class SentTrigger:
     """The trigger under way.
 
     Attributes:
-        wanted: how many results it is to have.
+        wanted: number of results expected.
         number: sequence number set for it, None if its layout has none.
-        evidence: what the camera has said of it.
-        came: how many of its results came.
-        early: containers that came before the camera showed that it had taken it.
-        given_up: what it still misses is owed.
-        ended: nobody waits for it any more.
+        evidence: evidence from the camera's messages.
+        came: number of its results received.
+        early: containers received before the camera showed that it had taken the trigger.
+        given_up: True if it was given up; its missing results are pending.
+        ended: True if no caller waits for it any more.
     """
 
     wanted: int
@@ -219,8 +219,8 @@ class Match:
     """The trigger to which a container belongs, if any.
 
     Attributes:
-        fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of one that was
-            given up; ``nobody``: of none of ours.
+        fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of a given-up
+            trigger; ``nobody``: of no trigger of this client.
         extra: True for one more result of a trigger that has all its results.
     """
 
@@ -237,7 +237,7 @@ _OVERTRIGGERED = int(Status.OVERTRIGGERED)
 
 @dataclass(slots=True, eq=False)
 class _Owed:
-    """Results of a trigger that was given up, which may still come."""
+    """Results of a given-up trigger, which may still come."""
 
     fate: Debt
     number: int | None
@@ -246,24 +246,24 @@ class _Owed:
 
 
 class Correlation:
-    """Decides whose each container is; knows no wire and no time.
+    """Decides to which trigger each container belongs; knows no wire and no time.
 
     Args:
-        chance: where the numbers begin, 0 to 1, drawn by chance: results that another client has
-            asked for may still be in flight, and their numbers lie elsewhere most probably.
+        chance: random place at which the numbers begin, 0 to 1: results of another client may
+            still be on their way, and their numbers are most probably different.
 
     Attributes:
         pending: the trigger under way.
-        satisfied: the last trigger has its results, and no other inspection was seen since.
+        satisfied: the last trigger has its results, and no inspection was observed since.
         owed: results of triggers that were given up, which may still come; the oldest first.
-        doubted: the status may be older than the last trigger, which was given up: it may say that
-            the camera waits for one although it has one.
+        doubted: the status may be older than the last trigger, which was given up: it may show that
+            the camera waits for a trigger although it has one.
     """
 
     def __init__(self, chance: float) -> None:
         self.pending: SentTrigger | None = None
         self.doubted: bool = False
-        self._complete = False  # every status is told, in order
+        self._complete = False  # whether every status is sent, in order
         self.satisfied: bool = False
         # evidence of the last trigger, until it has its results
         self._last: TriggerEvidence | None = None
@@ -282,15 +282,15 @@ class Correlation:
     # ------------------------------------------------------------------ the session
 
     def begin_session(self, *, complete: bool) -> None:
-        """Begin on a new link: what earlier triggers owe may still come over it.
+        """Begin on a new link: pending results of earlier triggers may still come over it.
 
         Args:
-            complete: every change of the status is told, in order.
+            complete: every change of the status is sent, in order.
         """
         self._complete = complete
         self.satisfied = self.doubted = False
         self._last = None
-        for one in self.owed:  # whether it began may have been told to nobody
+        for one in self.owed:  # the report of its beginning may have been lost
             one.evidence = TriggerEvidence()
             one.evidence.began = 1
 
@@ -301,9 +301,9 @@ class Correlation:
         self._last = None
 
     def heard(self) -> None:
-        """Note that everything said before now is heard, since a later Query is answered.
+        """Note that all earlier messages are received, since a later Query is answered.
 
-        A trigger that would have shown by now, and has not, was not taken: nothing of it comes.
+        A trigger without a sign by now was not taken: it will have no result.
         """
         self.doubted = False
         if self._complete:
@@ -313,7 +313,7 @@ class Correlation:
     # ------------------------------------------------------------------ the trigger
 
     def take_number(self, highest: int) -> int:
-        """Return the next trigger's number: the one that the user has set, or ours.
+        """Return the next trigger's number: the number that the user has set, or the client's own.
 
         Args:
             highest: largest number that the field holds.
@@ -335,7 +335,7 @@ class Correlation:
         self.pending, self.satisfied = pending, False
         self._last = pending.evidence
         if pending.number is None:
-            self._given = None  # its run has it
+            self._given = None  # the trigger's run uses it
 
     def leave(self) -> None:
         """Note that the trigger's caller goes on."""
@@ -347,14 +347,14 @@ class Correlation:
         self._last = None
 
     def give_up(self, pending: SentTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
-        """Nobody waits for the trigger any more; its results may still come.
+        """End the caller's wait for the trigger; its results may still come.
 
         Args:
             pending: the trigger.
             fate: fate of the results that still come.
-            unread: containers of it that came and could not be interpreted.
+            unread: number of its containers that could not be interpreted.
         """
-        came = pending.came if pending.evidence.proven else 0  # they may be somebody else's
+        came = pending.came if pending.evidence.proven else 0  # they may belong to another trigger
         missing = pending.wanted - came - unread
         if pending.given_up or missing <= 0:
             return
@@ -380,10 +380,10 @@ class Correlation:
             self._last.on_trigger_answer()
 
     def take_round(self, pending: SentTrigger) -> bool:
-        """Note two answers, and one inspection between them; False where more is to be judged.
+        """Note two answers, and one inspection between them; return False in any other case.
 
-        That is where something has come of the trigger already, or is owed from before, or where
-        its evidence is another one. A container behind the inspection is this trigger's then.
+        These cases: a result of the trigger has come already, an earlier one is pending, or the
+        evidence is of another kind. Otherwise a container after the inspection is this trigger's.
         """
         evidence = pending.evidence
         if not self._complete or self.owed or self._last is not evidence:
@@ -394,14 +394,14 @@ class Correlation:
         return True
 
     def on_status(self, previous: int | None, status: int) -> bool:
-        """Note where an inspection begins: Waiting for Trigger drops while running.
+        """Note the beginning of an inspection: Waiting for Trigger falls while running.
 
         Args:
             previous: the status before, None if there was none in this session.
-            status: the new one.
+            status: the new status.
 
         Returns:
-            Whether it is one that somebody else has triggered.
+            True if the inspection was triggered by others.
         """
         last = self._last
         if last is not None:
@@ -414,11 +414,11 @@ class Correlation:
             self.doubted = False
             return False
         self.satisfied = False
-        self._given = None  # that run has it
+        self._given = None  # that run uses it
         return self._complete and previous is not None
 
     def judge_told(self, asked: bool) -> Match:
-        """Return the same where the wire says whether a trigger of this client was answered."""
+        """Return the trigger of a container if the wire shows whether it answers this client."""
         pending = self.pending
         if not asked:
             return NOBODYS
@@ -430,8 +430,8 @@ class Correlation:
         """Return the trigger that a container of the right application belongs to.
 
         Args:
-            number: sequence number of the container, None if the container has none or no trigger
-                of ours waits.
+            number: sequence number of the container, None if the container has none, or no trigger
+                waits.
         """
         pending = self.pending
         if pending is not None and not pending.ended:
@@ -444,13 +444,13 @@ class Correlation:
         return self.judge_older(number)
 
     def judge_older(self, number: int | None) -> Match:
-        """Say the same of one that is known not to be of the trigger under way."""
+        """Return the trigger of a container that does not belong to the trigger under way."""
         if number is not None and number in self._given_up:
             self._pay([one for one in self.owed if one.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
             return EXTRA
-        # a number that is none of ours may be that of a trigger that was sent without one
+        # an unknown number may be that of a trigger that was sent without a number
         if self.owed:
             open_ = [
                 one
@@ -462,11 +462,11 @@ class Correlation:
         return EXTRA if self.satisfied and number is None else NOBODYS
 
     def _may_pay(self, run: TriggerEvidence) -> bool:
-        """Return True if a container that comes now may be from a run that has begun."""
+        """Return True if a container that comes now may be of a run that has begun."""
         return bool(run.began) or (run.reached and not self._complete)
 
     def _pay(self, owed: list[_Owed]) -> Debt:
-        """Note that one result of the first of these debts has come."""
+        """Note that a result of the first of these debts has come."""
         if not owed:
             return "late"
         owed[0].missing -= 1

@@ -57,8 +57,8 @@ class ClientCounters:
     """The counters of one client.
 
     Attributes:
-        fates: what became of result containers; their sum is ``received``.
-        received: containers that came.
+        fates: numbers of result containers by fate; their sum is ``received``.
+        received: containers received.
         empty_slots: all-zero records that interpreters skipped.
         extra_results: containers for a trigger that had its results already.
         inspections_by_others: inspections that something else has triggered.
@@ -86,7 +86,7 @@ class ClientCounters:
         self._open: Counters | None = None
 
     def count(self, fate: str, containers: int = 1) -> None:
-        """Count containers with what became of them, in one step: the sum always holds."""
+        """Count containers with their fate, in one step: the sum always holds."""
         self.fates[fate] += containers
         self.received += containers
 
@@ -115,7 +115,7 @@ class ClientCounters:
         self.last_error = str(error)
 
     def begin(self, wire: Counters) -> None:
-        """Count a session, and what goes over its link from now on."""
+        """Count a session, and the traffic of its link from now on."""
         self.end()
         self.sessions += 1
         self._open = wire

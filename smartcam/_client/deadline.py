@@ -1,7 +1,7 @@
 """A timer for deadlines that are set all the time and hardly ever reached.
 
 A timer of the event loop costs more than the rest of a wait, and most are cancelled at once. This
-one stays where it is when a later deadline is set, and is set again only when it goes off too soon.
+timer stays when a later deadline is set, and is set again only when it fires too soon.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class DeadlineTimer:
     """Calls back at a deadline; one deadline at a time.
 
     Args:
-        callback: what is called, in the event loop.
+        callback: function that is called in the event loop.
     """
 
     __slots__ = ("_at", "_callback", "_deadline", "_timer")
@@ -26,7 +26,7 @@ class DeadlineTimer:
         self._callback = callback
         self._deadline: float | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._at = 0.0  # when the timer goes off
+        self._at = 0.0  # loop time at which the timer fires
 
     def set(self, deadline: float) -> None:
         """Call back at ``deadline`` (loop time), unless it is cleared or set anew before."""

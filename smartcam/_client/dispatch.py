@@ -1,4 +1,4 @@
-"""Hand what comes from the camera to whoever waits for it.
+"""Pass everything that comes from the camera to the tasks that wait for it.
 
 The receive task hands every chunk to :meth:`Dispatch.dispatch`, which never waits: an answer
 completes its request, a status is shown to every predicate in order, a result gets exactly one fate
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.protocols._inside import Event
 
 FEWEST_GATHERED = 6
-"""Events of a chunk that are worth to be looked through: two results, each between statuses."""
+"""Least number of events of a chunk to examine: two results, each between statuses."""
 
 ROUND_EVENTS = 5
 """Events that a trigger brings: two answers to Queries, and between them two statuses around the
@@ -55,7 +55,7 @@ _LOGGED = (
     (Status.OVERHEAT, logging.INFO, "no heat", "= the camera is no longer too hot"),
     (Status.SYSTEM_ERROR, logging.ERROR, "System Error", "! the camera reports System Error"),
 )
-"""Bits whose rise is logged, or with INFO their fall."""
+"""Bits whose rise is logged; with INFO, their fall is, too."""
 
 _NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 
@@ -66,12 +66,12 @@ class _Round(NamedTuple):
     """The messages around the result of a trigger: the same objects each time.
 
     Attributes:
-        first: answer to the Query in front of the trigger.
+        first: answer to the Query before the trigger.
         began: status when the inspection begins.
         ended: status when the camera waits again.
-        last: answer to the Query behind the trigger.
+        last: answer to the Query after the trigger.
         application: the application that both answers name.
-        bits: bits of the last status, which is also the one from before.
+        bits: bits of the last status, equal to those of the status before.
         endian: byte order in both statuses.
     """
 
@@ -100,7 +100,7 @@ class Dispatch:
         self._dialect: Dialect | None = None
         self._remarks = Remarks(self._name)
         self._round: _Round | None = None  # around the last trigger's result, if that was usual
-        self._notes_events = False  # events are seen although nobody subscribed to them
+        self._notes_events = False  # events are used although there is no subscriber
         self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
             m.ResultContainer: self._results.on_result,
@@ -117,18 +117,18 @@ class Dispatch:
         return self._results.interpretation.layout
 
     def begin_session(self, dialect: Dialect, *, ordered: bool) -> None:
-        """Begin a session; ``ordered`` where messages come in order and none is lost (TCP)."""
+        """Begin a session; ``ordered``: messages come in order and none is lost (TCP)."""
         self._dialect = dialect
         self._waits.begin_session()
         self._state.begin_session()
-        # where the status has to be asked for, changes of it are missed
+        # if the status comes only on request, changes of it are missed
         complete = ordered and dialect.capabilities.status_by_itself and dialect.shows_triggers
         self._results.begin_session(ordered=ordered, complete=complete)
 
     def dispatch_early(self, chunks: Iterable[Chunk]) -> None:
-        """Hand on what came while the session was made.
+        """Pass on the messages received while the session was made.
 
-        Nothing is asked before all of it is: an answer among it is to a question of the handshake.
+        No request is sent before that: an answer among them belongs to the handshake.
         """
         for chunk in chunks:
             self._hand_on(chunk)
@@ -136,7 +136,7 @@ class Dispatch:
             self._requests.ask_what_is_active()
 
     def dispatch(self, chunk: Chunk) -> None:
-        """Hand on every event of a chunk, in order; never waits, never raises."""
+        """Pass on every event of a chunk, in order; never waits, never raises."""
         self._hand_on(chunk)
         if self._state.active_in_doubt:
             self._requests.ask_what_is_active()
@@ -157,10 +157,10 @@ class Dispatch:
                 self._waits.on_message(event, now, chunk.delivery)
 
     def _take_round(self, events: list[Event], now: float, at: datetime) -> bool:
-        """Take the answers to the trigger under way in one step, where nothing is unusual in them.
+        """Handle the answers to the trigger under way in one step, if they are the usual ones.
 
-        Neither in who looks at them: nobody but the trigger's caller, and streams of results. It
-        leaves everything as one event after the other would, which
+        Only the trigger's caller and streams of results may use them. The effect is the same as of
+        one event after the other, which
         ``python -m tests.client.proofs.straight`` shows, or does nothing and returns False.
         """
         first, began, container, ended, last = events
@@ -201,13 +201,13 @@ class Dispatch:
         return True
 
     def _only_streams(self) -> bool:
-        """Return True if nobody looks at statuses, and containers go to streams in any case."""
+        """Return True if no task needs statuses, and containers go to streams in any case."""
         waits, listeners = self._waits, self._listeners
         heard = waits.answers or waits.statuses or listeners.hears_statuses
         return not (heard or listeners.sees_events) and self._results.only_streams
 
     def fail(self, error: SmartCamError) -> None:
-        """End the session: tell everybody who waits, and who comes before the next one.
+        """End the session: every wait ends with an error, also one begun before the next session.
 
         The first reason stays. Streams go on until :meth:`finish`.
         """
@@ -218,7 +218,7 @@ class Dispatch:
             self._results.fail(error)
 
     def finish(self, error: SmartCamError) -> None:
-        """End the streams for good because of ``error``, quietly if we closed."""
+        """End the streams for good because of ``error``, quietly if this side closed."""
         self.fail(error)
         self._waits.finish(error)
         self._results.finish()
@@ -243,7 +243,7 @@ class Dispatch:
             self._state.switched(answer.application)
             self._results.on_switched()
         known = self._dialect is None or answer.application in self._dialect.application_ids
-        if done or known:  # too busy, or too short, to say
+        if done or known:  # else the camera was too busy, or the answer too short
             self._state.set_active(answer.application, at)
 
     def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
@@ -284,7 +284,7 @@ class Dispatch:
 
 
 def _round_of(events: list[Event]) -> _Round | None:
-    """Return the messages around a trigger's result; None where they are not the usual ones."""
+    """Return the messages around a trigger's result; None if they are not the usual ones."""
     first, began, _, ended, last = events
     if (
         not isinstance(began, m.StatusReport)
@@ -305,10 +305,10 @@ def _round_of(events: list[Event]) -> _Round | None:
 def gathered(events: list[Event], endian: int) -> list[Event]:
     """Return events of a camera that runs free with its containers as one burst, then the statuses.
 
-    It sends statuses around each container, which keeps those that came together from being read
-    together. As they came where there is anything else among them, or a container could be read
-    otherwise for where it stands: of another application, or behind a status with another byte
-    order than ``endian``, the present one.
+    It sends statuses around each container, so that containers that came together could not be
+    read together. The events are unchanged if there is anything else among them, or the place of a
+    container matters: it is of another application, or follows a status with another byte order
+    than ``endian``, the present one.
     """
     statuses: list[Event] = []
     data: list[bytes] = []
@@ -331,6 +331,6 @@ def gathered(events: list[Event], endian: int) -> list[Event]:
 
 
 def _is_plain(container: m.ResultContainer) -> bool:
-    """Return True if a container has its bytes alone, names its application, and nobody asked."""
+    """Return True if a container has only bytes, names its application, and was not asked for."""
     named = container.application >= 0 and not container.asked
     return named and container.cells is None and container.fault is None

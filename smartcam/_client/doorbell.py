@@ -1,4 +1,4 @@
-"""Wake the receive task, and who waits for what it hands on, without a turn of the event loop.
+"""Wake the receive task, and callers that wait for it, without a turn of the event loop.
 
 A future wakes its task by way of the event loop: a handle, another turn, another system call. For
 each delivery of bytes that costs more than processing them. A caller that rings this doorbell from
@@ -43,10 +43,10 @@ class Doorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        # what came in the present delivery; None: outcomes wake by way of the loop
+        # outcomes of the present delivery; None: outcomes wake by way of the loop
         self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
-        # function that wakes the waiting task; None if nobody waits
+        # function that wakes the waiting task; None if no task waits
         self._wake: Callable[[Doorbell], None] | None = None
         self._context: contextvars.Context | None = None
 
@@ -62,9 +62,9 @@ class Doorbell:
             self._loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
-        """Have the task go on as :meth:`ring` does, and behind it the callers whose outcome came.
+        """Make the task go on as :meth:`ring` does, and after it the callers whose outcome came.
 
-        What ends the program is raised by the loop: a transport would take it for its own.
+        The loop raises exceptions that end the program: a transport would take them for its own.
         """
         wake, context, loop = self._wake, self._context, self._loop
         if wake is None or context is None or asyncio.current_task(loop) is not None:
@@ -84,7 +84,7 @@ class Doorbell:
                 loop.call_soon(_raise, exc)
 
     def wake_in_order(self) -> None:
-        """Have the callers of this delivery go on by way of the loop, behind who waits already.
+        """Make the callers of this delivery go on by way of the loop, after the tasks in line.
 
         Subscribers then have a result before its trigger's caller goes on.
         """
@@ -156,7 +156,7 @@ class DirectFuture(Generic[T]):
         self._done = self._cancelled = False
         self._value: T | None = None
         self._error: BaseException | None = None
-        self._wake: Callable[[DirectFuture[T]], None] | None = None  # None: nobody waits
+        self._wake: Callable[[DirectFuture[T]], None] | None = None  # None: no task waits
         self._context: contextvars.Context | None = None
 
     def done(self) -> bool:
@@ -164,11 +164,11 @@ class DirectFuture(Generic[T]):
         return self._done
 
     def cancelled(self) -> bool:
-        """Return True if the wait was cancelled before there was anything."""
+        """Return True if the wait was cancelled before there was an outcome."""
         return self._cancelled
 
     def set_result(self, value: T) -> None:
-        """Have the task go on with a result.
+        """Make the task go on with a result.
 
         Raises:
             asyncio.InvalidStateError: it is done.
@@ -183,7 +183,7 @@ class DirectFuture(Generic[T]):
             due.append(self)
 
     def set_exception(self, error: BaseException) -> None:
-        """Have the task go on with an error.
+        """Make the task go on with an error.
 
         Raises:
             asyncio.InvalidStateError: it is done.
@@ -198,13 +198,13 @@ class DirectFuture(Generic[T]):
         return self._error
 
     def wake(self) -> None:
-        """Have the task go on at once, if it waits."""
+        """Make the task go on at once, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None and self._context is not None:
             self._context.run(wake, self)
 
     def wake_soon(self) -> None:
-        """Have the task go on in the loop's next turn, if it waits."""
+        """Make the task go on in the loop's next turn, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None:
             self.get_loop().call_soon(wake, self, context=self._context)
@@ -225,11 +225,11 @@ class DirectFuture(Generic[T]):
     def add_done_callback(
         self, wake: Callable[[DirectFuture[T]], None], *, context: contextvars.Context
     ) -> None:
-        """Note that the task sleeps now; ``wake`` has it go on."""
+        """Note that the task sleeps now; ``wake`` makes it continue."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
-        """Wake the task to be cancelled; False where it goes on anyway, and is told then."""
+        """Wake the task to be cancelled; False if it goes on anyway, and is cancelled then."""
         if self._done:
             return False
         self._done = self._cancelled = True
@@ -239,7 +239,7 @@ class DirectFuture(Generic[T]):
 
     def result(self) -> T:
         """Return the result, or raise the error."""
-        error, self._error = self._error, None  # it refers to who waited, once it is raised
+        error, self._error = self._error, None  # once raised, it refers to the waiting task
         if error is not None:
             raise error
         return cast("T", self._value)
@@ -249,13 +249,13 @@ Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"
 
 
 def wake(waiter: Waiter) -> None:
-    """Have the task go on that waits, unless it does already."""
+    """Make the waiting task go on, unless it does already."""
     if not waiter.done():
         waiter.set_result(None)
 
 
 async def outlast(task: asyncio.Task[Any]) -> None:
-    """Wait until a task has ended, however it does; as ``asyncio.wait`` for one, in fewer steps.
+    """Wait until a task has ended, in any way; as ``asyncio.wait`` for one task, in fewer steps.
 
     Cancellation: the task is left alone.
     """
@@ -290,7 +290,7 @@ class PlainDoorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        # future of the waiting task; None if nobody waits
+        # future of the waiting task; None if no task waits
         self._ringing: asyncio.Future[None] | None = None
 
     def ring(self) -> None:
@@ -299,7 +299,7 @@ class PlainDoorbell:
             self._ringing.set_result(None)
 
     def deliver(self) -> None:
-        """Have the task go on; callers whose outcome comes go on behind it, by way of the loop."""
+        """Make the task go on; callers whose outcome comes go on after it, by way of the loop."""
         self.ring()
 
     def wake_in_order(self) -> None:
@@ -322,7 +322,7 @@ class PlainDoorbell:
 
 
 Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
-"""What :meth:`Doorbell.outcome` or :meth:`PlainDoorbell.outcome` returns."""
+"""The value of :meth:`Doorbell.outcome` or :meth:`PlainDoorbell.outcome`."""
 
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:

@@ -1,10 +1,10 @@
-"""Making a session: fresh links, one after the other, until one answers as a camera does.
+"""Make a session: fresh links, one after the other, until a camera answers.
 
 Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
 3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
 Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt. To
 a camera that hangs up without a byte, the next attempt is made without the Disconnect.
-Where no dialect is pinned, attempts take turns through the protocol's dialects. Those that begin a
+If no dialect is pinned, attempts take turns through the protocol's dialects. Those that begin a
 session alike share an attempt: the answer to Connect, and what follows, tells them apart.
 """
 
@@ -55,7 +55,7 @@ camera answers in milliseconds, one that speaks another dialect is silent; later
 rest of the time, for slow links."""
 
 TELLING_ROUNDS = 3
-"""Questions for the status that a camera must have answered, each, to be one that answers them."""
+"""Number of requests for the status that a camera must answer to count as one that answers."""
 
 BUSY_PAUSE = 0.05
 """Seconds until a camera that was too busy to name its application is asked again."""
@@ -73,10 +73,10 @@ class Session(NamedTuple):
     Attributes:
         link: the link.
         address: address of the attempt, with the dialect pinned.
-        dialect: what is spoken.
+        dialect: dialect of the session.
         version: protocol version from the Connect answer.
-        early: every chunk that came meanwhile, in order: the first status, and whatever else the
-            camera had to say.
+        early: every chunk that came meanwhile, in order: the first status, and any other
+            messages.
     """
 
     link: Link
@@ -91,8 +91,8 @@ class _Collector:
     """Takes events until a wanted one is there; keeps the rest for the client.
 
     Attributes:
-        link: where they come from.
-        most: bytes that may come meanwhile.
+        link: link that the events come from.
+        most: largest number of bytes that may come meanwhile.
     """
 
     link: Link
@@ -141,7 +141,7 @@ class _Collector:
                     logger.debug("%s ! %s during connect", self.link.name, type(event).__name__)
 
     async def ask(self, *first: Message) -> None:
-        """Send a Query behind ``first`` and wait for its answer."""
+        """Send a Query after ``first`` and wait for its answer."""
         before = self.answers
         for message in first:
             self.link.send(message, answered=False)
@@ -150,7 +150,7 @@ class _Collector:
             await self.take()
 
     async def tell_apart(self) -> None:
-        """Find out which of its kin the camera speaks: who answers Get status, or not.
+        """Find out which dialect of its kin the camera speaks, by an answer to Get status, or none.
 
         A status may also come by itself, so it must come to each of several questions.
         """
@@ -158,7 +158,7 @@ class _Collector:
         asking = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
         others = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
         if asking and others:
-            # one that goes on without an answer is certain where no message is lost
+            # a missing answer is certain if no message is lost
             certain = 1 if machine.transport is Transport.TCP else 2
             number = asking[0].message_id(GetStatus)
             known = reader.has(GetStatus)
@@ -200,10 +200,10 @@ async def attempt(
     """Make a session over one fresh link; bounded by the caller's deadline.
 
     Args:
-        address: where the camera is.
+        address: address of the camera.
         dialects: one, or several that begin a session alike.
         transport: TCP or UDP.
-        progress: function that is told how far the handshake came.
+        progress: function that gets each step of the handshake.
         name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
         trace: function that is called with every frame.
@@ -212,7 +212,7 @@ async def attempt(
 
     Raises:
         OSError: no link.
-        SmartCamError: the link ended, or what came was no camera's answer.
+        SmartCamError: the link ended, or the received bytes were no camera's answer.
     """
     link = await open_link(
         load_protocol(address.protocol),
@@ -271,10 +271,10 @@ def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
 def _for_layout(
     tries: list[tuple[Dialect, ...]], layout: Layout | None
 ) -> list[tuple[Dialect, ...]]:
-    """Return the attempts in which the camera can be told a layout.
+    """Return the attempts in which the camera can get a layout.
 
     Raises:
-        ConfigurationError: no attempt can tell the layout.
+        ConfigurationError: no attempt can send the layout.
     """
     groups: list[tuple[Dialect, ...]] = []
     refused: ConfigurationError | None = None
@@ -311,13 +311,13 @@ async def establish(
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
 
     Args:
-        settings: where to, and how long.
+        settings: the address, and the timeouts.
         trace: function that is called with every frame.
-        layout: the fields of the results, for a camera that can be told.
+        layout: the fields of the results, for a camera that takes them.
 
     Raises:
         ConfigurationError: the camera cannot give results of this layout.
-        ConnectFailedError: why, and what to do about it; ``attempts`` tells what came each time.
+        ConnectFailedError: the reason, and the cure; ``attempts`` has the outcome of each.
 
     Cancellation: the link that was being made is dropped.
     """
@@ -333,7 +333,7 @@ async def establish(
     round_tries: list[Try] = []
     for left in range(settings.connect_attempts, 0, -1):
         if isinstance(cause, CommandRejectedError):
-            break  # it said no, and would again
+            break  # it refused, and would again
         round_tries = []
         end = loop.time() + (deadline - loop.time()) / left
         hurried = len(groups) > 1 and left == settings.connect_attempts > 1
@@ -360,13 +360,13 @@ async def establish(
                 progress.end(exc, loop.time() - begin)
                 cause = exc
             if progress.hung_up:
-                # perhaps at the Disconnect: then the next link does without, and so by turns
+                # perhaps because of the Disconnect: attempts are made with and without it by turns
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):
-                break  # another dialect would fare no better in this round
+                break  # another dialect would fail, too, in this round
             if progress.step != CONNECTING:
-                groups = [dialects]  # it answered the Connect: that is its dialect
+                groups = [dialects]  # it answered the Connect, so this is its dialect
                 break
     why = explain(round_tries, address, protocol)
     raise ConnectFailedError(
@@ -382,8 +382,8 @@ def _sharer(
 ) -> Callable[[str], None]:
     """Return the function that gives each step of an attempt its time, in a round until ``end``.
 
-    Only the answer to Connect has to leave time for the dialects that are untried, this one
-    included: no link means that none of them answered, and who answered speaks this one.
+    Only the answer to Connect has to leave time for the untried dialects, this one included:
+    without a link no dialect answered, and a camera that answered speaks this one.
     """
     loop = asyncio.get_running_loop()
 

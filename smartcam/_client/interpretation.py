@@ -87,10 +87,10 @@ class Interpretation:
     """The interpreters of result containers; resolved once, used for every result.
 
     Args:
-        spec: what ``interpret_as`` accepts.
+        spec: a value of ``interpret_as``.
         lenient: whether any non-zero byte is a true bool.
         y_down: whether the camera's y axis points down.
-        calibration: what ``calibration`` accepts.
+        calibration: a value of ``calibration``.
         own: whether the calibration was given for results read by ``spec``; else values that never
             are localizations stay unchanged.
 
@@ -257,7 +257,7 @@ class Interpretation:
             values = way.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
             if self._calibrations is not None and way.calibrated:
-                # each alone, so that it has the same bits in whichever way it came
+                # each alone, so that its bits do not depend on the way it came
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
             raise
@@ -270,7 +270,7 @@ class _Calibrations:
     """The calibrations that each application's values go through.
 
     Args:
-        given: what ``calibration`` accepts, but None.
+        given: a value of ``calibration``, not None.
         y_down: whether the camera's y axis points down.
 
     Raises:
@@ -297,7 +297,7 @@ class _Calibrations:
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: no value would pass; the text says what to give instead.
+            ConfigurationError: no value would pass; the text names the possible values.
         """
         given, known = [self._one], self._by_application
         of = "" if application is None else f" of application {application}"
@@ -373,7 +373,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
     """Return the calibration that was given.
 
     Raises:
-        ConfigurationError: the calibration is not valid, or one that would mirror poses.
+        ConfigurationError: the calibration is not valid, or would mirror poses.
     """
     method = getattr(given, "to_robot", None)
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
@@ -454,7 +454,7 @@ class _ApplicationReader:
 
 @functools.cache
 def _raw(own: bool) -> _ApplicationReader:
-    """Return the reader where nothing is said: bytes as they are, for each client the same."""
+    """Return the reader without a specification: plain bytes, the same reader for each client."""
     return _way(resolve(None), own)
 
 

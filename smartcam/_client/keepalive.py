@@ -65,7 +65,7 @@ def _nothing() -> None: ...
 
 
 class _Watch:
-    """One timer, which is set again each time it fires, and never by received bytes."""
+    """A timer, which is set again each time it fires, and never by received bytes."""
 
     def __init__(self, owner: KeepAlive, link: Link, timeout: float) -> None:
         self._owner = owner

@@ -1,7 +1,7 @@
 """One TCP or UDP link to a camera, used once.
 
-The transport hands bytes to the machine of ``protocols/``. What comes out waits in a bounded queue,
-a chunk of events a delivery, for the receive task, which takes one chunk in a turn of the event
+The transport hands bytes to the machine of ``protocols/``. Its events wait in a bounded queue, as
+a chunk for each delivery, for the receive task, which takes one chunk in a turn of the event
 loop (:meth:`Link.receive`). So nothing that a chunk causes runs in the transport's callbacks, and a
 camera that floods takes no more of a turn than others.
 """
@@ -54,8 +54,8 @@ MAX_DATAGRAMS = 256
 counted."""
 
 MAX_DATAGRAMS_AT_ONCE = 8
-"""Largest number of datagrams that are taken in one turn of the loop where they have come already:
-twice a trigger's answers."""
+"""Largest number of waiting datagrams that are read in one turn of the loop: twice a trigger's
+answers."""
 
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
@@ -64,26 +64,26 @@ The time that one chunk took decides how many bytes the next one holds.
 """
 
 SHARED_TURN_TIME = 0.00005
-"""Seconds in place of :data:`TURN_TIME` where other links share the event loop.
+"""Seconds in place of :data:`TURN_TIME` if other links share the event loop.
 
-Each step of another link waits for one turn of every link that is flooded.
+Each step of another link waits for one turn of every flooded link.
 """
 
 MAX_PASSES = 4
-"""Most turns of the loop before the next chunk, where other links share the loop: as
+"""Largest number of turns of the loop before the next chunk, if other links share the loop: as
 long as other tasks take longer than one turn."""
 
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
 """Number of links that are open on each loop."""
 
 MIN_FRAMES_PER_CHUNK = 5
-"""Fewest frames into which a chunk is cut."""
+"""Least number of frames of a cut chunk."""
 
 FIRST_CHUNK = 64
-"""Frames of a chunk as long as it is not known how long they take."""
+"""Number of frames of a chunk until the time that they take is known."""
 
 LARGEST_CHUNK = 512
-"""Largest number of frames of a chunk, however fast they are worked off: the next ones may take
+"""Largest number of frames of a chunk, even if they are fast: the next ones may take
 longer."""
 
 MAX_REST_BYTES = 256
@@ -96,8 +96,8 @@ class Chunk:
     """Events that one delivery of bytes gave, or some of them.
 
     Attributes:
-        received_at: loop time when it came.
-        events: what it gave, in order.
+        received_at: loop time of the delivery.
+        events: events of the delivery, in order.
         frames: number of frames in which the events came; an event may be made of many (In-Sight).
         delivery: number of the delivery on its link, from 1.
     """
@@ -123,7 +123,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         loop: the event loop that the link is used in.
         outcome: function that makes a future for one task to wait for, which the receive task or
             another one sets.
-        wake_in_order: function that has callers of the present delivery go on behind subscribers.
+        wake_in_order: function that makes callers of the present delivery go on after subscribers.
         heard_at: loop time of the last byte received.
     """
 
@@ -147,23 +147,23 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
-        # where the machine can say several at once
+        # if the machine can send several at once
         each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
         self._send_all = getattr(machine, "send_all", each)
         # function that takes the bytes of an unfinished frame
         self.on_rest: Callable[[bytes], None] | None = None
         self._chunks: collections.deque[Chunk] = collections.deque()
-        self.deliveries = 0  # of bytes that gave events, so far
-        self._frames = 0  # that came until the last chunk
+        self.deliveries = 0  # number of deliveries with events so far
+        self._frames = 0  # number of frames received until the last chunk
         self._most = FIRST_CHUNK  # frames of the next chunk
         # time since which the link works on the last chunk, if that was a large one
         self._busy_since: float | None = None
         self._busy_with = 0
-        self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
+        self._doorbell = bell = make_doorbell(self.loop)  # doorbell of the receive task
         self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
         self.wake_in_order: Callable[[], None] = bell.wake_in_order
         self._closed = False
-        self._closers: list[asyncio.Future[None]] = []  # what those wait for who wait for its end
+        self._closers: list[asyncio.Future[None]] = []  # futures of the waits for its end
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
         self._writable.set()
@@ -176,8 +176,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Write a message.
 
         Args:
-            message: what to say.
-            answered: whether the message is answered, where the protocol does not know.
+            message: the message.
+            answered: whether the message is answered, if the protocol does not know.
 
         Raises:
             LocalProtocolError: the protocol's state forbids it.
@@ -192,7 +192,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Write messages at once: one write on TCP, a datagram each on UDP.
 
         Raises:
-            LocalProtocolError: the protocol's state forbids one; those before it were written.
+            LocalProtocolError: the state forbids a message; those before it were written.
             ConnectionLostError: the link is gone.
         """
         if self._loss is not None:
@@ -263,13 +263,13 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.abort()
 
     def abort(self, reason: BaseException | None = None) -> None:
-        """Drop the link at once; ``reason`` is what the receive task and writers are told."""
+        """Drop the link at once; ``reason``: error for the receive task and writers."""
         self._lose(reason or ConnectionAbortedError("closed by this side"))
         if self._transport is not None:
             self._transport.abort()
 
     def give_up(self, reason: BaseException) -> None:
-        """Drop the link at once, but say Disconnect first where there is a session."""
+        """Drop the link at once, but send Disconnect first if there is a session."""
         if self._transport is not None and not self._transport.is_closing():
             self._say_goodbye()
         self.abort(reason)
@@ -325,7 +325,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 _keep_alive(sock, self._liveness_timeout)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """asyncio: where the next bytes of a TCP link go."""
+        """asyncio: the buffer for the next bytes of a TCP link."""
         return self.machine.room()
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -339,7 +339,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
         self.heard_at = self.loop.time()
-        chunks = self._chunks  # only the first may have come by several datagrams
+        chunks = self._chunks  # only the first chunk may consist of several datagrams
         if chunks and len(chunks) - 1 + chunks[0].frames >= MAX_DATAGRAMS:
             self.machine.counters.ignored_frames += 1
             return
@@ -393,10 +393,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._transport.write(b"".join(frames))
 
     def _read_aside(self, sock: socket.socket) -> OSError | None:
-        """Take the datagrams that have come already, without a turn of the loop for each.
+        """Read the datagrams that have come already, without a turn of the loop for each.
 
         Returns:
-            What the system says of one that this side has sent; None for nothing.
+            The system's error about a datagram that this side has sent; None without one.
         """
         for _ in range(min(MAX_DATAGRAMS_AT_ONCE, MAX_DATAGRAMS) - 1):
             try:
@@ -414,7 +414,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._flush()
 
     def _hand_on(self) -> None:
-        """Queue what the last bytes gave for the receive task."""
+        """Queue the events of the last bytes for the receive task."""
         events = self.machine.events()
         if not events or self._closing:
             return
@@ -431,7 +431,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._doorbell.deliver()
 
     async def _give_way(self) -> None:
-        """Let the loop go round; more often where it is shared and the others are at work."""
+        """Let the loop make a turn, or several if busy other links share it."""
         for _ in range(MAX_PASSES if links[self.loop] > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
@@ -439,12 +439,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 break
 
     def _adapt(self, since: float) -> None:
-        """Have the next chunks hold as much as one turn takes, by how long the last one took."""
+        """Set the size of the next chunks to one turn's time, by the time of the last chunk."""
         self._busy_since = None
         took = thread_time() - since
         turn = SHARED_TURN_TIME if links[self.loop] > 1 else TURN_TIME
         frames = int(self._busy_with * turn / max(took, 1e-9))
-        frames = max(frames, self._most // 2)  # once is no rule
+        frames = max(frames, self._most // 2)  # one slow chunk may be an exception
         self._most = max(MIN_FRAMES_PER_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _pause(self) -> None:
@@ -474,11 +474,11 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
     """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut.
 
-    A trigger's answer and what comes behind it stay together, since one frame may be both: whoever
-    waits for the answer would else send before the result that belongs to it is judged.
+    A trigger's answer and the events after it stay together, since one frame may be both: otherwise
+    a caller that waits for the answer would send before the result of that frame is judged.
     """
     at, events = chunk.received_at, chunk.events
-    if chunk.frames == len(events):  # one each
+    if chunk.frames == len(events):  # one frame for each event
         while frames < len(events) and type(events[frames - 1]) is TriggerAnswer:
             frames += 1
         others = Chunk(at, events[frames:], chunk.frames - frames, chunk.delivery)
@@ -573,12 +573,12 @@ async def open_link(
 
 
 def _keep_alive(sock: socket.socket, timeout: float) -> None:
-    """Have the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
+    """Make the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    probe = max(1, round(timeout / 3))  # whole seconds, after that long and that often
+    probe = max(1, round(timeout / 3))  # whole seconds before the first probe, and between two
     options = {
         "TCP_KEEPIDLE": probe,
-        "TCP_KEEPALIVE": probe,  # the same, where it is called so
+        "TCP_KEEPALIVE": probe,  # another name of the same option
         "TCP_KEEPINTVL": probe,
         "TCP_KEEPCNT": 2,
         "TCP_USER_TIMEOUT": max(1, round(timeout * 1000)),  # milliseconds

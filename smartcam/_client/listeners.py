@@ -1,4 +1,4 @@
-"""Keep those who listen to a camera: streams, single waiters for the next result, observers."""
+"""Keep a camera's listeners: streams, single waiters for the next result, observers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 
 
 class Listeners:
-    """The subscribers and observers that get what comes from a camera.
+    """The subscribers and observers that get a camera's results, statuses and events.
 
     Args:
         name: the camera's name.
@@ -31,8 +31,8 @@ class Listeners:
         results: subscriptions to results.
         statuses: subscriptions to statuses.
         events: subscriptions to events.
-        observed: True if some observer looks at results.
-        may_await: True if somebody asked for the next result since the last one.
+        observed: True if an observer handles results.
+        may_await: True if the next result was requested since the last one.
     """
 
     def __init__(self, name: str, observers: Observers) -> None:
@@ -52,7 +52,7 @@ class Listeners:
         return [*self.results, *self.statuses, *self.events]
 
     def next_result(self) -> asyncio.Future[Result]:
-        """Return a future that gets the next result; it is let go when nobody holds it."""
+        """Return a future that gets the next result; it is dropped without a reference."""
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._next_results.add(future)
         self.may_await = True
@@ -60,12 +60,12 @@ class Listeners:
 
     @property
     def streams_results(self) -> bool:
-        """True if a result would be handed to streams, and to nobody else who wants it alone."""
+        """True if results go to streams, and to no listener that needs single results."""
         return self._streams_hear and not (self._see_each or self._awaits_next)
 
     @property
     def hears_results(self) -> bool:
-        """True if a result would be handed to anybody but its trigger."""
+        """True if a result would go to a listener beside its trigger."""
         return self._streams_hear or self._awaits_next
 
     @property
@@ -78,52 +78,52 @@ class Listeners:
 
     @property
     def has_subscribers(self) -> bool:
-        """True if a task beside the callers of commands may wait for what comes."""
+        """True if tasks beside the callers of commands may wait for something."""
         subscribed = self.results.references or self.statuses.references or self.events.references
         return bool(subscribed) or self.may_await
 
     @property
     def hears_statuses(self) -> bool:
-        """True if a status would be handed to anybody."""
+        """True if a status would go to a listener."""
         return bool(self.statuses.references)
 
     @property
     def watches_status(self) -> bool:
-        """True if somebody subscribed to statuses or events."""
+        """True if there is a subscriber to statuses or events."""
         streams: list[Queue[Any]] = [*self.statuses, *self.events]
         return any(not stream.ended for stream in streams)
 
     @property
     def sees_events(self) -> bool:
-        """True if anybody would see an event."""
+        """True if an event would go to a listener."""
         return bool(self.events.references) or self.notes_events()
 
     def notes_events(self) -> bool:
-        """Return True if an observer or the log takes events, even without a subscriber."""
+        """Return True if an observer or the log needs events, even without a subscriber."""
         return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ delivery
 
     def publish(self, event: CameraEvent) -> None:
-        """Hand an event to its subscribers."""
+        """Pass an event to its subscribers."""
         logger.debug("%s = %s", self._name, event)
         self._observers.state(event)
         self.events.offer(event, 0.0)
 
     def offer_status(self, status: Status, now: float) -> None:
-        """Hand a status to its subscribers."""
+        """Pass a status to its subscribers."""
         if self.statuses.references:
             self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
-        """Hand on results that are only streamed and observed; ``size`` bytes in all."""
+        """Pass on results that are only streamed and observed; ``size`` bytes in all."""
         if self.observed:
             self._observers.results(results)
         for stream in self.results:
             stream.offer_all(results, now, size)
 
     def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
-        """Hand a result on.
+        """Pass a result on.
 
         Args:
             result: result to deliver.
@@ -142,14 +142,14 @@ class Listeners:
     def offer_error(
         self, error: InterpretationError, now: float, size: int, *, current: bool, owned: bool
     ) -> None:
-        """Hand on that a container cannot be read.
+        """Report that a container cannot be read.
 
         Args:
-            error: why.
+            error: the reason.
             now: loop time.
             size: the container's bytes.
             current: as for :meth:`offer_result`.
-            owned: a trigger is ended by it, whose caller tells the observers.
+            owned: the error ends a trigger, and the trigger's caller reports it to observers.
         """
         if self.results:
             _drop_frames(error)
@@ -181,9 +181,9 @@ class Listeners:
 
 
 def _drop_frames(error: SmartCamError) -> None:
-    """Take the frames from an error that may wait in a queue: they hold a whole delivery's bytes.
+    """Remove the frames from an error that may wait in a queue: they hold a delivery's bytes.
 
-    What it came from gets a note instead that says where it was raised.
+    Its cause gets a note with the place where it was raised.
     """
     chain: list[BaseException | None] = [error]
     while chain:
@@ -196,5 +196,5 @@ def _drop_frames(error: SmartCamError) -> None:
         if one is not error:
             code = place.tb_frame.f_code
             one.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
-        one.__traceback__ = None  # so that each comes once
+        one.__traceback__ = None  # so that each error is visited once
         chain += (one.__cause__, one.__context__)

@@ -1,7 +1,7 @@
-"""Poll the status, in dialects that do not send it unasked (``bid``), while somebody needs it.
+"""Poll the status, in dialects that do not send it unasked (``bid``), while it is needed.
 
 There is one timer, which runs while a wait for a status or a trigger is pending, or while statuses
-or events are subscribed to. It asks only if no question is open, from whichever task; an unanswered
+or events are subscribed to. It asks only if no question of any task is open; an unanswered
 question is repeated after a while, since a datagram may be lost. On TCP nothing is lost: if a
 camera sends other messages but no answer, the link is given up.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 PERIOD = 0.02
-"""Seconds between two questions while somebody waits: a fraction of a usual inspection time."""
+"""Seconds between two questions while a task waits: a fraction of a usual inspection time."""
 
 IDLE_PERIOD = 0.25
 """Seconds between two questions while statuses are only subscribed to."""
@@ -49,7 +49,7 @@ class Polling:
         self._running = False
         self._triggered = False  # whether a trigger is pending
         self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0  # time at which the timer fires; a timer of uvloop does not say
+        self._due = 0.0  # time at which the timer fires; a timer of uvloop does not have it
         self._open_since = 0.0
         self._heard = -1  # number of statuses that had come when the timer fired last
 
@@ -66,7 +66,7 @@ class Polling:
         self._stop()
 
     def wanted(self) -> None:
-        """Begin to ask for the status, or ask more often, since somebody wants it."""
+        """Begin to ask for the status, or ask more often, since it is needed."""
         if not self._running:
             return
         loop = self._connection.loop

@@ -23,7 +23,7 @@ class _Logged:
 
 
 class Remarks:
-    """The log lines that one camera causes, each of a kind that has its own count.
+    """The log lines that one camera causes; each kind has its own count.
 
     Callers use a handful of kinds, never a text from the camera.
 
@@ -36,7 +36,7 @@ class Remarks:
         self._kinds: dict[str, _Logged] = {}
 
     def log(self, kind: str, level: int, text: str, *values: object, now: float) -> None:
-        """Log a line unless there were enough of its kind; later log how many were left out.
+        """Log a line unless there were enough of its kind; later log the number left out.
 
         Args:
             kind: name of the kind, for people.

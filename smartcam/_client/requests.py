@@ -1,12 +1,12 @@
 """Send requests to the camera, and wait for each answer with a deadline.
 
 The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
-open, and one that was cancelled leaves an owed answer which the next request of that kind awaits
-first. An answer that never comes leaves the link untrustworthy, so it is given up. But not before
-``request_timeout`` is over (``switch_timeout`` of a switch): one caller may have little time, and
-the link is not its alone.
+open, and a cancelled request leaves a pending answer, which the next request of that kind awaits
+first. An answer that never comes makes the link untrustworthy, so the link is given up; but not
+before ``request_timeout`` is over (``switch_timeout`` for a switch): one caller may have little
+time, and others use the link, too.
 
-Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
+Every ``deadline`` is loop time. The command lock decides whose command runs, one at a time.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TIMER_RESOLUTION = 0.02
 
 @dataclass(eq=False)
 class Requests:
-    """Says something to the camera and has the answer, over one link after the other."""
+    """Sends requests to the camera and waits for answers, over one link after the other."""
 
     _connection: Connection
     _waits: Waits
@@ -56,8 +56,8 @@ class Requests:
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
-        self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        # what the wait goes on by that the timer belongs to
+        self._due: dict[object, float] = {}  # deadline of the last request of a kind
+        # future of the wait that the timer belongs to
         self._late: Waiter | None = None
         self._timer = DeadlineTimer(self._wake_late)
 
@@ -66,7 +66,7 @@ class Requests:
         self._timer.cancel()
 
     def begin_session(self) -> None:
-        """Owe nothing: the session is new."""
+        """Forget pending answers: the session is new."""
         self._due.clear()
 
     # ------------------------------------------------------------------ say and wait
@@ -74,12 +74,12 @@ class Requests:
     async def tell(
         self, message: m.Message, deadline: float, *, answered: bool | None = None
     ) -> None:
-        """Send what the camera never answers; returns once written.
+        """Send a message that the camera never answers; returns once written.
 
         Args:
-            message: what to say.
+            message: the message.
             deadline: loop time.
-            answered: False for a message without a name that is not answered either.
+            answered: False for an unnamed message that is not answered.
 
         Raises:
             ResponseTimeoutError: the camera takes no bytes.
@@ -99,7 +99,7 @@ class Requests:
             raise error from exc
 
     async def command(self, message: m.Request, deadline: float) -> None:
-        """Send a command; where the dialect acknowledges it, wait for that.
+        """Send a command; if the dialect acknowledges it, wait for the acknowledgement.
 
         Raises:
             UnsupportedError: the dialect, or the camera, does not know it.
@@ -114,7 +114,7 @@ class Requests:
         self.check(type(message), got)
 
     def check(self, request: type[m.Message], answer: m.Message) -> None:
-        """Raise what an answer's code says, where it does not say that all is well.
+        """Raise the error for an answer's code, unless the code is a success.
 
         Raises:
             UnsupportedError: the camera does not know the request.
@@ -154,7 +154,7 @@ class Requests:
         """Send a request and return the answer registered under ``key``; as :meth:`ask`.
 
         Raises:
-            ResponseTimeoutError: the answer did not come. It stays owed where it may come yet; if
+            ResponseTimeoutError: the answer did not come. It stays pending if it may still come; if
                 it is overdue, too, the link is given up.
         """
         answer = await self.post(message, key, deadline)
@@ -168,12 +168,12 @@ class Requests:
     async def post(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> OwedAnswer:
-        """Send a request as soon as none of its kind is open; its answer is owed from then on.
+        """Send a request as soon as none of its kind is open; its answer is pending from then on.
 
         Args:
             message: the request.
-            key: what its answer is registered under.
-            deadline: loop time until when to wait for earlier ones.
+            key: key of its answer's registration.
+            deadline: loop time until which earlier requests are awaited.
 
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
@@ -181,10 +181,10 @@ class Requests:
         if self.is_free(key):
             return self._send(message, key, deadline)
         await self.await_turn(key, message, deadline)
-        return self._send(message, key, deadline)  # at once, before whoever is next in the line
+        return self._send(message, key, deadline)  # at once, before the next request in line
 
     def is_free(self, key: type[m.Message] | int) -> bool:
-        """Return True if no answer of this kind is owed, and nobody waits to send its request."""
+        """Return True if no answer of this kind is pending, and no request of it is in line."""
         return not (self._waits.owes(key) or self._locks[key].locked())
 
     async def await_turn(
@@ -223,17 +223,17 @@ class Requests:
     # ------------------------------------------------------------------ Query, and what it fences
 
     async def fence(self, deadline: float) -> None:
-        """Have heard everything that the camera said before now."""
+        """Wait until everything is received that the camera sent before now."""
         await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
     def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
-        """Note that Queries went out with a trigger: their answers are owed to nobody."""
+        """Note that Queries went out with a trigger: no task waits for their answers."""
         self._waits.expect_fences(count)
         self._due[m.QueryAnswer] = max(deadline, sent_at + self.patience)
 
     def ask_status(self) -> None:
-        """Have the camera say its status, where it does not come by itself.
+        """Make the camera send its status, if it does not come by itself.
 
         Raises:
             ConnectionLostError: the link is gone.
@@ -247,7 +247,7 @@ class Requests:
         if self._waits.owes(m.QueryAnswer):
             return False
         features = self._connection.features
-        # the status is not to grow old; over UDP an answer that is owed may have been lost
+        # the status must be fresh; over UDP a pending answer may have been lost
         if features.polled and not (features.ordered and self._state.owes_status):
             self.ask_status()
         self._connection.require_link().send(m.Query())
@@ -255,8 +255,8 @@ class Requests:
         return True
 
     def ask_what_is_active(self) -> None:
-        """Send a Query after somebody else's switch, as soon as none is open from before it."""
-        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
+        """Send a Query after a switch by others, as soon as no earlier Query is open."""
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports it
             if self.ask_for_life(asyncio.get_running_loop().time()):
                 self._state.asked()
 
@@ -267,7 +267,7 @@ class Requests:
     # ------------------------------------------------------------------ answers
 
     def owes(self, key: type[m.Message]) -> bool:
-        """Return True if the camera owes an answer of this kind."""
+        """Return True if an answer of this kind is pending."""
         return self._waits.owes(key)
 
     async def await_owed(
@@ -289,7 +289,7 @@ class Requests:
                 raise error from exc
 
     def _give_up_overdue(self, key: type[m.Message] | int, error: ResponseTimeoutError) -> None:
-        """Give the link up if the answer that is owed should have come by now."""
+        """Give the link up if the pending answer is overdue."""
         loop = asyncio.get_running_loop()
         if loop.time() + TIMER_RESOLUTION >= self._due[key]:
             self._connection.require_link().give_up(error)
@@ -297,7 +297,7 @@ class Requests:
     async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
         """Wait until an answer is there, and return it.
 
-        The answer is left alone when the task that waits is cancelled: it stays owed.
+        If the waiting task is cancelled, the answer stays pending.
 
         Raises:
             TimeoutError: the deadline is over.
@@ -306,7 +306,7 @@ class Requests:
             link = self._connection.require_link()
             waiter: Waiter = link.outcome()
             answer.waiters.append(waiter)
-            timer = None  # a wait beside another one has a timer of its own
+            timer = None  # a wait beside another has its own timer
             if self._late is None:
                 self._late = waiter
                 self._timer.set(deadline)

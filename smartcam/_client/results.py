@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
-# as plain integers: what an IntFlag does in Python costs more than all else that a status needs
+# as plain integers: operations of an IntFlag cost more than the rest of handling a status
 _TELLING = int(
     Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING
 )  # a change of these may mean that the trigger under way has failed
@@ -51,10 +51,10 @@ _CURRENT = {"triggered", "nobody"}
 
 @dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
-    """The trigger under way, and what the caller waits for.
+    """The trigger under way, and the outcome that its caller waits for.
 
     Attributes:
-        outcome: what the caller waits for: the results or the error.
+        outcome: future with the results or the error.
         interpretation: interpretation that reads the results.
         has_input: True if input data was sent with the trigger.
         sent_at: loop time at which the trigger was sent.
@@ -62,7 +62,7 @@ class PendingTrigger(SentTrigger):
         application: id of the application that is believed to be active, None if any will do.
         results: results received so far.
         unproven: containers that wait for proof that the camera took the trigger (those with the
-            fate ``triggered`` are its own then), and the containers behind them.
+            fate ``triggered`` are its own then), and the containers after them.
     """
 
     outcome: DirectFuture[list[Result]] | asyncio.Future[list[Result]]
@@ -86,8 +86,8 @@ class Results:
     """Gives each container exactly one fate, and its result to its trigger and to the streams.
 
     Attributes:
-        interpretation: how to read results that no trigger reads otherwise.
-        correlation: says whose each container is.
+        interpretation: interpretation of results, unless a trigger has its own.
+        correlation: finds the trigger of each container.
         input_in_doubt: the input data of a trigger without a result may still be queued in the
             camera.
     """
@@ -114,7 +114,7 @@ class Results:
 
         Args:
             ordered: messages come in order and none is lost (TCP).
-            complete: every change of the status is told, too.
+            complete: every change of the status is sent, too.
         """
         self._warned_extra = self._warned_others = False
         self._lossy = not ordered
@@ -123,7 +123,7 @@ class Results:
     def fail(self, error: SmartCamError) -> None:
         """End the session, and with it the trigger under way.
 
-        What it would have given may come in the next session: it is owed.
+        Its results may still come in the next session: they are pending.
         """
         if self._pending is not None:
             self.give_up(told(error))
@@ -195,7 +195,7 @@ class Results:
         self._decide(now)
 
     def _decide(self, now: float) -> None:
-        """End the trigger under way if what the camera has said of it by now is enough for that."""
+        """End the trigger under way if the camera's messages so far are enough for that."""
         pending = self._awaited()
         if pending is None:
             return
@@ -214,11 +214,11 @@ class Results:
                 self._complete(pending, now)
 
     def on_status(self, previous: int | None, bits: int, now: float) -> None:
-        """Take a status.
+        """Handle a status.
 
         Args:
-            previous: the one before, None if there was none in this session.
-            bits: the new one.
+            previous: the status before, None if there was none in this session.
+            bits: the new status.
             now: loop time.
         """
         was = previous or 0
@@ -230,7 +230,7 @@ class Results:
             self._decide(now)
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
-        """End the trigger under way where the status says that its result cannot be trusted."""
+        """End the trigger under way if the status shows that its result cannot be trusted."""
         pending = self._awaited()
         if pending is None:
             return
@@ -262,21 +262,21 @@ class Results:
         self._release(pending)
 
     def _release(self, pending: PendingTrigger) -> None:
-        """Hand on the unproven containers: to the trigger, or as an older one's if it has ended."""
+        """Pass on the unproven containers: to the trigger, or as older ones if it has ended."""
         unproven, pending.unproven = pending.unproven, []
         if not pending.ended:
             pending.came -= sum(fate == "triggered" for _, fate, *_ in unproven)
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
                 self._hand_on(container, None, fate, number, now, at)
-            elif not pending.ended:  # which it has where the one before could not be read
+            elif not pending.ended:  # it has ended if the container before could not be read
                 self._hand_on(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate
                 self._hand_on(container, None, older, number, now, at)
 
     def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
-        """Count and hand on several containers at once; one by one where they may differ."""
+        """Count and pass on several containers at once; one by one if they may differ."""
         results = self._read_burst(burst, at)
         if results is None:
             for container in burst:
@@ -291,7 +291,7 @@ class Results:
 
     @property
     def only_streams(self) -> bool:
-        """True if results go to streams, and need not be told of one by one.
+        """True if results go to streams, and need not be passed on one by one.
 
         No result can then belong to a trigger, pay a debt, or count as an extra result.
         """
@@ -302,8 +302,8 @@ class Results:
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None if one may be anything else.
 
-        Otherwise a trigger or a single waiter may want one of them, one may pay a debt, an observer
-        may look at each by itself, and one that cannot be interpreted is an item of its own.
+        Otherwise a trigger or a single waiter may need one of them, one may be a pending result, an
+        observer may need each by itself, and one that cannot be interpreted is its own item.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:
@@ -337,7 +337,7 @@ class Results:
         """
         state, counters, pending = self._state, self._counters, self._awaited()
         active, expected = state.active, state.expected
-        if container.application < 0:  # a quirk: it does not say whose it is
+        if container.application < 0:  # a quirk: it does not name its application
             known = m.UNNAMED_APPLICATION if active is None else active
             container = replace(container, application=known)
         if expected is None and pending is not None:
@@ -346,7 +346,7 @@ class Results:
             state.set_active(container.application, at)
         if expected is not None and container.application != expected:
             self.give_up(self._wrong_application(container, expected))  # ours may still come
-            if state.shared:  # somebody else may want it
+            if state.shared:  # another program may want it
                 self._hand_on(container, None, "streamed", None, now, at)
             else:
                 counters.count("wrong_application")
@@ -407,8 +407,8 @@ class Results:
     def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
         """Return the trigger under way if a container with its answers around it is its result.
 
-        That is noted then, and :meth:`on_own` takes the container. None where anything but its
-        evidence decides, or something has come of it already.
+        That is noted then, and :meth:`on_own` handles the container. None if anything but its
+        evidence decides, or a result of it has come already.
         """
         pending = self._pending
         if pending is None or pending.ended or pending.outcome.done() or pending.came:
@@ -427,11 +427,11 @@ class Results:
     def on_own(
         self, container: m.ResultContainer, owner: PendingTrigger, now: float, at: datetime
     ) -> None:
-        """Take a container that is known to be a trigger's."""
+        """Handle a container that is known to be a trigger's."""
         self._hand_on(container, owner, "triggered", None, now, at)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
-        """Return True if a container equal to this one is there, as when a datagram comes twice."""
+        """Return True if an equal container came before, as when a datagram comes twice."""
         results = pending.results if pending is not None else []
         return any(one.raw == container.data for one in results)
 
@@ -471,7 +471,7 @@ class Results:
         return result
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
-        """End the trigger under way if it has all its results, and nothing speaks against it."""
+        """End the trigger under way if it has all its results, without a sign against them."""
         if owner.came < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:
@@ -487,7 +487,7 @@ class Results:
         """End a trigger whose result came and cannot be read."""
         if owner.has_input:
             self.input_in_doubt = False
-        # where its number cannot be read, it may be another's, and its own still come
+        # without a readable number it may be another's result, and its own may still come
         certain = owner.number is None or number == owner.number
         self.correlation.give_up(owner, unread=int(certain))
         if not owner.given_up:

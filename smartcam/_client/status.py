@@ -32,7 +32,7 @@ def is_ready(status: Status) -> bool:
 
 @dataclass(eq=False)
 class StatusRequests:
-    """Waits for statuses, and has them told where they do not come by themselves."""
+    """Waits for statuses, and requests them if they do not come by themselves."""
 
     _connection: Connection
     _requests: Requests
@@ -41,15 +41,15 @@ class StatusRequests:
     _waits: Waits
 
     def begin_session(self) -> None:
-        """Have the status told from now on, where it does not come by itself."""
+        """Request the status from now on, if it does not come by itself."""
         self._polling.begin_session()
 
     def end_session(self) -> None:
-        """Ask for no status any more."""
+        """Request no status any more."""
         self._polling.end_session()
 
     def wanted(self) -> None:
-        """Somebody subscribed: have statuses told, where they do not come by themselves."""
+        """Request statuses for a new subscriber, if they do not come by themselves."""
         self._polling.wanted()
 
     @property
@@ -71,7 +71,7 @@ class StatusRequests:
             predicate: function that returns True for the status awaited.
             deadline: loop time.
             what: description of the status awaited, for the error.
-            insist: ask for the status again where a report of it may have been lost.
+            insist: request the status again if a report of it may have been lost.
 
         Raises:
             ResponseTimeoutError: the status did not come in time; the text names it and the last
@@ -93,7 +93,7 @@ class StatusRequests:
     async def wait(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
         """Return the first status, the present one included, that ``predicate`` accepts.
 
-        It is shown every status in order. What it raises comes out here.
+        It gets every status in order. Its errors are raised here.
 
         Raises:
             TimeoutError: at ``deadline`` (loop time).
@@ -107,7 +107,7 @@ class StatusRequests:
         return await self._waits.status(predicate, deadline)
 
     async def insist(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
-        """Wait for a status; over UDP, where one may be lost, have it said again half-way.
+        """Wait for a status; over UDP, where one may be lost, request it again half-way.
 
         Raises:
             TimeoutError: at ``deadline``.
@@ -121,9 +121,9 @@ class StatusRequests:
         return await self.wait(predicate, deadline)
 
     async def demand(self, deadline: float) -> None:
-        """Have the camera say its status, by Get status where there is that.
+        """Make the camera send its status, by Get status if the dialect has it.
 
-        Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: a client that
+        Otherwise Connect brings one (SC manual p. 29, published). A Query goes first: a client that
         has lost the session must not take it back by this.
         """
         link = self._connection.require_link()
@@ -134,15 +134,15 @@ class StatusRequests:
             await self._requests.fence(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
-            pass  # its own time may not be over; keepalive sees to the rest
+            pass  # its own time may not be over; keepalive detects a lost camera
         except LocalProtocolError as exc:  # the last one's answer never came
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     async def refresh(self, deadline: float) -> None:
-        """Know the status as it is now, where it can be asked for.
+        """Get the present status, if it can be requested.
 
         Raises:
-            ResponseTimeoutError: the camera did not tell it.
+            ResponseTimeoutError: the camera did not send it.
         """
         connection = self._connection
         if not connection.dialect.has(m.GetStatus):

@@ -1,10 +1,10 @@
-"""The life of a client: sessions, one after the other, and what happens between them.
+"""The life of a client: sessions, one after the other, and the steps between them.
 
 One task per client, its only bare ``create_task``. It makes a session, has the receive
-task read its link to the end, tells everybody that it is over, and by the
-:class:`~smartcam.Backoff` makes the next. When the camera was lost again soon after a
-reconnect another client has it: then it stops or, at an agent, tries again slowly. What has to
-follow its end is done by a callback, since a task that is cancelled before its first step runs no
+task read its link to the end, ends all waits, and makes the next by the
+:class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another client has
+it: then the task stops or, at an agent, tries again slowly. The steps after its end are done by a
+callback, since a task that is cancelled before its first step runs no
 ``finally``.
 """
 
@@ -56,8 +56,8 @@ client (a decision of this library; the camera does not say so)."""
 
 FIRST_RETRY_DELAY_OF_TAKEN = 30.0
 MAX_RETRY_DELAY_OF_TAKEN = 600.0
-"""Seconds until a camera that was taken is tried again, where it is: twice as long each time that
-it is taken again. Each try costs the other client its session for a moment."""
+"""Seconds until a taken camera is tried again, if it is: twice as long each time that it is
+taken again. Each try costs the other client its session for a moment."""
 
 
 @dataclass(eq=False)
@@ -66,8 +66,8 @@ class Supervisor:
 
     Attributes:
         session: the last session that was made, None before the first.
-        on_taken: function that is called when the camera was taken, and has it tried again slowly;
-            None: a camera that was taken is the end.
+        on_taken: function that is called when the camera was taken, which is then tried again
+            slowly; None: a taken camera is the end.
     """
 
     _settings: CameraSettings
@@ -88,12 +88,12 @@ class Supervisor:
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._changed = asyncio.Event()
         self._closing = False
-        self._closed: ConnectionClosedError | None = None  # what close() tells everybody
-        self._ended_by: SmartCamError | None = None  # why there is no more session, if not by us
-        self._finished = False  # the task is over, and everybody knows
-        self._reading = False  # a link, whose end it notices by itself
+        self._closed: ConnectionClosedError | None = None  # error for all waits after close()
+        self._ended_by: SmartCamError | None = None  # reason of the end, if not this program
+        self._finished = False  # whether the task is over, and all waits have ended
+        self._reading = False  # whether a link is read, whose end is noticed then
         self.on_taken: Callable[[], None] | None = None
-        self._times_taken = 0  # in a row
+        self._times_taken = 0  # losses in a row to another client
         self._take_back = asyncio.Event()
         self._short_lived = 0  # sessions in a row that were lost soon
         self._excused = False  # an early loss of this session is no other client's doing
@@ -168,10 +168,10 @@ class Supervisor:
                 self._commands.end_session()
 
     def abandon(self) -> bool:
-        """Drop the link and end the task soon, from any thread: nobody has the client any more.
+        """Drop the link and end the task soon, from any thread: no reference to the client is left.
 
         Returns:
-            Whether there was anything to end.
+            True if there was anything to end.
         """
         task = self._task
         if task is None or task.done():
@@ -182,14 +182,14 @@ class Supervisor:
         return True
 
     def _drop(self) -> None:
-        """Drop the link at once, Disconnect said, and have the task end."""
+        """Drop the link at once, after a Disconnect, and end the task."""
         if self.session is not None:
             self.session.link.give_up(ConnectionAbortedError("closed by this side"))
         if self._task is not None and not self._reading:
             self._task.cancel()
 
     async def wait_connected(self, deadline: float, timeout: float) -> None:
-        """Wait until there is a session, and what had to be restored in it is.
+        """Wait until there is a session, and its state is restored.
 
         Raises:
             LinkError: there will be none.
@@ -219,16 +219,16 @@ class Supervisor:
         return isinstance(self._waits.end, ConnectionTakenError)
 
     def take_back(self) -> None:
-        """Have a camera that was taken tried again now."""
+        """Try a taken camera again now."""
         if self.taken:
             self._take_back.set()
 
     def restarts(self, link: Link) -> None:
-        """Note that the camera was told to restart: the link ends, and that is no fault."""
+        """Note that a restart was requested: the link will end without a fault."""
         self._restarting = link
 
     def closed_error(self) -> ConnectionClosedError:
-        """Return the error of a client that has no session by our own will."""
+        """Return the error of a client that this program has closed or not opened."""
         address = self._settings.address
         state = "closed" if self.started else "not opened yet"
         return ConnectionClosedError(
@@ -238,7 +238,7 @@ class Supervisor:
     # ------------------------------------------------------------------ the task
 
     def _end(self, task: asyncio.Task[SmartCamError]) -> None:
-        """Tell everybody that there will be no session any more: the task is over."""
+        """End all waits, since there will be no session any more: the task is over."""
         error = self._reason(task)
         self._dispatch.fail(error)
         if self._closing:
@@ -280,11 +280,11 @@ class Supervisor:
         try:
             return await self._live()
         except ENDS_PROGRAM as exc:
-            # the receive task has raised it out of the event loop, which is to clean up in peace
+            # the receive task has raised it out of the event loop, which must clean up undisturbed
             return self._failed(exc)
 
     async def _live(self) -> SmartCamError:
-        """Have sessions; return why there will be no more."""
+        """Make sessions; return the reason why there will be no more."""
         session = await establish(self._settings, self._observers.trace, self._dispatch.layout)
         while True:
             again = self.session is not None
@@ -294,7 +294,7 @@ class Supervisor:
             if self._closing or self._settings.reconnect is None:
                 return error
             ordered = session.link.machine.transport is Transport.TCP
-            # over UDP only silence tells that it is another's, which it was before that began
+            # over UDP only silence shows that another client has it, which began earlier
             now = asyncio.get_running_loop().time()
             short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
             takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
@@ -313,7 +313,7 @@ class Supervisor:
             session = await self._reconnect(error)
 
     async def _have(self, session: Session) -> ConnectionLostError:
-        """Have one session until its link ends; return why it did."""
+        """Keep one session until its link ends; return the reason of the end."""
         settings, link = self._settings, session.link
         error: ConnectionLostError
         self._reading = True
@@ -355,7 +355,7 @@ class Supervisor:
         self._tell()
 
     async def _receive(self, link: Link) -> ConnectionLostError:
-        """Have each chunk dispatched until the link ends; return the reason for its end."""
+        """Dispatch each chunk until the link ends; return the reason of its end."""
         while True:
             try:
                 chunk = await link.receive()
@@ -367,7 +367,7 @@ class Supervisor:
             del chunk  # the next one may take its time
 
     def _tell_of_loss(self, link: Link, error: ConnectionLostError) -> None:
-        """Tell everybody that a link has ended; what came before is dispatched."""
+        """End all waits, since a link has ended; all its events are dispatched."""
         restarting = self._restarting is link
         expected = self._closing or restarting
         reason = "the camera restarts" if restarting else str(error.__cause__)
@@ -383,7 +383,7 @@ class Supervisor:
         self._tell()
 
     async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
-        """Make a new session after a long pause, or as soon as somebody takes the camera back.
+        """Make a new session after a long pause, or as soon as the camera is to be taken back.
 
         Raises:
             SmartCamError: the client gave up.
@@ -396,7 +396,7 @@ class Supervisor:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._take_back.wait()
-        # a camera that does not answer is nobody's: from then on it is awaited like any other
+        # a camera that does not answer has no client: from then on it is awaited like any other
         return await self._reconnect(taken, at_once=True)
 
     async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
@@ -448,7 +448,7 @@ class Supervisor:
     @property
     def _pause_of_taken(self) -> float:
         """Seconds until a camera that was taken is tried again."""
-        doubled = min(self._times_taken, 16)  # of what is far beyond the longest pause
+        doubled = min(self._times_taken, 16)  # more is far beyond the longest pause
         return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
 
     def _tell(self) -> None:

@@ -1,7 +1,7 @@
-"""Triggers: from the camera's readiness to the results, or to the reason why there are none.
+"""Triggers: from the camera's readiness to the results, or to the reason of their absence.
 
-What is left over from earlier triggers is settled first, and a fence goes out in front of each, so
-that no older result passes for the next one's (:mod:`smartcam._client.correlation`).
+Pending results of earlier triggers are settled first, and a fence goes out before each trigger, so
+that no older result passes for its result (:mod:`smartcam._client.correlation`).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGG
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
 _SPEAKS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
-)  # of these Waiting alone is to be set before a trigger
+)  # of these, exactly Waiting must be set before a trigger
 
 LATE_GRACE = 0.25
 """Seconds that a late result is waited for before it is made impossible: most are only a little
@@ -67,18 +67,18 @@ late, and stopping and starting an application costs more."""
 
 
 OVERTRIGGERED_GRACE = 1.0
-"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
-cannot tell that ours was dropped, so no trigger is sent."""
+"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set, it
+cannot show that the new trigger was dropped, so no trigger is sent."""
 
 MAX_SHARE_WITHOUT_WAIT = 0.5
-"""Share of a trigger's timeout below which what is left shows that the trigger had to wait."""
+"""A trigger with less than this share of its timeout left has had to wait."""
 
 MIN_TIMEOUT_SHARE = 0.01
 """Share of its timeout that a trigger which had to wait needs at least."""
 
 READING_SHARE = 0.8
-"""Share of the time until its deadline after which a trigger is ended on a camera that goes on
-until it is told to end. The rest is for its answer."""
+"""Share of the time until its deadline after which a trigger is ended on a camera that would
+not end it by itself. The rest is for its answer."""
 
 _WHY_READY = "; it does not while it inspects, and an application that runs free never does"
 
@@ -88,8 +88,8 @@ _HINT = "; where it never shows that, shows_triggers=no in its URL lets results 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
 
 FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
-"""The messages of a trigger where statuses alone tell what became of it: one object, by which the
-machine knows it."""
+"""The messages of a trigger if statuses alone show its outcome: one object, by which the machine
+recognizes them."""
 
 
 @dataclass(slots=True)
@@ -97,11 +97,11 @@ class TriggerRequest:
     """The arguments of a trigger, checked.
 
     Attributes:
-        interpretation: how to read its results.
-        input_data: sent right before it, None for none.
-        results: how many results it is to have.
-        wait: wait until the camera takes a trigger; else refuse where it does not.
-        expected: the application that its results are to be of; by default the one that was named.
+        interpretation: interpretation of its results.
+        input_data: data to send right before it, None for none.
+        results: number of results expected.
+        wait: wait until the camera takes a trigger; else refuse if it does not.
+        expected: application expected to send its results; by default the named one.
     """
 
     interpretation: Interpretation
@@ -123,7 +123,7 @@ def takes_trigger(status: Status) -> bool:
 
 @dataclass(eq=False)
 class Triggers:
-    """Triggers a camera, one trigger at a time: whose turn it is, the command lock says."""
+    """Triggers a camera, one trigger at a time; the command lock decides whose."""
 
     _connection: Connection
     _requests: Requests
@@ -137,19 +137,19 @@ class Triggers:
     def __post_init__(self) -> None:
         self._name = self._connection.name
         self._correlation = self._results.correlation
-        self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
+        self._doubtful: Link | None = None  # over UDP: link on which a status may have been lost
         self._quickest = 0.0
-        self._quickest_of: int | None = None  # the application
-        self._ending: asyncio.TimerHandle | None = None  # of the trigger under way
+        self._quickest_of: int | None = None  # application of the quickest result
+        self._ending: asyncio.TimerHandle | None = None  # timer of the trigger under way
 
     def give_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
         self._correlation.give_number(number)
 
     def _check_time(self, left: float, timeout: float) -> None:
-        """See that a trigger which has waited has the time that a result takes.
+        """Check that a trigger that had to wait still has the time that a result takes.
 
-        One that is sent all the same ends without its result, which then comes late, and the next
+        Otherwise it would end without its result, which then comes late, and the next
         trigger has to settle that first.
 
         Raises:
@@ -172,9 +172,9 @@ class Triggers:
         """Wait until the camera takes a trigger, send it, return its results.
 
         Args:
-            request: what to do.
+            request: the trigger's arguments.
             deadline: loop time at which the trigger ends.
-            timeout: seconds that were given to it.
+            timeout: seconds of the whole call.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
@@ -186,7 +186,7 @@ class Triggers:
     async def _trigger_until_taken(
         self, request: TriggerRequest, deadline: float, timeout: float
     ) -> list[Result]:
-        """Trigger again where the camera says that it was too busy for it."""
+        """Trigger again if the camera was too busy."""
         busy: CameraBusyError | None = None
         while True:
             try:
@@ -228,19 +228,19 @@ class Triggers:
             await self._check_application(expected, deadline)
         if self._doubtful is not None and self._doubtful is connection.link:
             await self._status.demand(deadline)
-            await self._requests.fence(deadline)  # it has come by then, or is lost again
+            await self._requests.fence(deadline)  # a status has come by then, or is lost again
             self._doubtful = None
             correlation.heard()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
-        # an older result shows by its number where each container has one
+        # an older result shows by its number if each container has one
         decided = numbering is not None and numbering.always
         if correlation.doubted:  # the trigger before may not show in the status yet
             await self._requests.fence(deadline)
             correlation.heard()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
-        waited = False  # in line with Queries, so none of either kind keeps the other one waiting
+        waited = False  # in line with Queries, so that neither kind delays the other
         while True:
             status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
@@ -269,7 +269,7 @@ class Triggers:
             request.input_data is not None,
             now,
             datetime.now(UTC),
-            # where each application has its own interpreter none is read with another's layout
+            # if each application has its own interpreter, no result is read with another's layout
             request.expected if interpretation.by_application else state.active,
             [],
         )
@@ -281,7 +281,7 @@ class Triggers:
         try:
             self._send(pending, link, words, deadline)
             if not link.is_writable():
-                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
+                with contextlib.suppress(TimeoutError):  # the outcome is a timeout then, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
             results = await pending.outcome  # TimeoutError: the timer of Results, at the deadline
@@ -293,7 +293,7 @@ class Triggers:
                 if self._ending is not None and not self._ending.cancelled():
                     self._end_reading(link)
             else:
-                pending.outcome.exception()  # nobody will look at it
+                pending.outcome.exception()  # no task will read it
             raise
         else:
             took = link.loop.time() - now
@@ -322,7 +322,7 @@ class Triggers:
     def _send(
         self, pending: PendingTrigger, link: Link, words: Sequence[m.Message], deadline: float
     ) -> None:
-        """Write a trigger and what goes with it; note what is owed for it."""
+        """Write a trigger and its other messages; note the pending answers."""
         requests, features = self._requests, self._connection.features
         link.send_all(words)
         if features.tells_all and words is FENCED_TRIGGER:
@@ -343,7 +343,7 @@ class Triggers:
     def _timed_out(
         self, pending: PendingTrigger, link: Link, deadline: float
     ) -> TriggerTimeoutError:
-        """Give a trigger up whose time is over; return the error that says so."""
+        """Give up a trigger whose time is over; return the error."""
         self._correlation.give_up(pending)
         # it may have been stopped: then Waiting did not drop for this trigger
         certain = self._connection.features.ordered or pending.evidence.began
@@ -360,7 +360,7 @@ class Triggers:
     async def _prepare(
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[m.Message]:
-        """Return the messages of a trigger; its input goes out now, where that is answered."""
+        """Return the messages of a trigger; its input is sent now if it is answered."""
         requests, features = self._requests, self._connection.features
         asked = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []
@@ -380,12 +380,12 @@ class Triggers:
         return words
 
     def _end_reading(self, link: Link) -> None:
-        """Have the camera end the trigger under way, which it would not do by itself."""
+        """Make the camera end the trigger under way, which it would not do by itself."""
         with contextlib.suppress(SmartCamError):  # the link is over, and the trigger with it
             link.send(m.EndTrigger(), answered=False)
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
-        """Have the trigger end at once where the camera says that it took none."""
+        """End the trigger at once if the camera reports that it took none."""
 
         def on_answer(answer: asyncio.Future[Answer]) -> None:
             got = answer.result()
@@ -395,7 +395,7 @@ class Triggers:
                 self._requests.check(m.Trigger, got)
             except (CommandRejectedError, UnsupportedError) as exc:
                 busy = isinstance(got, m.Acknowledgement) and self._requests.is_busy(got)
-                if not self._connection.features.ordered:  # it may be the answer to an earlier one
+                if not self._connection.features.ordered:  # perhaps an earlier trigger's answer
                     self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
             except SmartCamError as exc:  # the link is over
@@ -404,12 +404,12 @@ class Triggers:
         self._requests.expect(m.TriggerAnswer, deadline).add_done_callback(on_answer)
 
     async def _check_application(self, expected: int, deadline: float) -> None:
-        """See to it that an application is the active one.
+        """Check that an application is the active one.
 
         Raises:
-            WrongApplicationError: somebody else has switched; nothing was sent but a Query.
+            WrongApplicationError: another program has switched; only a Query was sent.
         """
-        await self._requests.fence(deadline)  # what is known may be old
+        await self._requests.fence(deadline)  # the known status may be old
         active = self._state.active
         if active != expected:
             raise WrongApplicationError(
@@ -420,9 +420,9 @@ class Triggers:
             )
 
     async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
-        """Wait until the camera takes a trigger, or say why it never will."""
+        """Wait until the camera takes a trigger, or raise the reason why it never will."""
         begin = asyncio.get_running_loop().time()
-        ends_at = math.inf  # when a trigger that is not ours is ended
+        ends_at = math.inf  # time at which another program's trigger is ended
         if self._connection.features.ends_triggers:
             ends_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
         while True:
@@ -456,11 +456,11 @@ class Triggers:
                 ) from exc
 
     async def _end_stranger(self, deadline: float) -> None:
-        """End a trigger that is not ours, such as one whose link broke: the camera never would."""
+        """End a trigger of others, or one whose link broke: the camera never would."""
         ours = self._waits.owes(m.TriggerAnswer)
         if Status.BUSY in self._status.last and not ours:
             self._end_reading(self._connection.require_link())
-            await self._requests.fence(deadline)  # a line that comes of it is not the next one's
+            await self._requests.fence(deadline)  # a line of that trigger is not the next one's
 
     def _fault(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
@@ -468,9 +468,9 @@ class Triggers:
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
         """Await the result of an earlier trigger, or make it impossible, unless a number decides.
 
-        Stop voids the inspection under way, a Query is the fence: what comes before its answer
-        came from before. Without a Stop the inspection's end is awaited: the camera waits for a
-        trigger again. A camera that does one thing after the other needs the fence only.
+        Stop voids the inspection under way, a Query is the fence: containers before its answer are
+        older. Without a Stop the inspection's end is awaited: the camera waits for a trigger
+        again. A camera that handles requests one after the other needs the fence only.
         Source: that Stop voids the inspection is inferred.
         """
         correlation, commands = self._correlation, self._commands
@@ -495,7 +495,7 @@ class Triggers:
         correlation.settled()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
-        """Reset Overtriggered, or wait until it has fallen: only then can it rise for ours.
+        """Reset Overtriggered, or wait until it falls: only then can it rise for the next trigger.
 
         Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
         until it is reset (BVS ID guide p. 227, published).
@@ -523,7 +523,7 @@ def _is_not_overtriggered(status: Status) -> bool:
 
 
 def _evidence(features: Features) -> TriggerEvidence:
-    """Return the evidence that a trigger needs before results are taken for its own."""
+    """Return the evidence that a trigger needs before results count as its own."""
     if not features.fences:
         told = features.acknowledged and features.ordered  # else an answer may be lost, or late
         return EvidenceByAcknowledgement() if told else TriggerEvidence()
@@ -533,7 +533,7 @@ def _evidence(features: Features) -> TriggerEvidence:
 
 
 def _what_is_missing(pending: PendingTrigger) -> str:
-    """Return the part of an error text on what the camera has not said of the trigger."""
+    """Return the part of an error text on the camera's missing messages about the trigger."""
     evidence, early = pending.evidence, ""
     if pending.early:
         what = "1 result" if pending.early == 1 else f"{pending.early} results"

@@ -1,4 +1,4 @@
-"""Keep those who wait for an answer or a status, and the reason why there is no session."""
+"""Keep the waits for answers and statuses, and the reason why there is no session."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
-"""The outcome of a request: the answer, or the error that says why there is none."""
+"""The outcome of a request: the answer, or the reason of its absence as an error."""
 
 
 ErrorT = TypeVar("ErrorT", bound=SmartCamError)
 
 
 def told(error: ErrorT) -> ErrorT:
-    """Return an error to raise where another one is kept.
+    """Return a copy of a kept error, to be raised.
 
     A raised error refers to the frames of its caller, and by them to the client: kept by the
-    client's own task, it would keep a client alive that nobody has any more.
+    client's own task, it would keep an unreferenced client alive.
     """
     made = type(error)(*error.args)  # as copy() does, in a tenth of the steps
     vars(made).update(vars(error))
@@ -38,10 +38,10 @@ def told(error: ErrorT) -> ErrorT:
 
 
 class OwedAnswer(asyncio.Future[Answer]):
-    """An answer that the camera owes; it belongs to nobody who waits for it.
+    """A pending answer of the camera; it belongs to no single waiter.
 
     Attributes:
-        waiters: what those who wait go on by, each one's own.
+        waiters: a future for each waiter.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -49,7 +49,7 @@ class OwedAnswer(asyncio.Future[Answer]):
         self.waiters: list[Waiter] = []
 
     def set_result(self, result: Answer) -> None:
-        """Have the answer, or why there is none, and wake those who wait."""
+        """Set the answer, or the reason of its absence, and wake the waiters."""
         super().set_result(result)
         for waiter in self.waiters:
             wake(waiter)
@@ -60,9 +60,9 @@ class StatusWaiter:
     """A caller that waits for a status.
 
     Attributes:
-        predicate: says which one.
-        outcome: gets it, or what the predicate raised: as a value, for a future takes not every
-            error.
+        predicate: function that returns True for the awaited status.
+        outcome: future of the status, or of the predicate's error as a value, since a future does
+            not take every error.
     """
 
     predicate: Callable[[Status], bool]
@@ -87,12 +87,12 @@ class Waits:
         self._counters = counters
         self.answers: dict[type[m.Message] | int, OwedAnswer] = {}
         self._asked_at: dict[object, float] = {}
-        self._behind: dict[object, int] = {}  # deliveries that came before the request was sent
+        self._behind: dict[object, int] = {}  # deliveries received before the request was sent
         self._fences_open = 0  # Queries that went out with the last trigger and are not answered
         self.statuses: dict[StatusWaiter, None] = {}  # waiters in order; each leaves in one step
 
     def begin_session(self) -> None:
-        """Begin a session, in which nothing is asked yet."""
+        """Begin a session, without a pending request."""
         self.end = None
         self._fences_open = 0
 
@@ -100,7 +100,7 @@ class Waits:
         """End every wait, also one that begins before the next session, with the reason.
 
         Returns:
-            Whether that is news: the first reason stays.
+            True if it is the first reason, which stays.
         """
         if self.end is not None:
             return False
@@ -120,14 +120,14 @@ class Waits:
         return True
 
     def finish(self, error: SmartCamError) -> None:
-        """Note why there will be no session any more, whatever has ended the last one."""
+        """Note the reason why there will be no session any more."""
         self.end = error
 
     def raise_end(self) -> None:
-        """Raise why there is no session, if there is none.
+        """Raise the reason why there is no session, if there is none.
 
         Raises:
-            LinkError: there is no session, and why.
+            LinkError: the reason why there is no session.
         """
         if self.end is not None:
             raise told(self.end)
@@ -137,35 +137,35 @@ class Waits:
     def next_answer(self, key: type[m.Message] | int, *, behind: int = 0) -> OwedAnswer:
         """Register for the next answer of this kind; errors come as a result, never raised.
 
-        What came in the delivery ``behind`` of the link, or in an earlier one, is no answer: it was
-        there before the request was sent, and waits to be handed on.
+        Messages in the delivery ``behind`` of the link, or in an earlier one, are no answer: they
+        came before the request was sent, and wait to be passed on.
         """
         loop = asyncio.get_running_loop()
         future = OwedAnswer(loop)
         self.answers[key] = future
         self._behind[key] = behind
-        if key is not m.SwitchAnswer:  # it takes its time, which is no round trip
+        if key is not m.SwitchAnswer:  # a switch takes long, which is no round trip
             self._asked_at[key] = loop.time()
         return future
 
     def owed_answer(self, key: type[m.Message] | int) -> OwedAnswer:
-        """Return the future of an answer that is owed (:meth:`owes`)."""
+        """Return the future of a pending answer (:meth:`owes`)."""
         return self.answers.get(key) or self.next_answer(key)
 
     def owes(self, key: type[m.Message] | int) -> bool:
-        """Return True if an answer of this kind is open."""
+        """Return True if an answer of this kind is pending."""
         return key in self.answers or (key is m.QueryAnswer and self._fences_open > 0)
 
     def expect_fences(self, count: int) -> None:
-        """Note that Queries went out with a trigger, for whose answers nobody waits."""
+        """Note that Queries went out with a trigger; no task waits for their answers."""
         self._fences_open = count
 
     def awaits_fences(self, count: int) -> bool:
-        """Return True if so many Queries of a trigger are open, and nobody waits for anything."""
+        """Return True if so many Queries of a trigger are open, and no task waits for anything."""
         return self._fences_open == count and not self.answers and not self.statuses
 
     def take_fence(self) -> bool:
-        """Return True if nobody waits for an answer to Query; count that answer off."""
+        """Return True if no task waits for an answer to Query; count that answer off."""
         if not self._fences_open:
             return False
         self._fences_open -= 1
@@ -186,9 +186,9 @@ class Waits:
     # ------------------------------------------------------------------ statuses
 
     async def status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
-        """Return the next status that ``predicate`` accepts; it is shown each one in order.
+        """Return the next status that ``predicate`` accepts; it gets each status in order.
 
-        What it raises comes out here.
+        Its errors are raised here.
 
         Raises:
             TimeoutError: at ``deadline`` (loop time).
@@ -202,13 +202,13 @@ class Waits:
         finally:
             self.statuses.pop(waiter, None)
         if isinstance(outcome, SmartCamError):
-            raise outcome.with_traceback(None)  # raised for all who wait, it would grow each time
+            raise outcome.with_traceback(None)  # else it would grow with each waiter's raise
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
     def show(self, status: Status) -> None:
-        """Show a status to everybody who waits for one."""
+        """Pass a status to every waiter."""
         for waiter in tuple(self.statuses):
             if waiter.outcome.done():
                 continue

@@ -1,7 +1,7 @@
 """A Wireshark dissector for every dialect of ``bvs``, made from the message tables.
 
-The tables become Lua tables; ``engine.lua`` beside this file reads frames with them. So a message
-that is new in ``protocols/_bvs.py`` is new in Wireshark, too, and no fact of the wire stands twice.
+The tables become Lua tables, with which ``engine.lua`` beside this file reads frames. So a new
+message in ``protocols/_bvs.py`` is known to Wireshark, too.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _name(status: Status) -> str:
 def _status(bits: StatusBits) -> dict[str, Any]:
     """Return the status bits of the wire by the attributes of StatusBits.
 
-    Statuses that have no other place stand ``others`` bits higher than on the wire.
+    Statuses without a place of their own are shifted up by ``others`` bits.
     """
     if bits.others:
         named = {member.value >> bits.others: member for member in Status}
@@ -139,7 +139,7 @@ def _status(bits: StatusBits) -> dict[str, Any]:
 
 
 def _ids(rows: Sequence[MessageRow]) -> dict[int, str]:
-    """Return the messages that have an id, for each id: requests first."""
+    """Return the names of the messages with each id, requests first."""
     names: dict[int, dict[str, None]] = {}
     for row in sorted(rows, key=lambda one: one.type.sender is Sender.CAMERA):
         names.setdefault(row.message_id, {})[row.type.__name__] = None

@@ -1,1 +1,1 @@
-"""Is it a BVS camera? Is it a good client? Judged from outside, with code of its own."""
+"""Judge from outside, with independent code: is it a BVS camera, or a good client?"""

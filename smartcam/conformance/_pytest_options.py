@@ -1,6 +1,6 @@
-"""Options of the command line for judging cameras and clients, and what is found of clients.
+"""Command-line options for judging cameras and clients, and the findings about clients.
 
-It is light: the pytest plugin imports it in every run of pytest.
+The module is light, since the pytest plugin imports it in every run of pytest.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 PROPERTY = "smartcam-client-finding"
-"""Name of a test report's property that holds a finding: reports pass from process to process."""
+"""Property of a test report that holds a finding, since reports pass between processes."""
 
 CAMERA: Mapping[str, str] = {
     "--camera-url": (
         "the camera that smartcam.conformance.camera judges, such as bvs://192.168.0.10; "
-        "it is taken from whoever has it"
+        "it is taken from its client"
     ),
     "--camera-application": (
         "id of the application that may be started and triggered (default: the active one)"
@@ -25,21 +25,20 @@ CAMERA: Mapping[str, str] = {
         "id of another application, which may be loaded for a moment (default: none is)"
     ),
     "--camera-allow": (
-        "what may be done to the camera beside run, trigger and switch, which are put back: "
-        "clock, number, input, errors, reboot, all; 'nothing' takes the three away"
+        "changes of the camera that are allowed beside run, trigger and switch, all undone: "
+        "clock, number, input, errors, reboot, all; 'nothing' forbids the three"
     ),
     "--camera-timeout": "seconds that an answer, a status or a result may take (default 5)",
     "--camera-quiet": "seconds of silence that count as no answer (default 0.5)",
     "--camera-switch-timeout": "seconds that loading an application may take (default 30)",
     "--camera-reboot-timeout": "seconds that a restart may take (default 180)",
     "--camera-sequence-offset": (
-        "where in the application's results its sequence number (int32) stands, bytes "
-        "behind the application's id"
+        "offset of the sequence number (int32) in results, bytes after the application's id"
     ),
     "--camera-input": "input data that the application takes, as hex",
     "--camera-report": "file to write the report to, as JSON",
 }
-"""Help text of each option that is about a camera."""
+"""Help text of each option about a camera."""
 
 CLIENT: Mapping[str, str] = {
     "--client-command": (
@@ -51,7 +50,7 @@ CLIENT: Mapping[str, str] = {
     "--client-transport": "tcp, udp, or both with a comma between them; default tcp.",
     "--client-timeout": "Seconds that a task may take; default 30.",
 }
-"""Help text of each option that is about a client."""
+"""Help text of each option about a client."""
 
 
 def add_options(parser: Any) -> None:
@@ -68,7 +67,7 @@ def add_options(parser: Any) -> None:
 
 
 def terminal_summary(reporter: Any) -> None:
-    """Write what was found of clients into pytest's report; nothing where nothing was."""
+    """Write the findings about clients into pytest's report, if there are any."""
     found = [
         value
         for reports in reporter.stats.values()

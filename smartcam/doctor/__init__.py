@@ -1,8 +1,8 @@
-"""Find out what is wrong with a camera, or with the way to it, and name the cure in plain words.
+"""Find out what is wrong with a camera, or with the connection to it, and name the cure.
 
-:func:`examine` runs one check after the other, from the ground up: the name, the session, status,
-application, round trip, run state, triggers, layout, clock. It changes nothing on the camera and
-triggers nothing unless that is allowed. :func:`find` says where in a network cameras may be.
+:func:`examine` runs one check after the other, beginning with the basics: the name, the session,
+status, application, round trip, run state, triggers, layout, clock. It changes nothing on the
+camera and triggers nothing unless that is allowed. :func:`find` searches networks for cameras.
 """
 
 from __future__ import annotations
@@ -58,24 +58,24 @@ __all__ = [
 NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="connecting takes the camera from another client, where it serves one: the newcomer wins",
+    text="connecting takes the camera from another client, if it serves one: the newcomer wins",
     cure="A program that uses smartcam takes it back by itself.",
 )
 
 SHARED = Finding(
     check="notice",
     severity="ok",
-    text="the camera is an agent's, which shares it: this examination takes it from nobody",
+    text="the camera's agent shares it: this examination takes it from no program",
 )
 SEVERAL = Finding(
     check="notice",
     severity="ok",
-    text="the camera serves several clients: this examination takes it from nobody",
+    text="the camera serves several clients: this examination takes it from none",
 )
 
 
 MAX_SECONDS = 86_400
-"""Seconds that a camera is watched at most: a day."""
+"""Largest number of seconds for which a camera is watched: a day."""
 
 MAX_TRIGGERS = 10_000
 """Largest number of triggers of an examination, since their times are kept."""
@@ -85,8 +85,8 @@ class _DoctorCheck(NamedTuple):
     """One check."""
 
     name: str  # name of the examination in its findings
-    run: Callable[[Examination], Awaitable[None]]  # looks, and reports to the exam
-    limit: Callable[[DoctorOptions], float]  # seconds that it may take, by what was asked for
+    run: Callable[[Examination], Awaitable[None]]  # function that checks, and reports to the exam
+    limit: Callable[[DoctorOptions], float]  # seconds that it may take with these options
     in_session: bool = True  # whether the examination needs a session
 
 
@@ -95,7 +95,7 @@ def _requests(options: DoctorOptions) -> float:
 
 
 def _switch(options: DoctorOptions) -> float:
-    return 2 * options.step(10.0)  # the turn, and what is done in it
+    return 2 * options.step(10.0)  # the wait for the turn, and the switch
 
 
 def _once(options: DoctorOptions) -> float:
@@ -109,7 +109,7 @@ _AT_THE_WIRE = (
     _DoctorCheck(
         "session",
         session_checks.connect,
-        # a session that fails, every other way, and a session by one of them; and their ends
+        # a session that fails, all other ways, and a session by one of them; and their ends
         lambda options: (
             4 * options.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.CONNECTS
         ),
@@ -151,9 +151,9 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
-"""The checks in their order, after those of the wire or of the fleet. The limits are there for a
-fault of ours: each step has a bound of its own. Their sum, and a second for the end of the session,
-bounds the whole."""
+"""The checks in their order, after those of the wire or of the fleet. The limits only matter for an
+internal error, since each step has a bound of its own. Their sum, and a second for the end of the
+session, bounds the whole."""
 
 
 async def examine(
@@ -168,23 +168,23 @@ async def examine(
     count: int = 10,
     trace: Callable[[TraceEntry], None] | None = None,
 ) -> AsyncGenerator[Finding]:
-    """Examine a camera and yield what is found, as it is found.
+    """Examine a camera and yield each finding at once.
 
-    Connecting may take the camera from another client: the first finding says so. Nothing is
-    started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
+    Connecting may take the camera from another client: the first finding reports it. Nothing is
+    started, stopped, switched or set, and nothing is triggered without ``trigger``.
 
     Args:
-        url: the camera's address; ``gige://HOST`` is a source of frames, of which the way, the
+        url: the camera's address; for ``gige://HOST``, a source of frames, the network, the
             control, the packets and the pictures are examined.
         application: id that is expected to be active. With ``trigger`` it is loaded and started
-            for the triggers, and what was before is back afterwards.
+            for the triggers, and the application from before is loaded again afterwards.
         interpret_as: interpretation of the results; None does not compare them with anything.
         y_down: whether the camera's y axis points down.
         trigger: whether to send triggers.
         timeout: seconds for each step: connect (default 10), request (5), switch (10), trigger (5).
-        seconds: time for which a camera is watched that sends results by itself.
+        seconds: time for which a camera is watched that sends results unasked.
         count: number of triggers.
-        trace: function that is called with everything that goes over the wire.
+        trace: function that is called with every frame on the wire.
 
     Raises:
         ConfigurationError: an address, a layout or a number cannot work; nothing was tried.
@@ -230,7 +230,7 @@ async def examine(
     fleet = is_fleet(url)
     way, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
-    exam.make_camera()  # which sees to it that the options can work
+    exam.make_camera()  # checks the options
     alone = not fleet and serves_one(load_protocol(address.protocol))
     yield SHARED if fleet else NOTICE if alone else SEVERAL
     async with exam.stack, exam.borrowed:
@@ -255,12 +255,12 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
             if not check.in_session:
                 return not any(one.exit_code for one in exam.pending) or exam.camera is not None
             if not exam.patient.connected and check.name != "clock":
-                await exam.patient.query_application()  # raises why
+                await exam.patient.query_application()  # raises the reason
     except LinkError as exc:
         await _explain_loss(exam, exc)
         return False
     except ResponseTimeoutError as exc:
-        if not exam.patient.connected:  # an answer that did not come costs the session
+        if not exam.patient.connected:  # a missing answer ends the session
             await _explain_loss(exam, exc)
             return False
         exam.fail(

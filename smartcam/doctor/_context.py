@@ -1,4 +1,4 @@
-"""One examination: what was asked for, the camera, and what was seen of it so far."""
+"""One examination: its options, its camera, and its observations so far."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_KEPT = 1000
-"""Statuses and arrival times kept: at 300 results per second those of the default 3 seconds."""
+"""Largest number of statuses and arrival times kept: 300 results per second for 3 seconds."""
 
 MAX_CONTAINERS = 32
-"""Result containers kept, to be compared with the layout: 2 MB of the largest."""
+"""Largest number of containers kept, for the comparison with the layout: 2 MB of the largest."""
 
 
 def called(application: int | None) -> str:
-    """Return the application's name for texts; not every camera has ids for all of them."""
+    """Return the application's name for texts; some cameras have applications without ids."""
     return (
         "the application"
         if application is None or application < 0
@@ -75,16 +75,16 @@ class DoctorOptions:
 
 
 class Witness(Observer):
-    """Sees what the camera sends and keeps the last of it.
+    """Observes the camera's messages and keeps the last ones.
 
     Attributes:
         statuses: the last statuses, each different from the status before.
         results: number of results since the arrivals were last forgotten.
         arrivals: loop times at which the last results arrived, in seconds.
-        containers: the last results; each value is a :class:`Reading` where an interpreter was
+        containers: the last results; each value is a :class:`Reading` if an interpreter was
             given.
-        unreadable: why the first result could not be given to an interpreter: an endian field
-            that is neither little nor big, cells that are not the layout's.
+        unreadable: reason why the first result could not be given to an interpreter: an endian
+            field that is neither little nor big, or cells that do not fit the layout.
     """
 
     def __init__(self) -> None:
@@ -105,13 +105,13 @@ class Witness(Observer):
         self.containers.append(result)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """Keep why a result could not be given to an interpreter."""
+        """Keep the reason why a result could not be given to an interpreter."""
         if isinstance(error, InterpretationError):
             self._arrived()
             self.unreadable = self.unreadable or error
 
     def forget_arrivals(self) -> None:
-        """Count results anew."""
+        """Count results from 0 again."""
         self.results = 0
         self.arrivals.clear()
 
@@ -121,9 +121,9 @@ class Witness(Observer):
 
 
 class Diagnosis(NamedTuple, Generic[T]):
-    """One of several things that may be wrong; the first that fits is it."""
+    """One of several possible causes; the first that fits counts."""
 
-    fits: Callable[[T], bool]  # function that says, by what was seen, whether this is the cause
+    fits: Callable[[T], bool]  # function that judges from observations whether it fits
     text: str  # text with fields to fill in
     cure: str  # text of the cure, also with fields
     exit_code: Exit = Exit.NO_SESSION  # exit code of the finding
@@ -141,21 +141,21 @@ class FrameObserver(Observer):
 
 
 class Reading(NamedTuple):
-    """A result container's bytes and what an interpreter made of them."""
+    """A result container's bytes, and the error of an interpreter."""
 
     data: bytes
     byte_order: ByteOrder  # byte order of their numbers
-    error: InterpretationError | None  # why they do not fit, None if they do
+    error: InterpretationError | None  # reason why they do not fit, None if they do
 
 
 class Keeper(Interpreter):
-    """Reads as another interpreter does, and gives a :class:`Reading` whether they fit or not.
+    """Interprets as another interpreter does, and returns a :class:`Reading` in any case.
 
-    The layout's sequence number is no more than a field to it: setting the number of the next run
-    would change something on the camera.
+    The layout's sequence number is an ordinary field here: setting the number of the next run
+    would change the camera.
 
     Args:
-        inner: the other one.
+        inner: the other interpreter.
     """
 
     def __init__(self, inner: Interpreter) -> None:
@@ -166,7 +166,7 @@ class Keeper(Interpreter):
         self.inner: Interpreter = inner
 
     def interpret(self, reader: Reader) -> Reading:
-        """Return the bytes, and the error if there is one."""
+        """Return the bytes, and the error if they do not fit."""
         order = reader.context.byte_order
         try:
             run(self.inner, Reader(reader.data, reader.context, self.inner.layout))
@@ -177,14 +177,14 @@ class Keeper(Interpreter):
 
 @dataclass(slots=True)
 class Examination:
-    """An examination under way."""
+    """A running examination."""
 
     options: DoctorOptions  # options that the user gave
-    address: Address  # address of the camera, with what was found out pinned
+    address: Address  # address of the camera, with the dialect once found
     trace: Callable[[TraceEntry], None] | None  # called with every frame
-    witness: Witness  # sees what it sends
+    witness: Witness  # observer of the camera's messages
     stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # steps to undo at the end
-    # an application that is loaded for the triggers, and goes back
+    # the application that was loaded for the triggers, to be switched back
     borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
     bus: Bus | None = None  # bus of a fleet; None before it answered
     camera: Camera | None = None  # the client, None before the session
@@ -195,7 +195,7 @@ class Examination:
     # findings that were not handed out yet
     pending: list[Finding] = field(default_factory=list[Finding])
 
-    def say(
+    def report(
         self,
         severity: Severity,
         text: str,
@@ -221,7 +221,7 @@ class Examination:
         self, text: str, cure: str = "", *, exit_code: Exit = Exit.NO_SESSION, **details: Any
     ) -> None:
         """Report an error."""
-        self.say("error", text, cure, exit_code=exit_code, **details)
+        self.report("error", text, cure, exit_code=exit_code, **details)
 
     def take(self) -> list[Finding]:
         """Return the findings since the last call."""
@@ -232,7 +232,7 @@ class Examination:
     def patient(self) -> Camera:
         """The camera in a session.
 
-        LookupError: there is no session; checks that use it come behind the one that connects.
+        LookupError: there is no session; checks that use the camera run after the connecting one.
         """
         if self.camera is None:
             raise LookupError("there is no session")
@@ -245,7 +245,7 @@ class Examination:
         return f"{host}:{self.address.port}"
 
     def pin(self, url: str) -> None:
-        """Take over protocol, transport and dialect of a URL; a login, which none shows, stays."""
+        """Use protocol, transport and dialect of a URL; a login, which no URL shows, stays."""
         found = parse_address(url)
         if found.protocol != self.address.protocol:
             self.address = found
@@ -256,7 +256,7 @@ class Examination:
     def make_camera(self) -> Camera:
         """Return a client that takes the camera once and never takes it back.
 
-        Raises ConfigurationError: a time-out is not valid.
+        Raises ConfigurationError: a timeout is not valid.
         """
         asked = self.options
         options: CameraOptions = {
@@ -265,7 +265,7 @@ class Examination:
             "request_timeout": asked.step(5.0),
             "switch_timeout": asked.step(10.0),
         }
-        if asked.y_down or not self.in_fleet:  # the agent may know it
+        if asked.y_down or not self.in_fleet:  # the agent may know the direction
             options["y_down"] = asked.y_down
         if asked.interpreter is not None:
             options["interpret_as"] = Keeper(asked.interpreter)

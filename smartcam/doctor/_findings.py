@@ -19,7 +19,7 @@ class Exit(enum.IntEnum):
     """The exit codes that findings can have."""
 
     DONE = 0
-    """Only hints and warnings, if anything."""
+    """Only hints and warnings, if any."""
     NO_SESSION = 3
     """There is no session, or it broke."""
     RAN_OUT = 4
@@ -36,10 +36,10 @@ class Finding:
 
     Attributes:
         check: name of the check that made the finding.
-        severity: ``ok``: as it should be, or only information; ``hint``: something to know or to
+        severity: ``ok``: as expected, or only information; ``hint``: something to know or to
             try; ``warning``: it works, but something is wrong; ``error``: it does not work.
-        text: what was found, in plain words.
-        cure: what to do, empty if nothing is to be done.
+        text: the finding, in plain words.
+        cure: what to do about it; empty if nothing needs to be done.
         details: the finding as values for programs; times in seconds.
         exit_code: exit code of a command that ends with this finding; 0 for all but errors.
     """
@@ -53,10 +53,10 @@ class Finding:
 
 
 def summary(findings: Iterable[Finding]) -> Finding:
-    """Return the sum of findings, as one of ``check="summary"``.
+    """Return a summary of findings, a finding of ``check="summary"``.
 
-    It has the severity and the exit code of the worst; of several that are equally bad the first
-    decides, since the checks begin with the basics, and later findings may follow from earlier
+    It has the severity and the exit code of the worst finding; of several equally bad findings the
+    first counts, since checks begin with the basics, and later findings may follow from earlier
     ones.
     """
     all_found = list(findings)

@@ -1,4 +1,4 @@
-"""Checks on the way to a camera of a fleet: host, bus, agent, and the agent's session with it."""
+"""Checks of the connection to a camera of a fleet: host, bus, agent, and the agent's session."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.settings import Address
 
 LOOKS_WITHIN = 1.0
-"""Seconds in which an agent that has just been started, or joined its router, shows up."""
+"""Seconds within which an agent that was just started, or has joined its router, appears."""
 
 LOOK_AGAIN = 0.1
 
@@ -66,7 +66,7 @@ def address_of(url: str) -> Address:
 
 
 async def reach(exam: Examination) -> None:
-    """Check ``bus``: whether something takes a connection there, and answers as a bus does."""
+    """Check ``bus``: whether the port accepts a connection, and a bus answers there."""
     address, limit = FleetAddress.parse(exam.address.url), exam.options.step(10.0)
     place, cure = exam.host_and_port, SERVE.format(host=exam.address.host) + LISTENS
     try:
@@ -102,7 +102,7 @@ async def reach(exam: Examination) -> None:
     exam.stack.push_async_callback(end.close)
     exam.bus = end
     taken = 1e3 * (asyncio.get_running_loop().time() - begin)
-    exam.say(
+    exam.report(
         "ok",
         f"the bus at {place} answers, after {taken:.1f} ms",
         url=address._replace(camera="").url,
@@ -110,7 +110,7 @@ async def reach(exam: Examination) -> None:
 
 
 async def _certificates(exam: Examination, address: FleetAddress) -> bool:
-    """Look at the certificates of both sides, if there are any; return whether they will do."""
+    """Check the certificates of both sides, if any; return whether they are good enough."""
     if address.certificates is None:
         return True
     folder, loop = Path(address.certificates), asyncio.get_running_loop()
@@ -131,7 +131,7 @@ async def _certificates(exam: Examination, address: FleetAddress) -> bool:
         )
         return False
     warning = own.warning or ends_soon("the agent's certificate", theirs.ends)
-    exam.say(
+    exam.report(
         "hint" if warning else "ok",
         f"this program is {own}: it may look" + (", and command" if may_command(own.role) else ""),
         warning,
@@ -148,7 +148,7 @@ async def _certificates(exam: Examination, address: FleetAddress) -> bool:
 
 
 async def find(exam: Examination) -> None:
-    """Check ``agent``: whether one is there, and has the camera."""
+    """Check ``agent``: whether there is an agent that has the camera."""
     address = FleetAddress.parse(exam.address.url)
     cameras = await _cameras(exam, address)
     agents = sorted({agent for _, agent, _ in cameras})
@@ -184,7 +184,7 @@ async def find(exam: Examination) -> None:
     else:
         names = [agent for _, agent in sharing]
         several = len(names) > 1
-        exam.say(
+        exam.report(
             "hint" if several else "ok",
             f"agent{'s' if several else ''} {', '.join(names)} of the fleet {fleets[0]} "
             f"{'have' if several else 'has'} this camera; cameras there: {details['cameras']}",
@@ -194,10 +194,10 @@ async def find(exam: Examination) -> None:
 
 
 async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
-    """Return fleet, agent and name of all cameras; cameras that have just come are there, too."""
+    """Return fleet, agent and name of all cameras, including those that have just appeared."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
-        raise LookupError("there is no bus; what uses it comes behind what reaches it")
+        raise LookupError("there is no bus; checks that use it run after the check that reaches it")
     end = loop.time() + LOOKS_WITHIN
     pattern = Keys(address.fleet or "*").camera("*", "**")
     while True:
@@ -230,7 +230,7 @@ async def connect(exam: Examination) -> None:
         )
         return
     exam.camera, exam.connected_at = camera, loop.time()
-    exam.say(
+    exam.report(
         "ok",
         f"the agent has a session with the camera: dialect {camera.capabilities.dialect}, "
         f"protocol version {camera.protocol_version}",
@@ -239,10 +239,10 @@ async def connect(exam: Examination) -> None:
 
 
 async def reserve(exam: Examination) -> None:
-    """Check ``reservation``: for triggers the camera has to be ours alone."""
+    """Check ``reservation``: triggers need a camera that only this program uses."""
     if not exam.wants_trigger:
         return
-    exam.wants_trigger = False  # until it is ours
+    exam.wants_trigger = False  # until it is reserved
     camera, limit = cast("FleetCamera[Any]", exam.patient), exam.options.step(10.0)
     try:
         await exam.stack.enter_async_context(camera.reserve(limit))
@@ -261,11 +261,11 @@ async def reserve(exam: Examination) -> None:
         )
         return
     exam.wants_trigger = True
-    exam.say("ok", "the camera is reserved, so that no other program's triggers come between")
+    exam.report("ok", "the camera is reserved, so that no other program's triggers come between")
 
 
 def explain_loss(exam: Examination, error: SmartCamError) -> None:
-    """Say why a session is over."""
+    """Report why a session is over."""
     age = asyncio.get_running_loop().time() - exam.connected_at
     exam.check = "lost"
     exam.fail(

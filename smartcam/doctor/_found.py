@@ -1,4 +1,4 @@
-"""The findings of a search: the protocols that are spoken, and the likely owners of open ports."""
+"""The findings of a search: protocols of open ports, and the cameras that answered."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ MAX_PORTS = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundPort:
-    """A port that took a connection.
+    """A port that accepted a connection.
 
     Attributes:
         host: address of the host.
         port: number of the port.
-        protocols: names of the protocols that it may speak, the most probable first; empty if what
-            was heard is none of them.
-        evidence: ``greeted``: it said by itself what cameras of the protocol say; ``silent``: it
-            says nothing before it is spoken to, and so do they; ``said``: it said something, and
-            what they say is not known; ``ended``: it hung up at once, as a camera may that has a
-            client; ``other``: it is none of them.
-        said: what came by itself, up to 512 bytes.
+        protocols: names of the protocols that it may speak, the most probable first; empty if the
+            received bytes fit none of them.
+        evidence: ``greeted``: it sent the greeting of the protocol's cameras; ``silent``: it sends
+            nothing before it receives something, like such cameras; ``said``: it sent something,
+            and the cameras' greeting is not known; ``ended``: it closed the connection at once, as
+            a camera with a client may; ``other``: it is no such camera.
+        said: bytes that it sent unasked, up to 512.
         seconds: time until the connection was open.
-        answer: what the camera said of itself, where it was asked and has answered.
-        refusal: why the camera has not answered, where it was asked.
+        answer: the camera's description of itself, if it was asked and has answered.
+        refusal: reason why the camera has not answered, if it was asked.
     """
 
     host: str
@@ -53,7 +53,7 @@ class FoundPort:
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """Its address in each protocol; what it answered to, if it was asked."""
+        """The port's address in each protocol; after an answer, in the answered protocol only."""
         if self.answer is not None:
             return (self.answer.url,)
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -62,7 +62,7 @@ class FoundPort:
 
     @property
     def greeting(self) -> str:
-        """The first line of what came by itself, what cannot be printed as dots."""
+        """The first line of the bytes that it sent unasked, unprintable characters as dots."""
         lines = self.said.decode("latin-1").strip().splitlines()
         return (
             "".join(c if c.isascii() and c.isprintable() else "." for c in lines[0])
@@ -75,7 +75,7 @@ class FoundPort:
 
 
 def tcp_protocols() -> dict[str, Protocol]:
-    """Return the protocols that go over TCP, by name; one that cannot be loaded is left out."""
+    """Return the protocols over TCP, by name; those that cannot be loaded are left out."""
     found: dict[str, Protocol] = {}
     for info in PROTOCOLS.available():
         try:
@@ -83,7 +83,7 @@ def tcp_protocols() -> dict[str, Protocol]:
         except PluginError:
             if info.origin == "built-in":
                 raise
-            continue  # a broken plug-in costs only its own name
+            continue  # a broken plug-in is left out
         if isinstance(protocol, Protocol) and Transport.TCP in protocol.schemes.values():
             found[info.name] = protocol
     return found
@@ -92,7 +92,7 @@ def tcp_protocols() -> dict[str, Protocol]:
 def ports_of(
     further: Iterable[int], names: Iterable[str] | None
 ) -> dict[int, tuple[Protocol, ...]]:
-    """Return the ports to open, and which protocols may be spoken there.
+    """Return the ports to open, and the protocols that may be spoken there.
 
     Raises:
         ConfigurationError: a name is no protocol's of TCP, a number is no port.
@@ -144,20 +144,20 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
         )
 
 
-# ---------------------------------------------------------------------- what was heard
+# ---------------------------------------------------------------------- received bytes
 
 
 def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
-    """Return an open port with the protocols that fit what was heard there."""
-    said = opened.said.lstrip()
-    greeted = [one for one in protocols if one.greeting and said.startswith(one.greeting)]
+    """Return an open port with the protocols that fit the received bytes."""
+    received = opened.received.lstrip()
+    greeted = [one for one in protocols if one.greeting and received.startswith(one.greeting)]
     possible = greeted or [one for one in protocols if _may_be(one, opened)]
     evidence: Evidence = "silent"
     if greeted:
         evidence = "greeted"
     elif not possible:
         evidence = "other"
-    elif opened.said:
+    elif opened.received:
         evidence = "said"
     elif opened.ended:
         evidence = "ended"
@@ -166,27 +166,27 @@ def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]
         port=port,
         protocols=tuple(one.name for one in possible),
         evidence=evidence,
-        said=opened.said,
+        said=opened.received,
         seconds=opened.seconds,
     )
 
 
 def _may_be(protocol: Protocol, opened: Opened) -> bool:
     """Return True if a camera of the protocol may behave like this without a greeting."""
-    if opened.said:
+    if opened.received:
         return protocol.greeting is None
-    # who hangs up without a word may have as many clients as it takes
+    # a device that closes silently may serve as many clients as it accepts
     return opened.ended or not protocol.greeting
 
 
-def decided(said: bytes, protocols: tuple[Protocol, ...]) -> bool:
+def decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:
     """Return True if further bytes cannot change how an open port is judged."""
-    heard = said.lstrip()
-    if not heard:
+    start = received.lstrip()
+    if not start:
         return False
     for one in protocols:
-        if one.greeting is None or (one.greeting and one.greeting.startswith(heard)):
+        if one.greeting is None or (one.greeting and one.greeting.startswith(start)):
             return False
-        if one.greeting and heard.startswith(one.greeting):
-            return b"\n" in heard
+        if one.greeting and start.startswith(one.greeting):
+            return b"\n" in start
     return True

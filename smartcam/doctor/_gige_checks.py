@@ -1,4 +1,4 @@
-"""Examine a GigE Vision camera and the way to it: what keeps its pictures from coming."""
+"""Examine a GigE Vision camera and its network for reasons why its pictures do not come."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import GenicamFeatures, GigEDriver, PacketCounts
 
 PACKET_OVERHEAD_BYTES: Final = 36 + 38
-"""Bytes that a packet of a stream has beside pixels: IP, UDP and GVSP, and those of Ethernet."""
+"""Bytes of a stream's packet beside pixels: IP, UDP and GVSP, and the Ethernet frame."""
 
 STANDARD_MTU: Final = 1500
 JUMBO_MTU: Final = 9000
 
 MAX_LINK_LOAD: Final = 0.9
-"""Part of a link's speed beyond which a stream loses packets, as the switches on the way do."""
+"""Part of a link's speed above which a stream, or a switch between, loses packets."""
 
 SMALL_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer below which a busy machine loses packets of a large picture."""
@@ -50,12 +50,12 @@ FRAMES_NOT_SHOWN: Final = "smartcam frames measure shows the same for as long as
 
 
 class _ExaminationOverError(Exception):
-    """Nothing further can be examined."""
+    """The examination cannot continue."""
 
 
 @dataclass(eq=False)
 class _GigEExamination:
-    """One examination: what was asked for, and what is known so far."""
+    """One examination: its options, and its findings so far."""
 
     address: FrameAddress
     seconds: float
@@ -71,7 +71,7 @@ class _GigEExamination:
     rate: float | None = None
     camera_link: float = SPEED_UNKNOWN  # bits per second
 
-    def tell(
+    def add(
         self,
         severity: Severity,
         text: str,
@@ -97,17 +97,17 @@ class _GigEExamination:
         exit_code: Exit = Exit.NO_SESSION,
         details: Mapping[str, Any] | None = None,
     ) -> _ExaminationOverError:
-        """Add an error, and return what ends the examination."""
-        self.tell("error", text, cure, exit_code, details)
+        """Add an error, and return the exception that ends the examination."""
+        self.add("error", text, cure, exit_code, details)
         return _ExaminationOverError()
 
 
 async def examine_gige(
     url: str, *, seconds: float, timeout: float | None
 ) -> AsyncGenerator[Finding]:
-    """Examine a camera and yield what is found, as it is found.
+    """Examine a camera and yield each finding at once.
 
-    The camera is taken only where nobody else has it, and streams for a while as the URL says.
+    The camera is taken only if no other program has it, and streams by the URL's settings.
 
     Raises:
         ConfigurationError: the URL is wrong; nothing was tried.
@@ -115,7 +115,7 @@ async def examine_gige(
     Cancellation: the camera is given back.
     """
     address = FrameAddress.parse(url)
-    places.wanted(address)  # which sees to it that the URL can work
+    places.wanted(address)  # checks the URL
     exam = _GigEExamination(address, seconds, timeout or 5.0)
     checks: tuple[tuple[str, Callable[[_GigEExamination], Awaitable[None]]], ...] = (
         ("address", _find_address),
@@ -141,11 +141,11 @@ async def examine_gige(
             return
 
 
-# ---------------------------------------------------------------------- the way to it
+# ---------------------------------------------------------------------- the network
 
 
 async def _find_address(exam: _GigEExamination) -> None:
-    """Find out which address the URL means."""
+    """Find the address that the URL means."""
     try:
         host, exam.port = await places.place(exam.address, places.wanted(exam.address))
         found = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
@@ -160,20 +160,20 @@ async def _find_address(exam: _GigEExamination) -> None:
             f"the name {exam.address.host} has no IPv4 address: {exc}", "Write the address itself."
         ) from exc
     exam.host = str(found[0][4][0])
-    exam.tell("ok", f"the camera is looked for at {exam.host}, UDP port {exam.port}")
+    exam.add("ok", f"the camera is looked for at {exam.host}, UDP port {exam.port}")
 
 
 async def _look_at_networks(exam: _GigEExamination) -> None:
-    """See whether the camera's address is of one of this machine's networks."""
+    """Check whether the camera's address is in one of this machine's networks."""
     own = [one for one in discovery.networks() if one.network is not None]
     if not own:
-        exam.tell("hint", "the networks of this machine cannot be listed here")
+        exam.add("hint", "the networks of this machine cannot be listed here")
         return
     host = ipaddress.IPv4Address(exam.host)
     around = [one for one in own if one.network is not None and host in one.network]
     named = ", ".join(f"{one.address} in {one.network}" for one in own)
     if not around:
-        exam.tell(
+        exam.add(
             "warning",
             f"{exam.host} is of another subnet than this machine, which is {named}",
             f"Give the camera an address of a network here, or this machine one of {exam.host}'s: "
@@ -182,7 +182,7 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
             details={"networks": [str(one.network) for one in own]},
         )
     elif len(around) > 1:
-        exam.tell(
+        exam.add(
             "warning",
             f"{exam.host} is of {len(around)} networks of this machine: "
             f"{', '.join(f'{one.address} in {one.network}' for one in around)}",
@@ -190,11 +190,11 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
             "be the wrong one.",
         )
     else:
-        exam.tell("ok", f"{exam.host} is of the same subnet: {around[0].network}")
+        exam.add("ok", f"{exam.host} is of the same subnet: {around[0].network}")
 
 
 async def _ask(exam: _GigEExamination) -> None:
-    """Ask the camera something that it tells anybody."""
+    """Ask the camera for a value that every program may read."""
     try:
         control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
     except FrameSourceError as exc:
@@ -214,7 +214,7 @@ async def _ask(exam: _GigEExamination) -> None:
         other = await _register_or_0(control, Register.PRIMARY_APPLICATION_ADDRESS)
     finally:
         control.close()
-    exam.tell("ok", f"it answers, after {took * 1e3:.1f} ms", details={"round_trip": took})
+    exam.add("ok", f"it answers, after {took * 1e3:.1f} ms", details={"round_trip": took})
     exam.check = "control"
     if taken:
         where = f" at {ipaddress.IPv4Address(other)}" if other else ""
@@ -232,7 +232,7 @@ async def _ask(exam: _GigEExamination) -> None:
 
 
 async def _no_answer(exam: _GigEExamination, error: FrameSourceError) -> _ExaminationOverError:
-    """Say why nothing answered, as far as it can be told."""
+    """Report why nothing answered, as far as possible."""
     others = await discovery.find(discovery.networks())
     at = [one for one in others if exam.host in (one.address, one.info.address)]
     listed = ", ".join(f"gige://{one.address} {one.info.label}" for one in others)
@@ -274,9 +274,9 @@ async def _register_or_0(control: ControlChannel, address: int) -> int:
 
 
 async def _look_at_control(exam: _GigEExamination) -> None:
-    """Take control, which nobody had a moment ago, and read what the camera is."""
+    """Take control, which was free a moment ago, and read the camera's description."""
     async with _session(exam) as features:
-        exam.tell("ok", f"{exam.label}: nobody controlled it, and it lets us")
+        exam.add("ok", f"{exam.label}: no program controlled it, and this one may")
         exam.payload = int(await _number(features, "PayloadSize") or 0)
         exam.rate = await _number(
             features, "AcquisitionResultingFrameRate", "ResultingFrameRate", "AcquisitionFrameRate"
@@ -287,7 +287,7 @@ async def _look_at_control(exam: _GigEExamination) -> None:
         mode = await _text(features, "AcquisitionMode")
     exam.check = "features"
     if mode not in ("", "Continuous"):
-        exam.tell(
+        exam.add(
             "hint",
             f"AcquisitionMode is {mode}: a program that does not set it gets so many pictures, and "
             "then none",
@@ -296,7 +296,7 @@ async def _look_at_control(exam: _GigEExamination) -> None:
 
 
 class _session:  # noqa: N801 - used as a function
-    """Features of the camera while it is ours."""
+    """Features of the camera while this program controls it."""
 
     def __init__(self, exam: _GigEExamination) -> None:
         self._exam = exam
@@ -332,18 +332,18 @@ async def _text(features: GenicamFeatures, name: str) -> str:
 
 
 async def _read_features(exam: _GigEExamination) -> None:
-    """Look at this side: the MTU, the link, the buffer."""
+    """Check this side: the MTU, the link, the buffer."""
     exam.check = "link"
     link = _link_speed(exam.local)
     known = [speed for speed in (link, exam.camera_link) if speed]
     if exam.payload and exam.rate and known:
         _look_at_bandwidth(exam, min(known))
     elif known:
-        exam.tell("ok", f"the link has {min(known) / 1e6:,.0f} Mbit/s")
+        exam.add("ok", f"the link has {min(known) / 1e6:,.0f} Mbit/s")
     exam.check = "buffer"
     most = _most_buffer()
     if most is not None and most < SMALL_BUFFER_BYTES:
-        exam.tell(
+        exam.add(
             "hint",
             f"a program may have {most:,} bytes of receive buffer, which a busy machine fills "
             "before it reads: then packets are lost",
@@ -363,7 +363,7 @@ def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
     details = {"needed": needed, "link": link}
     if needed > MAX_LINK_LOAD * link:
         most = MAX_LINK_LOAD * link / (exam.payload * 8 * share)
-        exam.tell(
+        exam.add(
             "error",
             f"{text}: it does not fit",
             f"Ask for less: ?fps={most:.3g} or lower, a smaller ?size=, or a format of fewer bits. "
@@ -373,7 +373,7 @@ def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
             details=details,
         )
     else:
-        exam.tell("ok", text, details=details)
+        exam.add("ok", text, details=details)
 
 
 def _link_speed(local: str) -> float:
@@ -406,13 +406,13 @@ def _most_buffer() -> int | None:
 
 @dataclass(slots=True)
 class _StreamSeen:
-    """Frames and packets that came of the stream.
+    """Frames and packets of the stream that arrived.
 
     Attributes:
-        frames: frames that came.
-        counts: counts of their packets; None: it did not begin.
+        frames: number of frames that came.
+        counts: counts of their packets; None if the stream did not begin.
         packet_size: bytes of an IP packet.
-        seconds: time for which it was watched.
+        seconds: time for which the stream was watched.
     """
 
     frames: int
@@ -422,7 +422,7 @@ class _StreamSeen:
 
 
 async def _stream(exam: _GigEExamination) -> None:
-    """Have the camera stream as the URL says, and count."""
+    """Make the camera stream by the URL's options, and count frames and packets."""
     try:
         seen = await _watch(exam)
     except FrameTimeoutError as exc:
@@ -439,7 +439,7 @@ async def _stream(exam: _GigEExamination) -> None:
     details = {"frames": seen.frames, "lost": lost, "requested": again, "seconds": seen.seconds}
     text = f"{seen.frames} pictures in {seen.seconds:.1f} s"
     if lost or again:
-        exam.tell(
+        exam.add(
             "warning" if lost else "hint",
             f"{text}; {lost} more lost for missing packets, {again} packets asked for again",
             "Make room for the packets: large ones (an MTU of 9000 on each side and switch), "
@@ -449,10 +449,10 @@ async def _stream(exam: _GigEExamination) -> None:
             details=details,
         )
     else:
-        exam.tell("ok", f"{text}, none lost, no packet asked for again", details=details)
+        exam.add("ok", f"{text}, none lost, no packet asked for again", details=details)
     longest = 1 / exam.rate if exam.rate else 0.0
     if longest > exam.timeout:
-        exam.tell(
+        exam.add(
             "warning",
             f"a picture comes each {longest:.3g} s, and a source waits {exam.timeout:g} s for one",
             f"Wait longer: open(url, timeout={2 * longest:.3g}, stall=None).",
@@ -473,7 +473,7 @@ async def _watch(exam: _GigEExamination) -> _StreamSeen:
                 async with asyncio.timeout(exam.seconds):
                     async for _ in reader:
                         frames += 1
-            except FrameSourceError:  # some are timeouts, too
+            except FrameSourceError:  # some of them are timeouts, too
                 raise
             except TimeoutError:
                 pass
@@ -485,7 +485,7 @@ async def _watch(exam: _GigEExamination) -> _StreamSeen:
 
 
 async def _packet_size(exam: _GigEExamination) -> int:
-    """Return the size that the camera's stream channel is set to; anybody may read it."""
+    """Return the packet size of the camera's stream channel; any program may read it."""
     control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
     try:
         return await _register_or_0(control, Register.STREAM_PACKET_SIZE) & 0xFFFF
@@ -497,7 +497,7 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
     exam.check, size = "packet size", seen.packet_size
     details = {"packet_size": size, "mtu": exam.path_mtu}
     if size > exam.path_mtu and seen.frames:
-        exam.tell(
+        exam.add(
             "warning",
             f"packets of {size} bytes come in pieces, since this machine's side takes "
             f"{exam.path_mtu} (MTU): a lost piece is a lost packet",
@@ -505,7 +505,7 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
             details=details,
         )
     elif size > exam.path_mtu:
-        exam.tell(
+        exam.add(
             "error",
             f"packets of {size} bytes are asked for, and this machine's side takes {exam.path_mtu} "
             "(MTU): none of them comes",
@@ -515,7 +515,7 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
             details=details,
         )
     elif size < exam.path_mtu and size <= STANDARD_MTU < exam.path_mtu:
-        exam.tell(
+        exam.add(
             "hint",
             f"packets have {size} bytes, although this machine's side takes {exam.path_mtu} (MTU)",
             "A switch on the way, or the camera, takes no larger ones: raise its MTU, too. Small "
@@ -523,7 +523,7 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
             details=details,
         )
     elif size <= STANDARD_MTU:
-        exam.tell(
+        exam.add(
             "hint",
             f"packets have {size} bytes, the MTU is {exam.path_mtu}",
             "With an MTU of 9000 on both sides and on each switch a stream takes a third of the "
@@ -531,15 +531,15 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
             details=details,
         )
     else:
-        exam.tell("ok", f"packets have {size} bytes, the MTU is {exam.path_mtu}", details=details)
+        exam.add("ok", f"packets have {size} bytes, the MTU is {exam.path_mtu}", details=details)
 
 
 async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
-    """Say why no picture came."""
+    """Report why no picture came."""
     waiting = await _waiting_triggers(exam)
     counts = seen.counts
     if counts is not None and (counts.lost or counts.requested or counts.malformed):
-        exam.tell(
+        exam.add(
             "error",
             f"packets come, and no picture is whole: {counts.lost} pictures lost, "
             f"{counts.requested} packets asked for again, {counts.malformed} malformed",
@@ -550,7 +550,7 @@ async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
         )
     elif waiting:
         exam.check = "trigger"
-        exam.tell(
+        exam.add(
             "error",
             f"TriggerMode is On ({waiting}), and no trigger came in {seen.seconds:.1f} s: the "
             "camera waits",
@@ -560,13 +560,13 @@ async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
             details={"trigger": waiting},
         )
     elif exam.rate and 1 / exam.rate > seen.seconds:
-        exam.tell(
+        exam.add(
             "warning",
             f"no picture came in {seen.seconds:.1f} s; one is due each {1 / exam.rate:.3g} s",
             f"Watch for longer: --seconds {3 / exam.rate:.3g}.",
         )
     elif seen.packet_size <= exam.path_mtu:
-        exam.tell(
+        exam.add(
             "error",
             f"the camera obeys and streams, and no packet of the stream came in "
             f"{seen.seconds:.1f} s: something on the way drops UDP that this machine did not ask "
@@ -579,8 +579,8 @@ async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
 
 
 async def _waiting_triggers(exam: _GigEExamination) -> str:
-    """Return the triggers that are on, and where each comes from; "" if none is."""
-    told: list[str] = []
+    """Return the triggers that are on, and their sources; "" without any."""
+    triggers: list[str] = []
     try:
         async with _session(exam) as features:
             selectors, before = [""], ""
@@ -592,9 +592,9 @@ async def _waiting_triggers(exam: _GigEExamination) -> str:
                     await features.set("TriggerSelector", selector)
                 if await _text(features, "TriggerMode") == "On":
                     source = await _text(features, "TriggerSource") or "unknown source"
-                    told.append(f"{selector} by {source}" if selector else f"by {source}")
+                    triggers.append(f"{selector} by {source}" if selector else f"by {source}")
             if selectors != [""]:
                 await features.set("TriggerSelector", before)
     except FrameSourceError:
         pass
-    return ", ".join(told)
+    return ", ".join(triggers)

@@ -1,4 +1,4 @@
-"""Read a text as addresses: a network, a range, one address, a host's name."""
+"""Parse a text as addresses: a network, a range, one address, a host's name."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     SocketAddress = tuple[str, int] | tuple[str, int, int, int]
 
 MAX_IPV6 = 256
-"""Largest number of addresses of an IPv6 network: nobody has the time to try one of the usual
-size."""
+"""Largest number of addresses of an IPv6 network: trying a network of the usual size would never
+end."""
 
 _NAME = re.compile(r"(?=.*[A-Za-z])\w(?:[\w.-]{0,251}\w)?", re.ASCII)
 
@@ -33,19 +33,19 @@ EXPECTED = (
 
 
 class HostAddress(NamedTuple):
-    """An address of one host; sorts as people count."""
+    """An address of one host; sorts in numeric order."""
 
     version: int  # 4 or 6
     number: int
-    scope: str = ""  # interface of an IPv6 address that is the link's own
+    scope: str = ""  # interface of a link-local IPv6 address
 
     def __str__(self) -> str:
-        """Return the address as people write it."""
+        """Return the address as text."""
         kind = ipaddress.IPv4Address if self.version == 4 else ipaddress.IPv6Address
         return str(kind(self.number)) + (f"%{self.scope}" if self.scope else "")
 
     def sockaddr(self, port: int) -> tuple[socket.AddressFamily, SocketAddress]:
-        """Return family and address as sockets have them."""
+        """Return family and address for a socket."""
         if self.version == 4:
             return socket.AF_INET, (str(self), port)
         plain = str(ipaddress.IPv6Address(self.number))
@@ -65,7 +65,7 @@ class Span(NamedTuple):
 
 
 class AddressSet:
-    """Addresses, each of them once, in order."""
+    """Addresses in order, without duplicates."""
 
     def __init__(self, spans: Iterable[Span]) -> None:
         self._spans: list[Span] = []
@@ -114,7 +114,7 @@ class AddressSet:
         return AddressSet(left)
 
     def __iter__(self) -> Iterator[HostAddress]:
-        """Yield each."""
+        """Yield each address."""
         for first, last in self._spans:
             for number in range(first.number, last.number + 1):
                 yield first._replace(number=number)
@@ -123,8 +123,8 @@ class AddressSet:
 def read_span(text: str, *, whole: bool = False) -> Span | None:
     """Return the addresses that a text means; None for a name, which has to be looked up.
 
-    ``whole``: of an IPv4 network its first and last address too, which are no hosts in it, and may
-    be in a larger one.
+    ``whole``: include an IPv4 network's first and last address, which are no hosts in it, but may
+    be hosts in a larger one.
 
     Raises:
         ConfigurationError: the text means no address, or no host's, or an IPv6 network that is too
@@ -193,7 +193,7 @@ def _address(text: str) -> HostAddress | None:
 
 
 def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: bool) -> Span:
-    """Return a network's hosts: of IPv4 without the network's own and its broadcast address."""
+    """Return a network's hosts: for IPv4 without the first address and the broadcast address."""
     first, last = int(network.network_address), int(network.broadcast_address)
     if network.version == 4 and last - first > 1 and not whole:
         first, last = first + 1, last - 1
@@ -201,7 +201,7 @@ def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: boo
 
 
 def _mapped(span: Span) -> Span:
-    """Return IPv4 addresses that are written as IPv6 ones as what they are."""
+    """Return IPv4 addresses in place of those written as IPv6; others unchanged."""
     if span.first.version == 6 and span.first.number >> 32 == span.last.number >> 32 == 0xFFFF:
         first, last = (HostAddress(4, one.number & 0xFFFFFFFF) for one in span)
         return Span(first, last)
@@ -223,7 +223,7 @@ def _place(address: HostAddress) -> tuple[int, str, int]:
 
 
 def address_of(text: str) -> HostAddress:
-    """Return the address that a name server has told.
+    """Return the address in a name server's answer.
 
     Raises:
         ConfigurationError: the address is no host's.

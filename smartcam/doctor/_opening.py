@@ -1,4 +1,4 @@
-"""Opening a port and hearing what comes by itself; nothing is ever sent."""
+"""Open a port and read the bytes that come unasked; never send anything."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._networks import HostAddress
 
 MAX_SAID_BYTES = 512
-"""Largest number of bytes that are read of what comes by itself."""
+"""Largest number of bytes that are read from a port."""
 
 Outcome = Literal["open", "refused", "no answer", "unreachable", "failed"]
 
@@ -26,7 +26,7 @@ _OUTCOMES: dict[int, Outcome] = {
     errno.EHOSTDOWN: "unreachable",
     errno.ENETDOWN: "unreachable",
 }
-"""Outcomes of an opening by its error; others are failures of this machine."""
+"""Outcomes of an opening by its error; other errors are failures of this machine."""
 
 SCARCE = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 """Errors of a machine that has no socket left."""
@@ -38,14 +38,14 @@ class Opened(NamedTuple):
     Attributes:
         outcome: outcome of the opening.
         seconds: time until the connection was open.
-        said: bytes that came by themselves.
-        ended: whether the other end closed the connection by itself.
+        received: bytes that came unasked.
+        ended: whether the other end closed the connection.
         why: reason of a failure.
     """
 
     outcome: Outcome
     seconds: float = 0.0
-    said: bytes = b""
+    received: bytes = b""
     ended: bool = False
     why: str = ""
 
@@ -58,14 +58,14 @@ async def open_port(
     timeout: float,
     enough: Callable[[bytes], bool],
 ) -> Opened:
-    """Open a port, hear what comes by itself until that is ``enough``, and close it.
+    """Open a port, read the bytes that come unasked until they are ``enough``, and close it.
 
     Args:
         sock: socket of the address' family; it is closed in the end.
         address: address of the host.
         port: number of the port.
-        timeout: seconds until it is open, and as many again to hear.
-        enough: function that is called with all bytes that came; True ends the hearing.
+        timeout: seconds until it is open, and as many again to read.
+        enough: function that is called with all bytes that came; True ends reading.
 
     Cancellation: the connection is closed.
     """
@@ -84,26 +84,26 @@ async def open_port(
             outcome = _OUTCOMES.get(exc.errno or 0, "failed")
             return Opened(outcome, why=(exc.strerror or str(exc)) if outcome == "failed" else "")
         seconds = loop.time() - begun
-        said, ended = b"", False
+        received, ended = b"", False
         try:
             async with asyncio.timeout(timeout):
-                while len(said) < MAX_SAID_BYTES and not enough(said):
-                    data = await loop.sock_recv(sock, MAX_SAID_BYTES - len(said))
+                while len(received) < MAX_SAID_BYTES and not enough(received):
+                    data = await loop.sock_recv(sock, MAX_SAID_BYTES - len(received))
                     if not data:
                         ended = True
                         break
-                    said += data
+                    received += data
         except TimeoutError:
             pass
         except OSError:
-            ended = True  # it has reset the connection
-        return Opened("open", seconds, said, ended)
+            ended = True  # the other end has reset the connection
+        return Opened("open", seconds, received, ended)
 
 
 def is_own(sock: socket.socket) -> bool:
-    """Return True if a socket is connected with itself.
+    """Return True if a socket is connected to itself.
 
     The system may choose for our end the very port that is to be opened, if that is a free port of
-    this machine: then the socket meets itself.
+    this machine: then the socket connects to itself.
     """
     return bool(sock.getsockname() == sock.getpeername())

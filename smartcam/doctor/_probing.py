@@ -1,8 +1,8 @@
-"""Asking an address how it speaks: protocols, transports and dialects, each on a fresh link.
+"""Ask an address for its language: protocols, transports and dialects, each on a fresh link.
 
-Every try is a :class:`Trial` with all that was sent and received, decoded where that is possible
-and as hex in any case. A camera that hangs up without a byte is asked once more without the
-Disconnect in front (see :mod:`smartcam._client.handshake`).
+Every try is a :class:`Trial` with all sent and received bytes, decoded if possible, and as hex in
+any case. A camera that closes the link without a byte is asked once more without the Disconnect
+before Connect (see :mod:`smartcam._client.handshake`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
-"""Largest number of entries that a trial keeps: making a session takes six, and a camera may send
-results at once."""
+"""Largest number of entries that a trial keeps: a session takes six, and a camera may send results
+at once."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""
@@ -60,14 +60,14 @@ class CameraAnswer(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class Trial(Try):
-    """One try and what came of it; ``outcome`` is ``session`` where a camera answered.
+    """One try and its outcome; ``outcome`` is ``session`` if a camera answered.
 
     Attributes:
         address: address that was tried, with the scheme of the transport.
-        frames: what went over the wire, in order; direction ``!`` for bytes that make no frame.
+        frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol is another one than that of the address asked for.
+        other: whether the protocol differs from that of the given address.
     """
 
     address: Address
@@ -84,7 +84,7 @@ class Trial(Try):
         )
 
     def keep(self, entry: TraceEntry) -> None:
-        """Keep an entry, as long as this is not over."""
+        """Keep an entry, unless there are too many."""
         if self.answer is None and len(self.frames) < MAX_FRAMES:
             self.frames.append(entry)
         elif self.answer is None:
@@ -96,13 +96,13 @@ class Way(NamedTuple):
 
     address: Address  # address with the scheme of the transport
     transport: Transport  # transport that carries the protocol
-    dialects: tuple[Dialect, ...]  # one, or several that begin a session alike
+    dialects: tuple[Dialect, ...]  # dialects that begin a session alike
 
 
 def ways(address: Address) -> list[Way]:
     """Return every way to speak to an address, the most probable first.
 
-    What the address says comes first; the rest in the order of the protocol. Raises PluginError:
+    The address's own options come first, the rest in the order of the protocol. Raises PluginError:
     its protocol fails to load.
     """
     protocol, parameters = load_protocol(address.protocol), dict(address.parameters)
@@ -122,7 +122,7 @@ def ways(address: Address) -> list[Way]:
 def other_ways(address: Address) -> list[Way]:
     """Return every way to speak to an address's host in the other registered protocols.
 
-    Their port is that of the address; where that is its protocol's own, it is theirs.
+    They use the address's port; if that is its protocol's default, each uses its own default.
     """
     own = load_protocol(address.protocol)
     found: list[Way] = []
@@ -133,7 +133,7 @@ def other_ways(address: Address) -> list[Way]:
         scheme = next(iter(protocol.schemes))
         try:
             found += ways(Address(protocol.name, scheme, address.host, port))
-        except ConfigurationError:  # it wants what the URL cannot say, such as a login
+        except ConfigurationError:  # it needs more than the URL has, such as a login
             continue
     return found
 
@@ -148,12 +148,12 @@ async def trials(
 ) -> AsyncGenerator[Trial]:
     """Try every way in turn and yield each try; the session of one that answers is ended first.
 
-    What ``address`` pins is tried first. ``timeout``: seconds for all of them; each has an equal
-    share of what is left. ``trace``: called with everything that goes over the wire. ``go_on``: go
-    on behind the first way that answers. ``every_protocol``: try the other registered protocols,
-    too; one whose greeting was heard is next.
+    The pinned options of ``address`` are tried first. ``timeout``: seconds for all tries; each has
+    an equal share of the rest. ``trace``: called with every frame on the wire. ``go_on``: continue
+    after the first way that answers. ``every_protocol``: try the other registered protocols, too; a
+    protocol whose greeting was received is next.
 
-    Cancellation: the link is dropped, after a Disconnect where there was a session.
+    Cancellation: the link is dropped, after a Disconnect if there was a session.
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
@@ -168,7 +168,7 @@ async def trials(
         trial = await _try(way, share, trace, disconnect_first=disconnect_first)
         trial.other = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
-            left.appendleft((way, False))  # perhaps at the Disconnect
+            left.appendleft((way, False))  # perhaps it closed because of the Disconnect
         _put_greeted_first(left, trial)
         yield trial
         if trial.answer is not None and not go_on:
@@ -176,7 +176,7 @@ async def trials(
 
 
 def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) -> None:
-    """Have the ways that are left begin with those of the protocol that a try has heard greet."""
+    """Move the ways of a protocol whose greeting was received to the front."""
     greeted = _greeted(trial, {way.address.protocol for way, _ in left})
     if greeted is not None:
         place = (greeted, trial.address.port)
@@ -188,26 +188,26 @@ def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) 
 
 
 def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
-    """Return the one of these protocols whose greeting a try has heard, None if none is."""
+    """Return the protocol whose greeting a try has received, None without one."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
     heard = next((one.hex for one in trial.frames if one.direction == "!"), "")
-    said = bytes.fromhex(heard).lstrip()
-    return next((name for name in names if _greets(load_protocol(name), said)), None)
+    start = bytes.fromhex(heard).lstrip()
+    return next((name for name in names if _greets(load_protocol(name), start)), None)
 
 
-def _greets(protocol: Protocol, said: bytes) -> bool:
-    return bool(protocol.greeting) and said.startswith(protocol.greeting or b"")
+def _greets(protocol: Protocol, received: bytes) -> bool:
+    return bool(protocol.greeting) and received.startswith(protocol.greeting or b"")
 
 
 async def locate(host: str, *, timeout: float) -> str:
-    """Return the URL of the camera at a bare ``HOST[:PORT]``, in whichever protocol it answers.
+    """Return the URL of the camera at a bare ``HOST[:PORT]``, in the protocol that it answers.
 
-    The session that says so is over then. ``timeout``: seconds for all ways together.
+    The session for this is over then. ``timeout``: seconds for all ways together.
 
     Raises:
-        ConnectFailedError: no protocol was answered; says what the most telling way met, and what
-            to do.
+        ConnectFailedError: the camera answered no protocol; the error has the most telling try, and
+            the cure.
 
     Cancellation: the link is dropped.
     """
@@ -222,23 +222,23 @@ async def locate(host: str, *, timeout: float) -> str:
 
 
 def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
-    """Return the error for tries in vain: what the most telling one met, and what to do."""
-    told = by_telling(failed)
-    where = told[0].address
-    why = explain(told[:1], where, load_protocol(where.protocol))
+    """Return the error for failed tries: the most telling one, and the cure."""
+    ranked = by_telling(failed)
+    where = ranked[0].address
+    why = explain(ranked[:1], where, load_protocol(where.protocol))
     return ConnectFailedError(
         f"no session with {masked(host)}: {why}",
         host=address.host,
         port=address.port,
-        attempts=tuple(map(str, told)),
+        attempts=tuple(map(str, ranked)),
     )
 
 
 def by_telling(found: Iterable[Trial]) -> list[Trial]:
-    """Return tries in vain, the most telling first.
+    """Return failed tries, the most telling first.
 
     A refusal tells more than bytes that are no message, these more than other bytes, bytes more
-    than silence, and that more than no link.
+    than silence, and silence more than no link.
     """
 
     def rank(trial: Trial) -> tuple[bool, bool, bool, bool]:

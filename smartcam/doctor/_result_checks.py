@@ -1,4 +1,4 @@
-"""Checks of what results hold: does the layout fit, and do the values look like SI."""
+"""Check results: whether the layout fits, and whether the values look like SI."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ MAX_ROWS = 40
 
 
 class DumpRow(NamedTuple):
-    """One field of a container as the layout has it, beside the bytes that stand there.
+    """One field of a container by the layout, with the bytes at its place.
 
     Attributes:
         offset: place of the field's first byte, from the start of the container's data.
         field: name and type of the field.
-        hex: the bytes that are there, at most 32.
-        value: what the bytes mean; what is missing, or too many.
+        hex: the bytes at its place, at most 32.
+        value: meaning of the bytes; or the number that is missing or left over.
     """
 
     offset: int
@@ -48,10 +48,10 @@ class DumpRow(NamedTuple):
 def aligned(
     layout: Layout, data: bytes, order: ByteOrder = "little", *, around: int = 0
 ) -> list[DumpRow]:
-    """Return a container's bytes beside a layout's fields, whether they fit or not.
+    """Return a container's bytes beside a layout's fields, even if they do not fit.
 
-    ``data``: what came, behind the application id. ``order``: of the bytes of a number. ``around``:
-    an offset that must be among the rows: where records repeat, those long before it are left out.
+    ``data``: bytes after the application id. ``order``: byte order of numbers. ``around``:
+    an offset that must be among the rows: repeated records long before it are left out.
     """
     rows: list[DumpRow] = []
     end = 0
@@ -80,7 +80,7 @@ def aligned(
 
 
 def _places(layout: Layout, size: int, around: int) -> Iterator[tuple[int, str, Field]]:
-    """Yield offset, name and field of everything that the layout has in ``size`` bytes."""
+    """Yield offset, name and field of all fields of the layout in ``size`` bytes."""
     offset = 0
     for field in layout.head:
         yield offset, field.name, field
@@ -113,7 +113,7 @@ def _size_text(layout: Layout) -> str:
 
 
 async def look_at_results(exam: Examination) -> None:
-    """Check ``layout`` and ``values``: the results that came, against ``--interpret-as``."""
+    """Check ``layout`` and ``values``: compare the results with ``--interpret-as``."""
     containers, interpreter = list(exam.witness.containers), exam.options.interpreter
     unreadable = exam.witness.unreadable
     if unreadable is not None:
@@ -123,14 +123,14 @@ async def look_at_results(exam: Examination) -> None:
             exit_code=Exit.UNREADABLE,
         )
     elif not containers and interpreter is not None:
-        exam.say(
+        exam.report(
             "hint",
             "no result came, so the layout was not compared with one",
             "With --trigger, or while the application runs free, there are results.",
         )
     elif containers and interpreter is None:
         sizes = sorted({len(result.raw) for result in containers})
-        exam.say(
+        exam.report(
             "ok",
             f"{len(containers)} results looked at, of {_listed(sizes)} bytes: "
             f"{hex_excerpt(containers[0].raw)}; --interpret-as compares them with a layout",
@@ -142,16 +142,16 @@ async def look_at_results(exam: Examination) -> None:
 
 
 def _compare(exam: Examination, interpreter: Interpreter, containers: list[Result]) -> None:
-    """Tell the first result that does not fit, or that all do and what their values look like."""
+    """Report the first result that does not fit, or that all fit and how their values look."""
     readings: list[Reading] = [result.value for result in containers]
     for result, reading in zip(containers, readings, strict=True):
         if reading.error is not None:
             _say_misfit(exam, interpreter, result, reading, reading.error)
             return
     fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
-    exam.say("ok", f"{len(readings)} results {fit}", results=len(readings))
+    exam.report("ok", f"{len(readings)} results {fit}", results=len(readings))
     if interpreter.layout is not None:
-        # there integers are metres and radians, too; elsewhere they may count pixels
+        # for localizations, integers are metres and radians, too; elsewhere they may count pixels
         integers = isinstance(interpreter, LocalizationsInterpreter)
         _look_at_values(exam, interpreter.layout, readings, integers=integers)
 
@@ -183,7 +183,7 @@ def _say_misfit(
     exam.fail(
         text,
         'Compare it with the "send results" tool, field by field: which one is missing, of another '
-        "type, or of another width? All fields behind a wrong one are shifted.",
+        "type, or of another width? All fields after a wrong one are shifted.",
         exit_code=Exit.UNREADABLE,
         **details,
     )
@@ -200,7 +200,7 @@ class _Plausible(NamedTuple):
     most: float  # the largest magnitude that is plausible, SI
     text: str  # description of a larger value
     unit: str  # unit to write after the type then
-    reason: str  # why the limit
+    reason: str  # reason of the limit
 
 
 def _named(words: str) -> re.Pattern[str]:
@@ -234,15 +234,15 @@ PLAUSIBLE: tuple[_Plausible, ...] = (
         "they go from 0 to 1",
     ),
 )
-"""The limits that a value must exceed to be called implausible; the first row that names it."""
+"""Limits above which a value is implausible; the first row with the field's name counts."""
 
 
 class _Converted(NamedTuple):
     """The signs of a field with a unit whose values were in SI already."""
 
-    most: float  # the largest magnitude, SI, up to which it does
+    most: float  # largest magnitude, SI, that looks so
     text: str  # text that the camera may send instead
-    reason: str  # why the limit
+    reason: str  # reason of the limit
 
 
 CONVERTED: dict[str, _Converted] = {
@@ -253,12 +253,12 @@ CONVERTED: dict[str, _Converted] = {
         2 * math.pi * math.pi / 180 + 1e-6, "radians", "a turn is 6.28 in radians, 360 in degrees"
     ),
 }
-"""The limits that no value of any field may exceed to look like SI that was converted, by the unit.
-Of parts that all lie within two millimetres, or are turned by no more than six degrees, they say
-too much: so the hint asks."""
+"""Limits, by unit, below which all values look like SI that was converted again. Parts
+that all lie within two millimetres, or are turned by less than six degrees, look the same: so the
+hint only asks."""
 
 NONSENSE = (1e-20, 1e20)
-"""Reals beyond, zero apart, are hardly measured by anything: they are bytes of something else."""
+"""Reals outside of these limits, except zero, are probably bytes of other types."""
 
 
 def _look_at_values(
@@ -284,10 +284,10 @@ def _look_at_values(
     for unit, magnitudes in converted.items():
         _ask_for_si(exam, unit, magnitudes)
     for name, value in nonsense.items():
-        exam.say(
+        exam.report(
             "hint",
             f"{name} has values such as {value:g}, which nothing measures",
-            "A field before it is missing or has another type, so that all behind it are shifted; "
+            "A field before it is missing or has another type, so that all after it are shifted; "
             "or the camera sends no real number there.",
             check="values",
             field=name,
@@ -297,7 +297,7 @@ def _look_at_values(
         rule = next((one for one in PLAUSIBLE if one.names.search(name)), None)
         if rule is not None and value > rule.most:
             kind = next(field for field in fields if field.name == name)
-            exam.say(
+            exam.report(
                 "hint",
                 f"{name} goes up to {value:g}: as {_SI[rule.quantity]} that is not plausible, it "
                 f"looks like {rule.text}",
@@ -311,13 +311,13 @@ def _look_at_values(
 
 
 def _ask_for_si(exam: Examination, unit: str, found: Mapping[str, float]) -> None:
-    """Give a hint where all fields of a unit look as if their values had been SI before."""
+    """Give a hint if the values of all fields with a unit look as if they had been SI already."""
     rule, most = CONVERTED[unit], max(found.values(), default=0.0)
     if not 0.0 < most <= rule.most:
         return
     made, names = UNITS[unit], ", ".join(found)
     symbol = SI_SYMBOLS[made.quantity]
-    exam.say(
+    exam.report(
         "hint",
         f"{names}: no more than {most * made.divide / made.multiply:.4g} {unit}, which looks like "
         f"{rule.text}: {rule.reason}",

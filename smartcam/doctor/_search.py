@@ -1,7 +1,7 @@
-"""Finding cameras: which addresses of a network listen where cameras do.
+"""Find cameras: search networks for addresses that listen on the ports of cameras.
 
-Ports are opened and never used: nothing is sent, what comes by itself is read. Whoever wants to
-know more allows asking, which speaks as ``smartcam probe`` does.
+Ports are opened and not used: nothing is sent, unasked bytes are read. A caller that wants to
+know more allows asking, which speaks to the camera as ``smartcam probe`` does.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ if TYPE_CHECKING:
     from smartcam.doctor._networks import HostAddress
 
 DEFAULT_ADDRESSES = 65_536
-"""Addresses of one search, unless more are asked for."""
+"""Largest number of addresses of one search by default."""
 
 MAX_ADDRESSES = 1 << 24
 """Largest number of addresses of one search."""
 
 MAX_NETWORK_TEXT = 300
-"""Characters of a network's text: a host's name has 253 at most."""
+"""Length of the longest text of a network; a host's name has at most 253 characters."""
 
 MAX_OPEN_CONNECTIONS = 1_000
 """Largest number of connections at a time."""
@@ -57,19 +57,19 @@ MAX_OPENINGS_PER_SECOND = 10_000.0
 """Largest number of connections opened in a second."""
 
 MAX_SECONDS = 60.0
-"""Seconds that one opening may take at most."""
+"""Largest number of seconds for one opening."""
 
 ASK_TIMEOUT = 10.0
 """Seconds for asking one camera, all ways together."""
 
 ASK_AT_ONCE = 16
-"""Cameras that are asked at a time."""
+"""Number of cameras that are asked at the same time."""
 
 NAME_TIMEOUT = 5.0
 """Seconds for looking up a host's name."""
 
 SCARCE_PAUSE = 0.05
-"""Seconds until the next try where the system has no socket left."""
+"""Seconds until the next try if the system has no socket left."""
 
 
 async def find(
@@ -86,9 +86,9 @@ async def find(
 ) -> list[FoundPort]:
     """Return the open ports of networks where cameras may listen, sorted by address.
 
-    The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent. A
-    camera that speaks UDP cannot be found so. Of a camera that serves one client no document says
-    that a connection which sends nothing leaves that client alone: ``leave`` keeps away from it.
+    The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent.
+    Cameras that use UDP cannot be found in this way. No document says that a silent connection does
+    not disturb the client of a camera that serves one client: ``leave`` excludes such cameras.
 
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
@@ -97,16 +97,16 @@ async def find(
         protocols: names of the protocols to look for; default: all that are known.
         leave: addresses of cameras at work, which are not touched; written as ``networks``.
         may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
-        ask: also speak to what was found, which takes such a camera from its client.
-        rate: openings a second at most.
-        at_once: connections at a time at most.
-        timeout: seconds until a port is open, and as many again to hear what comes by itself.
+        ask: also speak to the cameras that were found, which takes such a camera from its client.
+        rate: largest number of openings per second.
+        at_once: largest number of connections at a time.
+        timeout: seconds until a port is open, and as many again to read unasked bytes.
         max_addresses: number of addresses above which a search is refused.
 
     Raises:
         ConfigurationError: a network, a number or a protocol cannot work, there are too many
             addresses, a name does not resolve, the system has no socket left, or consent is
-            missing. Nothing was opened, unless it is a socket that is missing.
+            missing. Nothing was opened, except if the system ran out of sockets.
 
     Cancellation: every connection is closed.
     """
@@ -127,15 +127,15 @@ async def find(
 
 
 class CameraSearch:
-    """One search; what was found stays, however it ends. Arguments as in :func:`find`.
+    """One search; its results stay, however it ends. Arguments as in :func:`find`.
 
     Attributes:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
         counts: numbers of tries, by their outcome.
-        why: the first failure that is this machine's.
-        left: addresses that were left alone, to the texts that say so.
-        begun: whether the search has come as far as the first port.
+        why: the first failure of this machine.
+        left: addresses that were left alone, by the texts that name them.
+        begun: whether the first port was tried.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class CameraSearch:
             ConfigurationError: a name does not resolve, there are too many addresses, or the system
                 has no socket left.
 
-        Cancellation: every connection is closed; what was found stays.
+        Cancellation: every connection is closed; the results stay.
         """
         addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
         leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
@@ -250,7 +250,7 @@ class CameraSearch:
                 address,
                 port,
                 timeout=self._timeout,
-                enough=lambda said: decided(said, protocols),
+                enough=lambda received: decided(received, protocols),
             )
         finally:
             self._busy -= 1
@@ -295,19 +295,19 @@ class CameraSearch:
 
 
 async def _spans(text: str, span: Span | None) -> list[Span]:
-    """Return a text's addresses; those of a name are looked up."""
+    """Return a text's addresses; a name is looked up."""
     if span is not None:
         return [span]
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(NAME_TIMEOUT):
-            told = await loop.getaddrinfo(text.strip(), None, type=socket.SOCK_STREAM)
+            resolved = await loop.getaddrinfo(text.strip(), None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
         why = (exc.strerror if isinstance(exc, OSError) else str(exc)) or (
             f"no name server answers within {NAME_TIMEOUT:g} s"
         )
         raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
-    found = {address_of(str(one[4][0])) for one in told}
+    found = {address_of(str(one[4][0])) for one in resolved}
     return [Span(address, address) for address in sorted(found)]
 
 
@@ -327,7 +327,7 @@ def _check_count(count: int, most: int) -> None:
 
 
 async def asked(found: FoundPort) -> FoundPort:
-    """Speak to what was found, in each protocol that it may speak, and return what came of it."""
+    """Ask a found camera, in each protocol that it may speak, and return the outcome."""
     failed: list[str] = []
     for url in found.urls:
         async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:

@@ -1,4 +1,4 @@
-"""Checks on the way to a session, and why one that was there is lost."""
+"""Checks of the connection up to a session, and reasons for a lost session."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
     from smartcam.exceptions import SmartCamError
 
 CONNECTS = 5
-"""Sessions made one after the other, so that the connect time has a spread."""
+"""Number of sessions made one after the other, for the spread of the connect time."""
 
 CONNECTS_WITHIN = 3.0
-"""Seconds after which no further session is begun: on a slow link one or two must do."""
+"""Seconds after which no further session is begun: on a slow link one or two must suffice."""
 
 KNOCK_TIMEOUT = 1.0
-"""Seconds for a bare TCP connection, to tell a camera that is away from one that hung up."""
+"""Seconds for a bare TCP connection, which tells an absent camera from one that closed the link."""
 
 KNOCK_AFTER = 0.25
 """Seconds to wait before this connection: a camera going down closes its port a moment later."""
 
 TAKEN_WITHIN = 10.0
-"""Seconds: a session that is lost so soon after its Connect was probably taken, as the client's
-own rule has it (see :mod:`smartcam._client.supervisor`)."""
+"""Seconds after its Connect within which a lost session was probably taken, by the client's own
+rule (see :mod:`smartcam._client.supervisor`)."""
 
 
 # ---------------------------------------------------------------------- the name
 
 
 async def resolve(exam: Examination) -> None:
-    """Check ``name``: what the host resolves to."""
+    """Check ``name``: the addresses that the host resolves to."""
     host, port = exam.address.host, exam.address.port
     loop = asyncio.get_running_loop()
     limit = exam.options.step(10.0)
@@ -67,14 +67,14 @@ async def resolve(exam: Examination) -> None:
     addresses = sorted({str(info[4][0]) for info in found})
     if addresses != [host]:
         text = f"{host} is {', '.join(addresses)}"
-        exam.say("ok", text, host=host, addresses=addresses)
+        exam.report("ok", text, host=host, addresses=addresses)
 
 
 # ---------------------------------------------------------------------- the session
 
 
 async def connect(exam: Examination) -> None:
-    """Check ``session``: make one, then some more for the spread of the connect time."""
+    """Check ``session``: make a session, then more for the spread of the connect time."""
     loop = asyncio.get_running_loop()
     pinned = exam.address.dialect is not None
     begin = loop.time()
@@ -105,7 +105,7 @@ async def connect(exam: Examination) -> None:
         return
     exam.camera, exam.connected_at = camera, loop.time()
     if first is not None and len(times) > 1:
-        del times[0]  # it had the search for the dialect in it
+        del times[0]  # it includes the search for the dialect
     _say_session(exam, camera, first, times)
 
 
@@ -115,7 +115,7 @@ def _say_session(
     measured = figures(times)
     link, dialect = exam.address.scheme, exam.address.dialect
     search = "" if first is None else f"; the first, which found the dialect, {1e3 * first:.1f} ms"
-    exam.say(
+    exam.report(
         "ok",
         f"a camera answers by {link}://, dialect {dialect}, protocol version "
         f"{camera.protocol_version}; {measured.times} connects: {measured}{search}",
@@ -125,14 +125,14 @@ def _say_session(
         connect_time=measured._asdict(),
     )
     for remark in remarks(exam.address):
-        exam.say("warning", remark)
+        exam.report("warning", remark)
 
 
 # ---------------------------------------------------------------------- no session
 
 
 async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
-    """Say why there is no session; return a camera where another way leads to one."""
+    """Report why there is no session; return a camera if another way leads to one."""
     own, found = exam.address, await _try_all(exam)
     answer = found[-1].answer
     if answer is None:
@@ -140,7 +140,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
         return None
     exam.pin(answer.url)
     if exam.address.scheme == own.scheme and own.dialect in {None, exam.address.dialect}:
-        exam.say(
+        exam.report(
             "warning",
             f"no session at first ({failure}), and one a moment later",
             "Once is no harm: the client tries again. If it happens often, look for another "
@@ -157,7 +157,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
 
 
 async def _try_all(exam: Examination) -> list[Trial]:
-    """Return every try, up to the one that is answered."""
+    """Return every try, up to the first that is answered."""
     timeout = exam.options.step(10.0)
     tries = trials(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
     async with contextlib.aclosing(tries):
@@ -197,7 +197,7 @@ def _reason(found: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
 
 
 def _folded(found: list[Trial]) -> str:
-    """Return tries in one line; dialects of a transport with the same outcome together."""
+    """Return tries in one line, with equal outcomes of a transport's dialects together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for trial in found:
         at = f" at port {trial.address.port}" if trial.other else ""
@@ -213,12 +213,12 @@ def _folded(found: list[Trial]) -> str:
 
 
 async def explain_loss(exam: Examination, error: SmartCamError) -> None:
-    """Say why a session is over; takes the camera from nobody.
+    """Report why a session is over, without taking the camera.
 
     A client that makes a new session and loses it again knows that it was taken
-    (ConnectionTakenError), at the price of taking the camera back once. This does not: whether the
-    camera is still there is tried with a bare TCP connection. It is a Connect that takes a session
-    over, not a connection (inferred).
+    (ConnectionTakenError), but takes the camera back once for that. This function only opens a
+    bare TCP connection to see whether the camera is still there. A Connect takes a session
+    over, a connection does not (inferred).
     """
     age = asyncio.get_running_loop().time() - exam.connected_at
     cause = error.__cause__
@@ -261,7 +261,7 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
 
 
 async def _knock(exam: Examination) -> bool:
-    """Return True if the camera's port takes a TCP connection."""
+    """Return True if the camera's port accepts a TCP connection."""
     await asyncio.sleep(KNOCK_AFTER)
     try:
         async with asyncio.timeout(KNOCK_TIMEOUT):

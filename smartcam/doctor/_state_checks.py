@@ -97,9 +97,9 @@ async def look_at_status(exam: Examination) -> None:
     for one in wrong:
         sticky = one.bit is Status.OVERTRIGGERED and capable.reset_errors
         cure = one.cure + (_STICKY if sticky else "")
-        exam.say(one.severity, one.text, cure, exit_code=one.exit_code, status=status)
+        exam.report(one.severity, one.text, cure, exit_code=one.exit_code, status=status)
     if not wrong:
-        exam.say("ok", f"no fault is reported: {status}", status=status)
+        exam.report("ok", f"no fault is reported: {status}", status=status)
 
 
 # ---------------------------------------------------------------------- round trip
@@ -116,7 +116,7 @@ async def measure_round_trip(exam: Examination) -> None:
     measured = figures(times)
     slow = measured.median > SLOW_ROUND_TRIP_TIME
     text = f"{measured.times} requests: {measured}"
-    exam.say(
+    exam.report(
         "hint" if slow else "ok",
         f"{text}; that is slow for a local network" if slow else text,
         "Look at what is between: Wi-Fi, VPN, a busy switch, a busy machine." if slow else "",
@@ -161,16 +161,16 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.patient, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # this was reported, and explains everything
+        return  # this was reported already, and explains the rest
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # perhaps while the camera was watched
+    stopped = _is_stopped(seen[-1])  # it may have stopped meanwhile
     if any(_waits(one) for one in seen) and not stopped:
         exam.may_trigger = True
         came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
         text = f"{called(application)} runs and waits for triggers{came}"
-        exam.say("ok", text, **details, **_rate(witness))
+        exam.report("ok", text, **details, **_rate(witness))
     elif witness.results and not stopped:
         _say_free(exam, details)
     else:
@@ -190,7 +190,7 @@ def _say_free(exam: Examination, details: dict[str, Any]) -> None:
     if rate:
         text += f", {rate['results_per_second']:.1f} a second; between two: {_intervals(witness)}"
     wanted = exam.wants_trigger
-    exam.say(
+    exam.report(
         "error" if wanted else "ok",
         text + ("; a trigger to it would get no result" if wanted else ""),
         "Take its results with camera.results() or smartcam watch; or have the application "
@@ -212,7 +212,7 @@ async def _watch(exam: Examination, seconds: float) -> list[Status]:
         return False
 
     exam.witness.forget_arrivals()
-    # held while watching, since results are made only if somebody takes them
+    # open while watching, since results are made only if there is a subscriber
     async with exam.patient.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
             await exam.patient.wait_status(note, timeout=seconds)
@@ -224,7 +224,7 @@ def _intervals(witness: Witness) -> Figures:
 
 
 def _rate(witness: Witness) -> dict[str, Any]:
-    """Return rate and spread of results that came by themselves; nothing for a single one."""
+    """Return rate and spread of unasked results; nothing for a single one."""
     arrivals = witness.arrivals
     if len(arrivals) < 2:
         return {}
@@ -256,15 +256,15 @@ async def look_at_clock(exam: Examination) -> None:
     """
     camera = exam.patient
     if not camera.capabilities.get_clock:
-        exam.say("ok", f"{camera.capabilities.dialect} has no message for a clock")
+        exam.report("ok", f"{camera.capabilities.dialect} has no message for a clock")
         return
     try:
         shown = await camera.get_clock()
     except InterpretationError as exc:
-        exam.say("warning", f"the camera's clock is no date: {exc.got}", _SET_CLOCK)
+        exam.report("warning", f"the camera's clock is no date: {exc.got}", _SET_CLOCK)
         return
     except ResponseTimeoutError as exc:
-        exam.say(
+        exam.report(
             "warning",
             f"the camera does not tell its clock: {exc}",
             "Nothing but the clock depends on it. The session was given up for it.",
@@ -281,10 +281,10 @@ async def look_at_clock(exam: Examination) -> None:
         "compared_with": zone,
     }
     if abs(off) <= CLOCK_MAY_DIFFER:
-        exam.say("ok", f"{text}, which is this machine's {zone}", **details)
+        exam.report("ok", f"{text}, which is this machine's {zone}", **details)
         return
     behind = "behind" if off < timedelta(0) else "ahead of"
-    exam.say(
+    exam.report(
         "warning",
         f"{text}, {_rounded(abs(off))} {behind} this machine's "
         f"{zone}; it carries no time zone, and a restart of the camera loses it",
@@ -302,5 +302,5 @@ def _rounded(off: timedelta) -> str:
 
 _SET_CLOCK = (
     "await camera.set_clock(datetime.now()) after each restart of the camera, or an NTP server in "
-    "its settings where it has them. Results of smartcam carry this machine's time."
+    "its settings if it has them. Results of smartcam carry this machine's time."
 )

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class Figures(NamedTuple):
-    """Figures of a row of times; seconds.
+    """Figures of a series of times; seconds.
 
     Attributes:
-        times: number of times in the row.
+        times: number of times in the series.
         min: shortest time.
         median: median of the times.
-        p99: the 99th percentile by nearest rank: the longest where there are 100 or fewer.
+        p99: the 99th percentile by nearest rank: the longest of 100 or fewer.
         jitter: mean of the absolute differences of successive times; 0 for a single one.
     """
 
@@ -35,7 +35,7 @@ class Figures(NamedTuple):
 
 
 def figures(times: Sequence[float]) -> Figures:
-    """Return the figures of one time or more, in the order in which they were taken."""
+    """Return the figures of one time or more, in the order of measurement."""
     ordered = sorted(times)
     steps = [abs(after - before) for before, after in pairwise(times)]
     return Figures(

@@ -1,4 +1,4 @@
-"""Checks about the application that is wanted, and the triggers, where they are allowed."""
+"""Checks of the wanted application, and of triggers if they are allowed."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 
 async def look_at_application(exam: Examination) -> None:
-    """Check ``application``: whether the wanted one is active; loaded for triggers only.
+    """Check ``application``: whether the expected one is active; load it for triggers only.
 
-    The protocol has no way to ask whether an application is there but to load it.
+    The protocol cannot ask whether an application exists without loading it.
     """
     camera, wanted = exam.patient, exam.options.application
     active = await camera.query_application()
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     if wanted is None or (wanted == active and not exam.wants_trigger):
-        exam.say("ok", f"{called(active)} is active", **details)
+        exam.report("ok", f"{called(active)} is active", **details)
     elif wanted == 0:
-        exam.wants_trigger = False  # of another application than the one that is meant
+        exam.wants_trigger = False  # triggers would run another application
         exam.fail(
             f"no application has the id 0; {called(active)} is active",
             "Name another id: the camera's pages show them.",
@@ -42,7 +42,7 @@ async def look_at_application(exam: Examination) -> None:
     elif exam.wants_trigger:
         await _borrow(exam, active, wanted)
     else:
-        exam.say(
+        exam.report(
             "warning",
             f"{called(active)} is active, not {wanted}; whether the camera has {wanted} cannot "
             "be known without loading it",
@@ -55,7 +55,7 @@ async def look_at_application(exam: Examination) -> None:
 async def _borrow(exam: Examination, active: int, wanted: int) -> None:
     camera = exam.patient
     details: dict[str, Any] = {"active": active, "wanted": wanted}
-    exam.wants_trigger = False  # until it is the one that is meant
+    exam.wants_trigger = False  # until the wanted application is loaded
     try:
         await exam.borrowed.enter_async_context(camera.application(wanted))
     except CommandRejectedError as exc:
@@ -68,17 +68,17 @@ async def _borrow(exam: Examination, active: int, wanted: int) -> None:
         return
     exam.wants_trigger = True
     text = f"application {wanted} is loaded and runs, for the triggers"
-    exam.say("ok", text, **details)
+    exam.report("ok", text, **details)
 
 
 async def give_back(exam: Examination) -> None:
-    """Have the application and the run state back that were there before the triggers."""
+    """Restore the application and the run state from before the triggers."""
     try:
         await exam.borrowed.aclose()
     except LinkError:
         raise
     except SmartCamError as exc:
-        exam.say(
+        exam.report(
             "warning",
             f"the camera did not go back to how it was: {exc}",
             "Look with smartcam status, and load or start with smartcam switch and start.",
@@ -89,7 +89,7 @@ async def give_back(exam: Examination) -> None:
 
 
 async def trigger(exam: Examination) -> None:
-    """Check ``trigger``: send some, one after the other; the first without a result ends it."""
+    """Check ``trigger``: send some, one by one, up to the first without a result."""
     if not (exam.wants_trigger and exam.may_trigger):
         return
     camera, loop, options = exam.patient, asyncio.get_running_loop(), exam.options
@@ -104,7 +104,7 @@ async def trigger(exam: Examination) -> None:
             except LinkError:
                 raise
             except InterpretationError:
-                break  # the check of the layout tells it
+                break  # the check of the layout reports it
             except SmartCamError as exc:
                 _say_failed(exam, exc, len(times))
                 break
@@ -115,10 +115,10 @@ async def trigger(exam: Examination) -> None:
     measured = figures(times)
     rate = len(times) / max(ended - begin, sum(times))
     text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
-    exam.say("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
+    exam.report("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
     extra = camera.statistics().extra_results
     if extra:
-        exam.say(
+        exam.report(
             "hint",
             f"{extra} results more than triggers came: the application sends several for each",
             "Tell the client how many: camera.trigger(results_per_trigger=...).",
@@ -131,7 +131,7 @@ def _say_failed(exam: Examination, error: SmartCamError, done: int) -> None:
     if not isinstance(error, TriggerTimeoutError):
         exam.fail(
             f"{which} gave no result: {error}",
-            "docs/troubleshooting.md has what stands behind this error.",
+            "docs/troubleshooting.md explains this error.",
             exit_code=Exit.REFUSED,
             error=type(error).__name__,
         )

@@ -1,4 +1,4 @@
-"""An emulated smart camera: write and test an application without one on the desk.
+"""An emulated smart camera: write and test an application without a real camera.
 
 ::
 

@@ -33,11 +33,11 @@ _LayoutText = Annotated[str, BeforeValidator(_layout_text)]
 
 
 class Application(EmulatorData):
-    """A program on the camera: when it runs, how long, and what it sends.
+    """A program on the camera: its trigger, its duration, and the values that it sends.
 
-    Exactly one of ``constant``, ``cycle`` and ``generator`` says what the result container holds;
-    with none of them the application has no "send results" tool and sends nothing.
-    Values are built once when the application is made, a generator is called once for that.
+    At most one of ``constant``, ``cycle`` and ``generator`` gives the values of the result
+    container; without any of them the application has no "send results" tool and sends nothing.
+    Values are built once when the application is made; a generator is called once for that.
 
     Raises:
         pydantic.ValidationError: a field is wrong, or its values do not fit the layout.
@@ -102,7 +102,7 @@ class Application(EmulatorData):
 
     @property
     def period(self) -> int | None:
-        """After how many runs its containers come again; None if each run makes its own."""
+        """Number of runs after which its containers repeat; None if each run makes its own."""
         layout = self.result_layout
         if layout is None or layout.sequence_field is not None or self.generator is not None:
             return None
@@ -124,13 +124,13 @@ class Application(EmulatorData):
             number: the run's sequence number.
             turn: runs of this application before this one, since it was loaded.
             time: seconds since the device was made.
-            scene: what the camera looks at.
+            scene: the scene that the camera sees.
             values: values of the input container.
             byte_order: order of the bytes of a number.
 
         Raises:
             ConfigurationError: the values do not fit the layout.
-            Exception: whatever a generator raises.
+            Exception: any error of a generator.
         """
         layout = self.result_layout
         if layout is None:
@@ -144,7 +144,7 @@ class Application(EmulatorData):
         """Return the result container's bytes of values, None without a "send results" tool.
 
         Args:
-            values: what the layout holds.
+            values: values of the layout's fields.
             number: the run's sequence number.
             byte_order: order of the bytes of a number.
 
@@ -271,5 +271,5 @@ BUILTIN_APPLICATIONS = (
         constant={"text": "Hello World"},
     ),
 )
-"""Applications of every emulated camera unless it is told otherwise: a text test, a part check, the
+"""Applications of every emulated camera by default: a text test, a part check, the
 tangram table, a free-running counter, a greeting."""

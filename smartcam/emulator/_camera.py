@@ -1,9 +1,9 @@
 """The emulated camera on a port: sockets, a clock and the device between them.
 
-Bytes of a client go ``socket -> ClientLink -> Machine -> EmulatedCamera.received ->
-Device.handle``; what the device says goes ``Device.take_output -> Machine -> one write``.
-Everything that happens is a *step*: bring the device's time up, do it, deliver, set one timer for
-the device's next event.
+Received bytes go ``socket -> ClientLink -> Machine -> EmulatedCamera.received ->
+Device.handle``; the device's messages go ``Device.take_output -> Machine -> one write``.
+Every action is a *step*: advance the device's time, act, deliver, set one timer for the device's
+next event.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
 SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
 """The fields of an application that the page shows."""
 
-_SHOWN = 20  # ids that an error names
+_SHOWN = 20  # largest number of ids that an error names
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -60,12 +60,12 @@ BAD_FRAME: Mapping[str, Policy] = {
     "skip": POLICIES[Role.CAMERA, Transport.TCP],
     "close": Policy(fatal=(FrameError,), exact_length=True),
 }
-"""Policies over TCP by value of the quirk ``bad_frame``; a broken body or an unknown id never
-matters."""
+"""Policies over TCP by value of the quirk ``bad_frame``; a broken body or an unknown id is always
+ignored."""
 
 
 class EmulatedCamera(WireCamera):
-    """A camera made of software, on a real port.
+    """A BVS camera made of software, on a real port.
 
     ::
 
@@ -73,45 +73,45 @@ class EmulatedCamera(WireCamera):
             async with smartcam.connect(emulator.url) as camera:
                 ...
 
-    The applications given come beside the built-in ones (1, 3, 7, 9, 21) and replace those of the
-    same id. It is stopped at first, unless ``running``.
+    The given applications are added to the built-in ones (1, 3, 7, 9, 21) and replace those with
+    the same id. The camera is stopped at first, unless ``running``.
 
     Args:
         applications: programs of the camera: :class:`Application` or mappings of its fields.
-        scenario: a scenario or the path of its file; what is given here beside it goes before it.
-        host: address to listen on; nothing but this.
-        port: port to listen on, 0 for a free one; default what the scenario says, else 0.
-        transport: ``"tcp"`` or ``"udp"``; default what the scenario says, else ``"tcp"``.
+        scenario: a scenario or the path of its file; the other arguments override it.
+        host: address to listen on, without a scheme or a port.
+        port: port to listen on, 0 for a free one; default the scenario's, else 0.
+        transport: ``"tcp"`` or ``"udp"``; default the scenario's, else ``"tcp"``.
         dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``; default
-            what the scenario says, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
+            the scenario's, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
             answers every request with a result code.
         clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
-        quirks: what is not known of real cameras: :class:`Quirks` or a mapping of its fields.
+        quirks: unknown behaviour of real cameras: :class:`Quirks` or a mapping of its fields.
         name: name of the camera in logs.
-        active: id of the application that is loaded at first; default the first given, else 1.
+        active: id of the application that is loaded at first; default the first given one, else 1.
         running: True for run mode from the beginning.
-        seed: seed of all that is left to chance, the scene's noise and the timeline; default 0.
-        builtins: have the built-in applications.
+        seed: seed of all random numbers, of the scene's noise and the timeline; default 0.
+        builtins: add the built-in applications.
         faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
-            of their fields with ``kind``. Those that wait for no message happen when it starts.
-        timeline: what happens by itself, and when: cues of
+            of their fields with ``kind``. Faults that wait for no message happen at the start.
+        timeline: events that happen by themselves, with their times: cues of
             :mod:`smartcam.emulator._scenario.timeline`, or mappings of their fields.
-            They come behind the scenario's.
+            They follow the scenario's.
 
     Attributes:
-        host: host that was given.
-        transport: transport that was given.
-        dialect: dialect that was given.
-        name: name that was given.
-        scenario: what all that was given comes to.
+        host: the given host.
+        transport: the transport in use.
+        dialect: the dialect in use.
+        name: the name in use.
+        scenario: the scenario with all arguments merged into it.
         clock: clock that the camera runs by.
-        device: the camera behind the wire. Its operator's methods (``trigger()``,
-            ``set_condition()``, ...) may be called at any time in the event loop's thread; what
-            they cause is sent. Its time is brought up whenever something happens.
-        seed: seed of all that is left to chance.
+        device: the camera itself. Its operator's methods (``trigger()``,
+            ``set_condition()``, ...) may be called at any time in the event loop's thread; the
+            messages that they cause are sent. Its time is advanced at every action.
+        seed: seed of all random numbers.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     takes: ClassVar[frozenset[str]] = frozenset(
@@ -207,7 +207,7 @@ class EmulatedCamera(WireCamera):
         clock: Clock | None = None,
         seed: int | None = None,
     ) -> EmulatedCamera:
-        """Return a camera of a scenario; what is given beside it goes before it."""
+        """Return a camera of a scenario; the other arguments override it."""
         own = plan.quirks.model_dump(exclude_unset=True)
         return cls(
             scenario=plan,
@@ -222,7 +222,7 @@ class EmulatedCamera(WireCamera):
 
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place in it of what the camera cannot do, and why; None if all is well."""
+        """Return the place of something unsupported in a scenario, and the reason; or None."""
         dialect = BVS.dialects[plan.dialect]
         known = [application.id for application in plan.all_applications]
         for number, application in enumerate(plan.applications):
@@ -251,14 +251,14 @@ class EmulatedCamera(WireCamera):
 
     @classmethod
     def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which an application is active, and runs, from the beginning."""
+        """Return the options for a camera whose application is active, and runs, from the start."""
         return {"active": active, "running": running}
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:
-        """Its address with the dialect pinned."""
+        """The camera's address with the dialect pinned."""
         kind = Transport(self.transport)
         scheme = next(s for s, t in BVS.schemes.items() if t is kind)
         hidden = self.device.quirks.hidden_triggers
@@ -274,7 +274,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def application_ids(self) -> list[int]:
-        """Ids of the applications on it."""
+        """Ids of the camera's applications."""
         return list(self.device.applications)
 
     def __repr__(self) -> str:
@@ -282,7 +282,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def scene(self) -> TableScene:
-        """The table it looks at, with the ground truth."""
+        """The table that the camera sees, with the ground truth."""
         return self.device.scene
 
     @property
@@ -294,19 +294,19 @@ class EmulatedCamera(WireCamera):
 
     @property
     def clock_time(self) -> datetime:
-        """Time that the device's own clock shows."""
+        """Time that the camera's own clock shows."""
         return self.device.clock_time
 
     @property
     def last_report(self) -> LastReport | None:
-        """The last run's report, whether anybody heard it or not; its time is the log's."""
+        """The last run's report, even if no client received it; its time is the log's."""
         last = self.device.last_report
         if last is None:
             return None
         return last._replace(time=self._moved_at - (self.device.time - last.time))
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
-        """Return the application that describes a result; None if none does."""
+        """Return the application that describes a result; None without one."""
         return self.device.applications.get(message.application)
 
     def shown(self) -> dict[str, Any]:
@@ -332,7 +332,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def quirks(self) -> Quirks:
-        """Its quirks."""
+        """The camera's quirks."""
         return self.device.quirks
 
     @property
@@ -342,7 +342,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def sessions(self) -> list[str]:
-        """Address and port of the client that has the session, or nothing."""
+        """Address and port of the client that has the session; empty without one."""
         return [] if self._active is None else [self._active.peer]
 
     # ------------------------------------------------------------------ links and the session
@@ -365,11 +365,11 @@ class EmulatedCamera(WireCamera):
         return dataclasses.replace(policy, tells=self.device.behaviour.tells_bad_messages)
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Take a message of a link; a link without the session is heard with Connect only."""
+        """Handle a message of a link; without the session only Connect has an effect."""
         connects = isinstance(message, m.Connect)
         if not connects and link is not self._active:
             return
-        faults = self._provoke(self.queue.device_heard, message)
+        faults = self._provoke(self.queue.device_on_client, message)
         if connects and not link.closed:
             self._connect(link)
         elif link is self._active:  # a fault may have given the session to another
@@ -388,12 +388,12 @@ class EmulatedCamera(WireCamera):
         return link is self._active
 
     def lost(self, link: ClientLink) -> None:
-        """Forget a link that is gone; if it had the session, end that."""
+        """Forget a link that is gone; end its session, if it has the session."""
         if link is self._active:
             self._leave_session()
 
     def _let_second_client_in(self) -> None:
-        """Let another client connect, which gets the session unless a quirk refuses newcomers."""
+        """Let another client connect; it gets the session unless a quirk refuses newcomers."""
         if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
             return
         self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
@@ -440,7 +440,7 @@ class EmulatedCamera(WireCamera):
         self._ends()
 
     def _deliver_at_once(self) -> None:
-        self._say_all(self.device.take_output(), provoke=False)
+        self._send_all(self.device.take_output(), provoke=False)
 
     def _move(self) -> None:
         now = self.clock.now
@@ -448,20 +448,20 @@ class EmulatedCamera(WireCamera):
         self.device.tick(max(0.0, passed))
 
     def _collect(self) -> None:
-        """Put what the device said into the active link's next write."""
+        """Put the device's messages into the active link's next write."""
         output = self.device.take_output()
-        if self.queue.device_said:
-            self._say_all(output, provoke=True)
+        if self.queue.device_on_camera:
+            self._send_all(output, provoke=True)
         elif self._active is not None:
             say = self._active.say
             for message in output:
                 say(message)
 
-    def _say_all(self, output: list[m.Message], *, provoke: bool) -> None:
-        """Say messages to the one that has the session; they may bring faults about."""
+    def _send_all(self, output: list[m.Message], *, provoke: bool) -> None:
+        """Send messages to the client that has the session; they may trigger faults."""
         session = self._active
         for message in output:
-            faults = self._provoke(self.queue.device_said, message) if provoke else ()
+            faults = self._provoke(self.queue.device_on_camera, message) if provoke else ()
             if session is not None and session is self._active and self.device.connected:
                 session.say(message)
             self._act(faults, "after")
@@ -481,7 +481,7 @@ class EmulatedCamera(WireCamera):
     # ------------------------------------------------------------------ the port
 
     def _go_down(self) -> None:
-        """Restart: lose every connection, and shut the port."""
+        """Restart: close every connection and the port."""
         _log.info("= %s: rebooting", self.name)
         self._down = True
         self._active = None

@@ -1,8 +1,8 @@
-"""One client's way to the camera, and the way of its messages while faults act on them.
+"""A client's link to the camera, and the path of its messages while faults act on them.
 
 Each link has a machine in the camera's role, which its owner makes. It is faulty only while wire
-faults wait or something of theirs is under way. What the camera says then goes
-``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; what a client sends goes
+faults wait or hold messages back. The camera's messages then go
+``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
 ``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT_BYTES = 1 << 16
-"""Largest number of bytes of payload the camera takes: input data has the container's limit of
-about 64 kB (HALCON script manual p. 35, published for the other direction)."""
+"""Largest number of bytes of payload that the camera accepts: input data has the container's limit
+of about 64 kB (HALCON script manual p. 35, published for the other direction)."""
 
 _ENDED = "connection ended"
 _UNSENT = "not sent"
@@ -45,7 +45,7 @@ Trace: TypeAlias = "Callable[[m.Sender, Frame | RemoteProtocolError], None]"
 
 
 class CameraMachine(Protocol):
-    """The methods that a link needs of the machine which speaks over it, in the camera's role."""
+    """The methods that a link calls of its machine, which has the camera's role."""
 
     transport: Transport
 
@@ -56,18 +56,18 @@ class CameraMachine(Protocol):
 
     @property
     def buffered(self) -> int:
-        """Bytes that wait for more."""
+        """Bytes of an unfinished message."""
         ...
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes; never raises for what is in them."""
+        """Add received bytes; never raises for bad bytes."""
 
     def events(self) -> Iterable[object]:
-        """Return the messages and bytes heard since the last call."""
+        """Return the messages and bytes received since the last call."""
         ...
 
     def send(self, message: Any) -> None:
-        """Say something; LocalProtocolError: not now."""
+        """Send a message; LocalProtocolError: not now."""
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
@@ -75,12 +75,12 @@ class CameraMachine(Protocol):
 
 
 class LinkOwner(Protocol):
-    """The methods that links need of the emulator behind them."""
+    """The methods of the emulator that links call."""
 
     clock: Clock
     queue: FaultQueue  # the faults that wait
-    max_links: int  # clients that are looked at
-    write_limit: int  # bytes kept for a client that does not read
+    max_links: int  # largest number of clients
+    write_limit: int  # largest number of bytes kept for a client
 
     @property
     def codec(self) -> WireCodec:
@@ -88,7 +88,7 @@ class LinkOwner(Protocol):
         ...
 
     def step(self) -> AbstractContextManager[object]:
-        """Bring the device's time up; afterwards deliver what it said."""
+        """Advance the device's time; afterwards deliver its messages."""
         ...
 
     def make_machine(self, transport: Transport, trace: Trace) -> CameraMachine:
@@ -100,7 +100,7 @@ class LinkOwner(Protocol):
         ...
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Take a message of a link."""
+        """Handle a message of a link."""
         ...
 
     def serves(self, link: ClientLink) -> bool:
@@ -120,25 +120,25 @@ class LinkOwner(Protocol):
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """Take note of a message that passed or is lost, as faults have made it."""
+        """Note a message that passed or is lost, as faults have changed it."""
         ...
 
 
 class ClientLink(ABC):
-    """One client's way to the camera."""
+    """A client's link to the camera."""
 
     def __init__(self, owner: LinkOwner, transport: Transport, peer: str) -> None:
         self.peer = peer
         self.closed: bool = False
         self.hearing: str | None = None
-        """Kinds of the faults that acted on what the camera hears just now."""
+        """Kinds of the faults that acted on the message that the camera is receiving."""
         self._owner = owner
         self.machine: CameraMachine = owner.make_machine(transport, self._trace)
-        self._faulty: FaultyLink | None = None  # there while faults act
+        self._faulty: FaultyLink | None = None  # set while faults act
 
     def say(self, message: m.Message) -> None:
-        """Put a message behind those that :meth:`flush` will write."""
-        if self._owner.queue.said and self._faulty is None:
+        """Add a message to those that :meth:`flush` will write."""
+        if self._owner.queue.on_camera and self._faulty is None:
             self._enter_faulty()
         try:
             self.machine.send(message)
@@ -149,7 +149,7 @@ class ClientLink(ABC):
             self._faulty.say(message, b"".join(self.machine.data_to_send()))
 
     def flush(self) -> None:
-        """Write everything said."""
+        """Write all added messages."""
         faulty = self._faulty
         if faulty is None:
             self._write_frames(self.machine.data_to_send())
@@ -160,7 +160,7 @@ class ClientLink(ABC):
 
     @property
     def settled(self) -> bool:
-        """True if the link has the session and so makes room for nobody."""
+        """True if the link has the session, so that it never makes room for another."""
         return self._owner.serves(self)
 
     def turn_away(self, why: str) -> None:
@@ -169,22 +169,22 @@ class ClientLink(ABC):
 
     @abstractmethod
     def close(self, reason: str) -> None:
-        """End the link; nothing is read or written any more."""
+        """End the link; nothing more is read or written."""
 
     def dismiss(self, reason: str) -> None:
-        """End the link because another client has the session; a dead one stays as it is."""
+        """End the link, since another client has the session; a dead link stays as it is."""
         if self._faulty is None or not self._faulty.dead:
             self.close(reason)
 
-    def unseated(self) -> None:  # noqa: B027  only where links have an order of their own
-        """Note that the client has given the session back; it may stay."""
+    def unseated(self) -> None:  # noqa: B027  only for links with an order of their own
+        """Note that the client has ended its session; it may stay."""
 
     def heard(self) -> None:
-        """Write the camera's answers to what it heard."""
+        """Write the camera's answers to the received messages."""
         self.flush()
 
     def feed(self, data: bytes) -> None:
-        """Feed the machine and pass its messages on."""
+        """Feed the machine, and pass its messages on."""
         self.machine.receive_data(data)
         for event in self.machine.events():
             if isinstance(event, m.Message) and not self.closed:
@@ -196,21 +196,21 @@ class ClientLink(ABC):
 
     @abstractmethod
     def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
-        """End the link behind what was written, or by a reset."""
+        """End the link after the bytes written so far, or by a reset."""
 
     def hold(self, on: bool) -> None:  # noqa: B027  only where the network keeps what is not read
-        """Read nothing more for a time, or go on."""
+        """Stop reading for a time, or continue."""
 
     @abstractmethod
     def stop_listening(self) -> None:
-        """Read nothing more."""
+        """Stop reading for good."""
 
     @abstractmethod
     def heal(self) -> None:
-        """End what a fault does to the link for long."""
+        """End the lasting effects of faults on the link."""
 
     def overflow(self) -> None:
-        """End the link: faults hold back too much."""
+        """End the link, since faults hold too many bytes back."""
         self.close(f"more than {self._owner.write_limit} bytes are held back")
 
     @abstractmethod
@@ -218,8 +218,8 @@ class ClientLink(ABC):
         """Write frames as they are."""
 
     def _take(self, data: bytes) -> None:
-        """Take what came: bytes of a stream, or one datagram."""
-        if self._faulty is None and not self._owner.queue.heard:
+        """Handle received bytes: of a stream, or one datagram."""
+        if self._faulty is None and not self._owner.queue.on_client:
             self.feed(data)
         else:
             self._enter_faulty().take(data)
@@ -250,10 +250,10 @@ class FaultyLink:
 
     def __post_init__(self) -> None:
         self.muted: str | None = None  # kind of the fault that keeps the camera silent on this link
-        self.dead: bool = False  # nothing is read either
+        self.dead: bool = False  # nothing is read on the link either
         self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
         self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
-        # framer that the client's bytes go through, if there is one
+        # framer of the client's bytes, if there is one
         self._framer: WireFramer | None = None
         self._revival = OneTimer(self._owner.clock, self._revive)
 
@@ -274,7 +274,7 @@ class FaultyLink:
 
     @property
     def idle(self) -> bool:
-        """True if messages may go the short way again, as far as this link is concerned."""
+        """True if this link allows messages to take the short way again."""
         return (
             self.muted is None
             and not self.dead
@@ -285,31 +285,31 @@ class FaultyLink:
 
     @property
     def unheard(self) -> bool:
-        """True while something of the client's is held back."""
+        """True while bytes of the client are held back."""
         return bool(self._incoming)
 
     def close(self) -> None:
-        """Drop what is under way, and every timer."""
+        """Drop all messages that are held back, and every timer."""
         self._revival.set(None)
         self._outgoing.close()
         self._incoming.close()
 
     def heal(self) -> None:
-        """Listen and talk again."""
+        """Read and write again."""
         self._revival.set(None)
         self.muted, self.dead = None, False
 
     # ------------------------------------------------------------------ out
 
     def say(self, message: m.Message, data: bytes) -> None:
-        """Take a message that the camera says, and its bytes; :meth:`run` next."""
+        """Add a message of the camera, and its bytes; call :meth:`run` next."""
         dialect, queue = self._owner.codec, self._owner.queue
         frame = dialect.to_frame(message)
-        faults = queue.by_message(queue.said, message)
+        faults = queue.by_message(queue.on_camera, message)
         self._put(self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect))
 
     def run(self) -> None:
-        """Write everything for which it is time."""
+        """Write all messages whose time has come."""
         self._outgoing.run()
 
     def _carry_out(self, batch: list[tuple[WireMessage, bytes]]) -> None:
@@ -331,10 +331,10 @@ class FaultyLink:
     # ------------------------------------------------------------------ in
 
     def take(self, data: bytes) -> None:
-        """Take bytes of the client: of a stream, or one datagram."""
+        """Add bytes of the client: of a stream, or one datagram."""
         if self.dead:
             return
-        heard = self._owner.queue.heard
+        heard = self._owner.queue.on_client
         if self.machine.transport is Transport.UDP:
             self._take_message(cut_datagram(data, self._owner.codec))
             return
@@ -351,13 +351,13 @@ class FaultyLink:
         self._stop_cutting()
 
     def _stop_cutting(self) -> None:
-        """Give the bytes of an unfinished frame to the machine where no fault may need it whole."""
-        if self._framer is not None and not self._owner.queue.heard and not self._incoming:
+        """Give an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
+        if self._framer is not None and not self._owner.queue.on_client and not self._incoming:
             rest, self._framer = self._framer.pending, None
             self._link.feed(rest)
 
     def _finish_frame(self, data: bytes) -> bytes:
-        """Let the frame pass that was under way when the faults were given; return the rest."""
+        """Let the frame pass that was unfinished when the faults were given; return the rest."""
         done = 0
         while self.machine.buffered and done < len(data):
             self._link.feed(data[done : done + 1])
@@ -368,7 +368,7 @@ class FaultyLink:
         queue, frame = self._owner.queue, message.what
         faults: list[Fault] = []
         if isinstance(frame, Frame):
-            faults = queue.by_frame(queue.heard, frame)
+            faults = queue.by_frame(queue.on_client, frame)
         self._put(self._incoming, apply_faults(message, faults, self._owner.codec))
         self._incoming.run()
 
@@ -409,11 +409,11 @@ class FaultyLink:
 
     @property
     def _why(self) -> str:
-        """Reason for which something is lost now."""
+        """Reason why a message is lost now."""
         return self.muted or (_ENDED if self._link.closed else _UNSENT)
 
     def _end(self, ending: Ending) -> None:
-        self._outgoing.run()  # what the camera said to the message that ends it
+        self._outgoing.run()  # the camera's answers to the ending message
         if self._link.closed:
             return
         if ending.how in {"close", "reset"}:
@@ -435,23 +435,23 @@ class FaultyLink:
 
 @dataclass(eq=False)
 class SecondClientSession:
-    """The second client of a fault: it has the session, and no program behind it reads anything."""
+    """The second client of a fault: it has the session, but is no real program."""
 
     _dialect: FramedDialect
-    _traced: Callable[[Frame], None]  # told of all the camera says to it; none of it is on a wire
+    _traced: Callable[[Frame], None]  # called with all messages to it; none is on a wire
     peer: ClassVar[str] = "second client"
 
     def say(self, message: m.Message) -> None:
-        """Take a message."""
+        """Accept a message."""
         try:
             frame = self._dialect.to_frame(message)
             self._dialect.encode_frame(frame)
         except LocalProtocolError:
-            return  # a link would not have sent it either
+            return  # a link would not send it either
         self._traced(frame)
 
     def flush(self) -> None:
         """Do nothing, since nothing waits."""
 
     def dismiss(self, reason: str) -> None:
-        """Do nothing: another client has the session, and nothing is there to be closed."""
+        """Do nothing: another client has the session, and there is nothing to close."""

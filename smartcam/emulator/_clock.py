@@ -1,4 +1,4 @@
-"""The time of an emulated camera: the real one, or one that a test moves by hand."""
+"""The time of an emulated camera: the real time, or a time that a test moves by hand."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 NANOSECONDS = 1_000_000_000
-"""In a second. Devices and the manual clock count whole nanoseconds, so that instants that are the
-same stay the same however they were summed up."""
+"""Number of nanoseconds in a second. Devices and the manual clock count whole nanoseconds, so that
+equal instants stay equal however they were summed up."""
 
 
 def nanoseconds(seconds: float) -> int:
@@ -34,7 +34,7 @@ class TimerHandle(Protocol):
 
 
 class Clock(ABC):
-    """Tells the time and calls back at an instant of it. Seconds, from any origin."""
+    """A source of time that calls back at an instant. Seconds, from any origin."""
 
     @property
     @abstractmethod
@@ -43,7 +43,7 @@ class Clock(ABC):
 
     @abstractmethod
     def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
-        """Call ``callback`` once when the time has come to ``when``."""
+        """Call ``callback`` once when the time reaches ``when``."""
 
 
 class RealClock(Clock):
@@ -61,17 +61,17 @@ class RealClock(Clock):
 
 @dataclass(eq=False)
 class OneTimer:
-    """One timer of a clock, set again whenever something else is next."""
+    """One timer of a clock, which is set again for each next event."""
 
     _clock: Clock
-    _callback: Callable[[], None]  # called when the time has come; the timer is not set then
+    _callback: Callable[[], None]  # called at the instant; the timer is not set then
 
     def __post_init__(self) -> None:
         self._handle: TimerHandle | None = None
         self._when: int | None = None
 
     def set(self, when: int | None) -> None:
-        """Set the timer to an instant, nanoseconds; None: not at all."""
+        """Set the timer to an instant, nanoseconds; None: cancel it."""
         if when == self._when:
             return
         if self._handle is not None:
@@ -98,7 +98,7 @@ class _Timer:
 class ManualClock(Clock):
     """A clock that stands still until :meth:`advance` moves it.
 
-    One clock may serve several cameras: they are moved together.
+    One clock may serve several cameras; they move together.
     """
 
     def __init__(self) -> None:
@@ -121,17 +121,17 @@ class ManualClock(Clock):
         return timer
 
     def advance(self, seconds: float) -> None:
-        """Move the time and everything that depends on it.
+        """Move the time, and run all events that depend on it.
 
-        All that happens inside the interval happens before this returns, in order of time, each
-        at its own instant; what devices send by it is written to their sockets.
+        All events of the interval happen before this returns, in order of time, each
+        at its own instant; messages that devices send are written to their sockets.
         Call it in the thread of the event loop.
 
         Args:
-            seconds: how far; not negative.
+            seconds: time to move by; not negative.
 
         Raises:
-            ConfigurationError: a negative time, or a call from inside another one.
+            ConfigurationError: a negative time, or a call from inside another call.
         """
         seconds = check_seconds(seconds, "seconds", "clock")
         if self._advancing:

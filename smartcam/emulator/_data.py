@@ -13,7 +13,7 @@ Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 
 
 class EmulatorData(BaseModel):
-    """Base of the data: they do not change, and a field that they lack is refused."""
+    """Base of the data: objects do not change, and unknown fields are refused."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         frozen=True, extra="forbid", ignored_types=(cached_property,)

@@ -1,4 +1,4 @@
-"""Emulated cameras that evaluate one part after the other: what those of a make have in common."""
+"""Emulated cameras that evaluate one part after the other: the common base of several makes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ KindT = TypeVar("KindT")
 
 
 def request(form: str) -> Callable[[HandlerT], HandlerT]:
-    """Have a method of an :class:`EvaluatingCamera` answer the requests of a form.
+    """Mark a method of an :class:`EvaluatingCamera` that answers the requests of a form.
 
-    The method is given the client and the groups of the form, and returns the answer, None for one
-    that is said later. The first line of its text says what the request does.
+    The method gets the client and the groups of the form, and returns the answer, or None for an
+    answer that is sent later. The first line of its docstring explains the request.
     """
 
     def mark(method: HandlerT) -> HandlerT:
@@ -52,13 +52,13 @@ def applications_of(
 
 
 class Operator:
-    """The operator of an emulated camera: what is done at the device itself."""
+    """The operator of an emulated camera: actions at the device itself."""
 
     def __init__(self, camera: EvaluatingCamera) -> None:
         self._camera = camera
 
     def trigger(self) -> None:
-        """Trigger at the input; while an evaluation is under way it is an overrun."""
+        """Trigger at the input; during an evaluation this is an overrun."""
         self._camera.overrun() if self._camera.busy else self._camera.begin(None)
 
     def switch_application(self, application: int, running: bool = False) -> None:
@@ -67,14 +67,14 @@ class Operator:
 
 
 class EvaluatingCamera(LineCamera):
-    """An emulated camera with applications, each with parts that it evaluates over and over.
+    """An emulated camera with applications, each with parts that it evaluates again and again.
 
-    A subclass calls :meth:`set_up` before ``super().__init__()``, and says in :meth:`evaluated`
-    what becomes of a result.
+    A subclass calls :meth:`set_up` before ``super().__init__()``, and reports a result in
+    :meth:`evaluated`.
 
     Attributes:
-        active: number of the active application, 0 or another number of none where none is.
-        busy: an evaluation is under way.
+        active: number of the active application; 0 or another unused number if none is active.
+        busy: an evaluation is running.
         parts: the parts of each application, one after the other.
     """
 
@@ -88,12 +88,12 @@ class EvaluatingCamera(LineCamera):
         cls.requests = {**cls.requests, **own}
 
     def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:
-        """Take the parts of each application by its number.
+        """Set the parts of each application by its number.
 
         Args:
             parts: parts of each application, by its number.
-            active: number of the active one; None for the first one.
-            none: numbers that say that no application is active.
+            active: number of the active application; None for the first one.
+            none: numbers that mean that no application is active.
 
         Raises:
             ConfigurationError: there is no such application, or one has no parts.
@@ -108,21 +108,21 @@ class EvaluatingCamera(LineCamera):
         }
         self._numbers_of_applications = [*parts]
         self._call: LineClient | None = None  # call that the running evaluation answers
-        self._run = 0  # an application that is switched voids the evaluation under way
+        self._run = 0  # a switch voids the running evaluation
         self.device: Any = Operator(self)
 
     @classmethod
     def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which an application is active."""
+        """Return the options for a camera with an active application."""
         return {"active": active}
 
     @property
     def application_ids(self) -> list[int]:
-        """Numbers of its applications."""
+        """Numbers of the camera's applications."""
         return list(self._numbers_of_applications)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Answer a request of one of the forms, unless it is answered later."""
+        """Answer a request of one of the forms, unless its method answers later."""
         for form, method in self.requests.items():
             found = form.fullmatch(line)
             if found is not None:
@@ -133,13 +133,13 @@ class EvaluatingCamera(LineCamera):
         client.answer(self.unknown(line))
 
     def unknown(self, line: str) -> str:
-        """Return the answer to a request of none of the forms."""
+        """Return the answer to a request of an unknown form."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ evaluations
 
     async def start(self) -> None:
-        """Open the port, and evaluate by itself where the active application does so."""
+        """Open the port; begin to evaluate if the active application runs by itself."""
         await super().start()
         if not self.busy:
             self.activated()
@@ -150,7 +150,7 @@ class EvaluatingCamera(LineCamera):
         raise NotImplementedError
 
     def evaluated(self, call: LineClient | None, part: Any) -> None:
-        """Tell the values of a part to the client that has asked for them, and to others."""
+        """Report the values of a part to the client that asked for them, and to others."""
         raise NotImplementedError
 
     def voided(self, call: LineClient) -> None:
@@ -160,15 +160,15 @@ class EvaluatingCamera(LineCamera):
         """Note a trigger that came too early; nothing unless overridden."""
 
     def activated(self) -> None:
-        """Note that an application is active, or is again; nothing unless overridden."""
+        """Note that an application is active, or is active again; nothing unless overridden."""
 
     def _ends(self) -> None:
-        """Forget the evaluation under way, as a device does whose power is gone."""
+        """Forget the running evaluation, like a device that loses power."""
         super()._ends()
         self.busy, self._call, self._run = False, None, self._run + 1
 
     def begin(self, call: LineClient | None) -> None:
-        """Begin an evaluation, which is the answer to a request or nobody's."""
+        """Begin an evaluation, for a request or without one."""
         self.busy, self._run, self._call = True, self._run + 1, call
         run = self._run
         self.after(self.evaluation_time, lambda: self._end(run))
@@ -181,7 +181,7 @@ class EvaluatingCamera(LineCamera):
         self.activated()
 
     def activate(self, application: int) -> None:
-        """Make another application the active one; the evaluation under way gives no result."""
+        """Make another application the active one; the running evaluation gives no result."""
         call, self._call, self.busy = self._call, None, False
         self.active, self._run = application, self._run + 1
         if call is not None and not call.gone:

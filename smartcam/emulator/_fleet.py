@@ -32,7 +32,7 @@ class EmulatedFleet(Server):
         scenarios: the path of a scenario file, or scenarios with different names.
         host: address to listen on; without a port.
         transport: ``"tcp"`` or ``"udp"``; by default that of each scenario.
-        dialect: name of the wire dialect; default what each scenario says.
+        dialect: name of the wire dialect; by default that of each scenario.
         quirks: fields of :class:`~smartcam.emulator.Quirks` that override those of each scenario.
         clock: clock of all cameras; by default real time.
 
@@ -102,7 +102,7 @@ class EmulatedFleet(Server):
         return {name: camera.url for name, camera in self._cameras.items()}
 
     async def start(self) -> None:
-        """Start all cameras; does nothing if they are started already.
+        """Start all cameras; do nothing if they are started already.
 
         Raises:
             ConfigurationError: one of the cameras cannot listen; none is started.

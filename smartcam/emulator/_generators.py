@@ -1,9 +1,9 @@
-"""Functions, by their names, that make an application's values where they are not constants.
+"""Functions, by their names, that make an application's values if they are not constants.
 
-A generator takes a :class:`Run` and returns what ``Layout.build`` takes: a mapping for a record, a
-list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name,
-and so does a plug-in (entry points ``smartcam.generators``); in Python the function itself can be
-given.
+A generator gets a :class:`Run` and returns a value for ``Layout.build``: a mapping for a record, a
+list of mappings for ``( ... )*``. :func:`register_generator` adds a generator that scenario files
+can name, and so does a plug-in (entry points ``smartcam.generators``); in Python the function
+itself can be given.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Values: TypeAlias = Mapping[str, Any] | Sequence[Any]
 
 
 class Run(NamedTuple):
-    """One inspection, as its application sees it.
+    """One inspection, with the facts that its application knows.
 
     Attributes:
         number: the run's sequence number.
-        turn: runs of this application before it, since it was loaded.
+        turn: number of runs of this application before it, since it was loaded.
         time: seconds since the device was made.
         layout: layout of the result.
-        scene: the table the camera looks at.
+        scene: the table that the camera sees.
         input: the input container's values, None for an application without one.
         parameters: ``parameters`` of the application.
     """
@@ -57,7 +57,7 @@ def zeros(fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def wrap_number(field: Field, number: int) -> int:
-    """Return a sequence number as ``field`` can hold it: it starts over where it overflows."""
+    """Return a sequence number as ``field`` can hold it: after the largest number comes 0."""
     low, high = field.wire.low, field.wire.high
     if low is None or high is None:
         return number
@@ -90,7 +90,7 @@ def find_generator(name: str) -> Generator:
 
 
 def generator_names() -> list[str]:
-    """Return the names of all generators, sorted; those of plug-ins are not loaded for it."""
+    """Return the names of all generators, sorted, without loading plug-ins."""
     return [info.name for info in GENERATORS.available()]
 
 

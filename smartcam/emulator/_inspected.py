@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class InspectionOrder(NamedTuple):
-    """An inspection that a camera asks for.
+    """An inspection for a run of a camera.
 
     Attributes:
-        application: id of the program that is to run.
+        application: id of the program to run.
         number: sequence number of the run.
         input: input data of the trigger; empty if none was ever given.
     """
@@ -48,16 +48,16 @@ class Inspector(ABC):
         Args:
             order: the run.
             seen: function that is called when the picture is there.
-            done: function that is called with what the application's layout holds; None if the
+            done: function that is called with the values of the application's layout; None if the
                 inspection failed and there is no result.
 
         Both are called in the event loop's thread, later and not from inside this call. After
-        :meth:`cancel` neither is.
+        :meth:`cancel` neither is called.
         """
 
     @abstractmethod
     def cancel(self) -> None:
-        """Give up the inspection under way; does nothing where none is."""
+        """Give up the running inspection; do nothing without one."""
 
 
 class InspectedApplication(Application):

@@ -320,7 +320,7 @@ class LineCamera(WireCamera):
         client.answer(self.answer(line))
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Note a client's line as it came, before it is carried out; override to use it."""
+        """Receive a client's raw line, before it is carried out; override to use it."""
 
     def greet(self, client: LineClient) -> None:
         """Greet a client that has just connected; override to send something."""
@@ -337,7 +337,7 @@ class LineCamera(WireCamera):
         with self.step():
             heapq.heappush(self._agenda, (when, next(self._numbers), action))
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:
@@ -381,7 +381,7 @@ class LineCamera(WireCamera):
         client = self._clients.get(link)
         if client is None or not isinstance(message, HeardLine):
             return
-        faults = self._provoke(self.queue.device_heard, message)
+        faults = self._provoke(self.queue.device_on_client, message)
         client.begin(message)
         self.begun(client, message)
         self.hear(client, self.lines.text(message.data))
@@ -408,7 +408,7 @@ class LineCamera(WireCamera):
     def say(self, link: ClientLink, message: SaidLine) -> None:
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
-            faults = self._provoke(self.queue.device_said, message)
+            faults = self._provoke(self.queue.device_on_camera, message)
             link.say(message)
             self._spoken_to[link] = None
             self._act(faults, "after")

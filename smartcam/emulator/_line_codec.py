@@ -1,7 +1,7 @@
-"""Lines of text as frames: what links, faults and the log of an emulated camera work on.
+"""Lines of text as frames, for the links, faults and the log of an emulated camera.
 
 A frame's payload is a line with its end. Its id is the row of the table that it belongs to, from
-1, as a request or as an answer; 0 for a line that stands in none.
+1, as a request or as an answer; 0 for a line without a row.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import LineRow, Transport
 
 MAX_LOGGED_BYTES = 4096
-"""Largest number of bytes of a line, or of an answer of several, that the log keeps."""
+"""Largest number of bytes of a line, or of an answer of several lines, that the log keeps."""
 
 HIDDEN = b"***"
 """The text that the log shows in place of a secret line."""
@@ -39,7 +39,7 @@ class HeardLine(m.Request):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SaidLine(m.Report):
-    """Bytes that a camera says: lines with their ends, or a prompt."""
+    """Bytes that a camera sends: lines with their ends, or a prompt."""
 
     row: int
     data: bytes
@@ -50,10 +50,10 @@ class LineCodec:
 
     Args:
         label: the dialect's name.
-        rows: what is said.
-        line_end: what the camera ends its lines with.
-        ends: what ends a client's line.
-        max_line: bytes of a client's line, its end not counted.
+        rows: requests and answers.
+        line_end: end of the camera's lines.
+        ends: pattern of the end of a client's line.
+        max_line: largest number of bytes of a client's line, without its end.
         encoding: encoding of characters.
         split: function that splits an answer into its word or ticket and the text that rows read.
     """
@@ -93,12 +93,12 @@ class LineCodec:
         found = self.ends.search(data)
         return data[: found.start() if found else None].decode(self.encoding, "replace")
 
-    def said(self, data: bytes) -> str:
-        """Return the text of what the camera says."""
+    def sent_text(self, data: bytes) -> str:
+        """Return the text of bytes that the camera sends."""
         return data.removesuffix(self.line_end).decode(self.encoding, "replace")
 
     def data(self, text: str) -> bytes:
-        """Return a text as the camera says it."""
+        """Return a text as bytes that the camera sends."""
         return text.encode(self.encoding, "replace") + self.line_end
 
     def row_of(self, text: str) -> int:
@@ -106,11 +106,11 @@ class LineCodec:
         return next((number for number, one in self._forms if one.read(text) is not None), 0)
 
     def row_of_word(self, word: str) -> int:
-        """Return the number of the row of what is said under a word, 0 for none."""
+        """Return the number of the row with a word, 0 for none."""
         return next((number for number, one in enumerate(self._rows, 1) if one.word == word), 0)
 
     def request_key(self, data: bytes) -> str:
-        """Return the word or ticket of the answer to a line, "" if order alone tells."""
+        """Return the word or ticket of the answer to a line, "" if only the order shows it."""
         if self._split is None:
             return ""
         text = self.text(data)
@@ -119,9 +119,9 @@ class LineCodec:
         return text.partition(",")[0] if word is None else word
 
     def answer_key(self, data: bytes) -> str:
-        """Return the word or ticket of an answer, "" if order alone tells."""
+        """Return the word or ticket of an answer, "" if only the order shows it."""
         try:
-            return "" if self._split is None else self._split(self.said(data))[0]
+            return "" if self._split is None else self._split(self.sent_text(data))[0]
         except (ValueError, LookupError):
             return ""
 
@@ -162,36 +162,36 @@ class LineCodec:
         return Frame(self.message_id(message), self.encode(message))
 
     def surplus(self, sender: m.Sender, frame: Frame) -> int:
-        """Return 0: a line has the length that it has."""
+        """Return 0: a line has no documented length."""
         return 0
 
     def decode(self, sender: m.Sender, frame: Frame) -> m.Message:
-        """Return the message that a line stands for; UnknownMessage where no row has the line."""
+        """Return the message of a line; UnknownMessage if no row has the line."""
         kind = self.message_type(sender, frame.message_id)
         if sender is m.Sender.CLIENT and kind is not m.UnknownMessage:
             return self._request(kind, frame.message_id, self.text(frame.payload))
         if kind is not m.UnknownMessage:
-            said = self.said(frame.payload)
+            text = self.sent_text(frame.payload)
             try:
-                told = self._rows[frame.message_id - 1].read(
-                    said if self._split is None else self._split(said)[1]
+                messages = self._rows[frame.message_id - 1].read(
+                    text if self._split is None else self._split(text)[1]
                 )
             except (ValueError, LookupError):
                 pass
             else:
-                found = told if isinstance(told, tuple) else (told,)
+                found = messages if isinstance(messages, tuple) else (messages,)
                 return next((one for one in found if type(one) is kind), found[0])
         return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
     def _request(self, kind: type[m.Message], number: int, text: str) -> m.Message:
-        """Return a request with what its line says for its fields, or zeros."""
+        """Return a request with the fields that its line gives, or zeros."""
         if kind is LineCommand:
             return LineCommand(line=text)
         form = next(one for row, one in self._forms if row == number)
-        said = form.read(text) or {}
+        fields = form.read(text) or {}
         values: dict[str, Any] = {}
         for name, wire in m.wire_fields(kind):
-            word = said.get(name, "")
+            word = fields.get(name, "")
             values[name] = (
                 word.encode(self.encoding, "replace")
                 if wire is m.Wire.DATA
@@ -203,11 +203,11 @@ class LineCodec:
 
 
 class _LineForm(NamedTuple):
-    """The form of a row's line: fixed texts with a field of any text between each two of them.
+    """The form of a row's line: fixed texts with a field of any text between two of them.
 
     Attributes:
         fields: names of the fields.
-        texts: one more than there are fields.
+        texts: fixed texts, one more than there are fields.
     """
 
     fields: tuple[str, ...]
@@ -222,9 +222,9 @@ class _LineForm(NamedTuple):
         )
 
     def read(self, text: str) -> dict[str, str] | None:
-        """Return the fields of a line, each as long as it can be; None: it has another form.
+        """Return the fields of a line, each as long as possible; None if it has another form.
 
-        Each fixed text is looked for from behind, so that no character is looked at twice.
+        Fixed texts are searched from the end, so that no character is read twice.
         """
         first, *texts = self.texts
         if not texts:
@@ -243,12 +243,12 @@ class _LineForm(NamedTuple):
 
 
 class LineFramer:
-    """Cuts a client's lines; a longer one than the codec's breaks the protocol."""
+    """Cuts a client's lines; a longer line than the codec's breaks the protocol."""
 
     def __init__(self, codec: LineCodec) -> None:
         self._codec = codec
         self._buffer = bytearray()
-        self._searched = 0  # no end begins before this
+        self._searched = 0  # no line end begins before this place
 
     @property
     def pending(self) -> bytes:
@@ -260,11 +260,11 @@ class LineFramer:
         return len(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Take bytes."""
+        """Add received bytes."""
         self._buffer += data
 
     def next_frame(self) -> Frame | None:
-        """Return the next line, None if it is not whole yet; FrameError: it is too long."""
+        """Return the next line, None if it is incomplete; FrameError: it is too long."""
         codec = self._codec
         found = codec.ends.search(self._buffer, self._searched)
         size = len(self._buffer) if found is None else found.start()
@@ -281,7 +281,7 @@ class LineFramer:
         return Frame(codec.row_of(data[:size].decode(codec.encoding, "replace")), data)
 
     def resync(self) -> int:
-        """Drop everything; return how much that was."""
+        """Drop everything; return the number of dropped bytes."""
         size = len(self._buffer)
         self._buffer.clear()
         self._searched = 0
@@ -289,11 +289,11 @@ class LineFramer:
 
 
 class LineServer:
-    """One connection's lines, in the camera's role: while one is done the next ones wait.
+    """One connection's lines, in the camera's role: the next line waits for the current one.
 
     Attributes:
-        busy: a line is under way.
-        going: lines are taken just now.
+        busy: a line is being carried out.
+        going: :meth:`events` is running.
         secret: the next line is not shown in the log.
     """
 
@@ -309,15 +309,15 @@ class LineServer:
 
     @property
     def buffered(self) -> int:
-        """Bytes that wait: of an unfinished line, and of those behind one under way."""
+        """Bytes that wait: of an unfinished line, and of lines after the current one."""
         return len(self._framer)
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes; never raises for what is in them."""
+        """Add received bytes; never raises for bad bytes."""
         self._framer.feed(data)
 
     def events(self) -> Iterator[HeardLine]:
-        """Yield lines until one is under way; each before the next is looked at."""
+        """Yield lines until one is being carried out, each before the next is read."""
         if self.going:
             return
         self.going = True
@@ -338,7 +338,7 @@ class LineServer:
             self.going = False
 
     def send(self, message: SaidLine) -> None:
-        """Say bytes."""
+        """Send bytes."""
         self._outbox.append(message.data)
         self._trace(m.Sender.CAMERA, Frame(message.row, message.data[:MAX_LOGGED_BYTES]))
 

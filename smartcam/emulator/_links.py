@@ -1,4 +1,4 @@
-"""Sockets of the emulated camera: they move bytes, what they mean is decided elsewhere.
+"""Sockets of the emulated camera: they move bytes and do not interpret them.
 
 A client's link is a TCP connection, or all datagrams of one address.
 """
@@ -30,9 +30,9 @@ CLOSE_TIMEOUT = 1.0
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
 FIRST_READ_BYTES = 1 << 10
-"""Largest number of bytes that one read of a connection takes at first: what a client says is
-short, and hundreds of cameras may have a buffer each. It doubles each time that a read took so
-many, as input data may; a read that took fewer makes it small again."""
+"""Largest number of bytes that the first reads of a connection take: client's messages are short,
+and hundreds of cameras may have a buffer each. It doubles after each full read, as for input data,
+and is small again after a read that was not full."""
 
 MAX_READ_BYTES = 1 << 16
 """Largest number of bytes that one read takes in the end."""
@@ -49,7 +49,7 @@ def _peer_text(address: Any) -> str:
 
 
 class _TcpLink(ClientLink, asyncio.BufferedProtocol):
-    """A connection. All that one step causes goes out in one write (SC manual p. 40)."""
+    """A connection. All messages of one step go out in one write (SC manual p. 40)."""
 
     _transport: asyncio.Transport
 
@@ -87,19 +87,19 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self._room = memoryview(bytearray(2 * size))
         elif nbytes < size > FIRST_READ_BYTES:
             self._room = memoryview(bytearray(FIRST_READ_BYTES))
-        if self.closed:  # it says farewell
+        if self.closed:  # the last bytes before the end
             return
         with self._owner.step():
             self._take(data)
             self.heard()
 
     def eof_received(self) -> bool:
-        """Note that the client has closed its side; bytes that faults hold back are read before."""
+        """Note that the client has closed its side; bytes that faults hold back are read first."""
         self._end_waits = self._faulty is not None and self._faulty.unheard
         return self._end_waits
 
     def heard(self) -> None:
-        self.flush()  # also what was said before a Disconnect in the same bytes
+        self.flush()  # also answers before a Disconnect in the same bytes
         if self.machine.state is State.FAILED:
             self.close("a broken frame came")
         elif self._end_waits and (self._faulty is None or not self._faulty.unheard):
@@ -145,7 +145,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._leave()
         _log.info("= %s: connection closed: %s", self.peer, why)
         self._owner.lost(self)
-        # a socket that is closed with unread bytes sends a reset, so it stays until the client
+        # closing a socket with unread bytes sends a reset, so it stays open until the client
         # has closed its side, too
         with contextlib.suppress(OSError):
             self._transport.write_eof()
@@ -198,7 +198,7 @@ class Listener(ABC):
         """Close the port and every link, at once."""
 
     async def wait_closed(self) -> None:
-        """Wait until the event loop has let go of all sockets."""
+        """Wait until the event loop has released all sockets."""
         # transports that were aborted call connection_lost in the loop's next round
         for _ in range(2):
             await asyncio.sleep(0)
@@ -212,7 +212,7 @@ class TcpListener(Listener):
     def __init__(self, owner: LinkOwner) -> None:
         super().__init__(owner)
         self.down: bool = True
-        """True while the camera is down: connections that are still accepted are closed."""
+        """True while the camera is down: accepted connections are closed at once."""
         self._acceptor: Acceptor[ClientLink] = Acceptor(
             lambda: _TcpLink(self, self._owner),
             self.places,
@@ -227,23 +227,23 @@ class TcpListener(Listener):
         self._acceptor.open(sock)
 
     def shut(self) -> None:
-        """Close the port and every link, at once; the socket is its owner's to close."""
+        """Close the port and every link, at once; the owner closes the socket."""
         self.down = True
         self.close_port()
         for link in self.all_links:
             link.close("the camera is down")
 
     def close_port(self) -> None:
-        """Close the port, at once; the socket is its owner's to close."""
+        """Close the port, at once; the owner closes the socket."""
         self._acceptor.close()
 
     async def wait_closed(self) -> None:
-        """Wait until the event loop has let go of all sockets."""
+        """Wait until the event loop has released all sockets."""
         await self._acceptor.wait_closed()
         await super().wait_closed()
 
     def enter(self, link: _TcpLink) -> str:
-        """Take a new connection; return "", or why there is no room for it."""
+        """Accept a new connection; return "", or why there is no room for it."""
         self.places.most = self._owner.max_links
         return self._acceptor.enter(link, link.address)
 
@@ -252,7 +252,7 @@ class TcpListener(Listener):
         self._acceptor.leave(link)
 
     def unseated(self, link: _TcpLink) -> None:
-        """Note that a client has given its session back; it is the last to be closed for room."""
+        """Note that a client has ended its session; it is the last to be closed for room."""
         self._acceptor.move_back(link)
         self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
 
@@ -291,7 +291,7 @@ class _UdpLink(ClientLink):
             self._faulty.heal()
 
     def shut_off(self) -> None:
-        """Shut the port for a time: whatever is said is lost."""
+        """Close the port for a time: messages are lost."""
         faulty = self._enter_faulty()
         faulty.muted = faulty.muted or REFUSED
 
@@ -330,7 +330,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             link.let_in()
 
     def close_port(self) -> None:
-        """Close the port, at once; what is said meanwhile is lost."""
+        """Close the port, at once; messages are lost meanwhile."""
         for link in self.links.values():
             link.shut_off()
         self._close_socket()
@@ -353,14 +353,14 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """Pass a datagram to its address' link; of too many links drop the longest silent one."""
         if self._transport is None:
-            return  # the port is shut, the loop had this one already
+            return  # the port is shut; this datagram was read before
         now = asyncio.get_running_loop().time()
         link = self.links.get(addr)
         if link is None:
             link = _UdpLink(self, self._owner, addr)
             self.places.most = self._owner.max_links
             if self.places.enter(link, str(addr[0]), now):
-                return  # everybody has a session
+                return  # every link has a session
             self.links[addr] = link
         else:
             self.places.move_back(link, now)
@@ -373,7 +373,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             self.places.leave(link)
 
     def error_received(self, exc: Exception) -> None:
-        """Log that a peer is gone; the camera does not notice."""
+        """Log that a peer is gone; the camera itself does not notice."""
         _log.debug("! datagram not delivered: %s", exc)
 
     def send(self, frame: bytes, address: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Find the emulated cameras of a protocol; a plug-in's protocol brings its own."""
+"""Find the class of a protocol's emulated cameras; a plug-in's protocol has its own."""
 
 from __future__ import annotations
 

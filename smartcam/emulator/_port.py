@@ -21,7 +21,7 @@ _RETRY = 0.2  # seconds between tries to get the port back
 
 @dataclass(eq=False)
 class Port:
-    """A port with a listener behind it."""
+    """A port and its listener."""
 
     _listener: Listener
     _host: str
@@ -32,15 +32,15 @@ class Port:
         self._address: tuple[int, Any] = (socket.AF_INET, (self._host, self.number))
         self._socket: socket.socket | None = None
         self._opening: asyncio.Task[None] | None = None
-        self._handing_over = False  # the loop may be about to watch the socket
+        self._handing_over = False  # True while the loop takes the socket over
 
     async def open(self) -> None:
         """Open the port for the first time.
 
         Raises:
-            OSError, ValueError, OverflowError: the port cannot be had.
+            OSError, ValueError, OverflowError: the port is not available.
 
-        Cancellation: leaves it closed.
+        Cancellation: leaves the port closed.
         """
         try:
             self._address = await self._resolve()
@@ -52,11 +52,11 @@ class Port:
             raise
 
     def reopen(self) -> None:
-        """Open the port again: now if possible, else as soon as it can be had."""
+        """Open the port again: now if possible, else as soon as it is free."""
         try:
             self._socket = self._bind()
         except OSError:
-            self._socket = None  # another program took it, or the loop has not let go of it yet
+            self._socket = None  # another program or the loop still has it
         self._opening = asyncio.get_running_loop().create_task(
             self._reopen(self._opening), name=f"smartcam.emulator[{self._name}].reopen"
         )
@@ -74,7 +74,7 @@ class Port:
         self._close_socket()
 
     async def wait_closed(self) -> None:
-        """Wait until nothing of it is left; it must be shut."""
+        """Wait until the port and its connections are closed; call :meth:`shut` first."""
         opening, self._opening = self._opening, None
         if opening is not None:
             await asyncio.wait({opening})
@@ -102,7 +102,7 @@ class Port:
         return sock
 
     async def _reopen(self, before: asyncio.Task[None] | None) -> None:
-        if before is not None:  # it was cancelled and has to let go of its socket first
+        if before is not None:  # it was cancelled, and has to release its socket
             await asyncio.wait({before})
         while True:
             try:
@@ -132,4 +132,4 @@ class Port:
         if self._handing_over and self._opening is not None:
             self._opening.add_done_callback(lambda _: sock.close())
         else:
-            sock.close()  # serves nothing yet, or is closed already
+            sock.close()  # not served yet, or closed already

@@ -2,7 +2,7 @@
 
 The pieces have ground-truth poses in metres. The camera turns them into pixels by a similarity
 transformation (scale, rotation, offset) and adds noise; its own calibration is the exact inverse of
-that transformation, so what it reports in metres differs from the truth by the noise only.
+that transformation, so its poses in metres differ from the truth only by the noise.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ PIECES: Mapping[str, TablePose] = {
     "square": TablePose(0.240, 0.065, 0.55),
     "parallelogram": TablePose(0.235, 0.185, -1.35),
 }
-"""The pieces and where they lie at first; no two touch, none reaches over the table's edge."""
+"""The pieces at their first poses; no two touch, none reaches over the table's edge."""
 
 _ARM = 0.02
 """Half the length of a piece, metres; pixel noise at this distance turns the piece."""
 
 
 MAX_PIXELS = 1e9
-"""Largest scale, offset and noise, in pixels; more is refused, as NaN and infinity are."""
+"""Largest scale, offset and noise, in pixels; more is refused, and so are NaN and infinity."""
 
 
 class TableScene:
@@ -62,14 +62,14 @@ class TableScene:
 
     Args:
         scale: pixels per metre. 4000 puts the table onto a sensor of 1280 x 1024 pixels.
-        offset: pixel where the table's origin is seen.
+        offset: pixel of the table's origin.
         rotation: radians, of the image against the table.
         pixel_noise: standard deviation of u and v, pixels.
         seed: seed of the noise; the same seed gives the same observations.
         y_down: v counts downwards, as in image files.
 
     Raises:
-        ConfigurationError: a scale that is not positive, or negative noise.
+        ConfigurationError: the scale is not positive, or the noise is negative.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class TableScene:
         self.seed: int = check_seed(seed, "scene")
         self.y_down: bool = check_flag(y_down, "y_down", "scene")
         self.pieces: dict[str, TablePose] = dict(PIECES)
-        """Name to ground truth; change it and the next measurement sees the change."""
+        """Ground truth by name; a change shows in the next measurement."""
         self._random = random.Random(seed)  # noqa: S311  noise, not a secret
         self._flip = -1.0 if y_down else 1.0
 
@@ -107,7 +107,7 @@ class TableScene:
         return u, v, self._flip * (pose.theta + self.rotation)
 
     def to_table(self, observation: Observation) -> TablePose:
-        """Return the place on the table that the camera's calibration gives an observation."""
+        """Return the place on the table of an observation, by the camera's calibration."""
         u = observation.u - self.offset[0]
         v = self._flip * (observation.v - self.offset[1])
         cos, sin = math.cos(self.rotation) / self.scale, math.sin(self.rotation) / self.scale
@@ -134,5 +134,5 @@ class TableScene:
 
 
 def _normal(angle: float) -> float:
-    """Return the same angle in (-pi, pi]."""
+    """Return an angle in (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2 * math.pi)

@@ -1,4 +1,4 @@
-"""Counting what happens, and waiting until it has happened so often."""
+"""Count events, and wait until an event has happened so many times."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ K = TypeVar("K")
 class Tally(Counter[K]):
     """A counter that coroutines can wait for."""
 
-    _changed: asyncio.Event | None = None  # there while somebody waits
+    _changed: asyncio.Event | None = None  # set while a coroutine waits
 
     def add(self, key: K, amount: int = 1) -> None:
-        """Count something, and wake those that wait."""
+        """Count an event, and wake the coroutines that wait."""
         self[key] += amount
         if self._changed is not None:
             self._changed.set()
@@ -25,8 +25,8 @@ class Tally(Counter[K]):
         """Wait until ``key`` was counted ``count`` times since the beginning.
 
         Raises:
-            TimeoutError: the key was not in ``timeout`` seconds of real time; the text says how
-                often.
+            TimeoutError: the count was not reached in ``timeout`` seconds of real time; the text
+                gives the count.
 
         Cancellation: safe.
         """

@@ -1,4 +1,4 @@
-"""Emulated cameras that speak in frames with a ticket: the base for those of a make."""
+"""Emulated cameras whose frames have a ticket: the common base of several makes."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ MAX_REQUEST_BYTES = 1 << 16
 
 
 class TicketedClient(LineClient):
-    """A client of an emulated camera that speaks in frames.
+    """A client of an emulated camera that uses frames.
 
-    A subclass keeps what lasts for a session in attributes of its own, see
+    A subclass keeps the values of a session in attributes of its own, see
     :attr:`TicketedCamera.client_class`.
 
     Attributes:
-        dialect: how the client is spoken to.
-        ticket: ticket of the request under way, "" if it has none.
+        dialect: dialect of the frames to the client.
+        ticket: ticket of the current request, "" if it has none.
         number: number of its session, from 1.
     """
 
@@ -45,30 +45,30 @@ class TicketedClient(LineClient):
 
     @property
     def session(self) -> Self:
-        """The client itself; of one that :meth:`keep` has returned, the client it is of."""
+        """The client itself; for a copy from :meth:`keep`, the original client."""
         return cast("Self", self._session)
 
     def speak(self, name: str) -> None:
-        """Go on in one of the protocol's dialects."""
+        """Continue in one of the protocol's dialects."""
         dialect = self._camera.protocol.dialects[name]
         assert isinstance(dialect, TicketedDialect)  # noqa: S101 - as make_codec has seen to
         self.dialect = dialect
 
     def pack(self, text: str) -> bytes:
-        """Return an answer to the request under way, with its ticket."""
+        """Return an answer to the current request, with its ticket."""
         return self.frame(text, self.ticket)
 
     def say_again(self, data: bytes) -> None:
-        """Say a frame once more, with the ticket of the request under way unless it has its own."""
+        """Send a frame again, with the ticket of the current request unless it has its own."""
         codec = self._camera.lines
         ticket = codec.answer_key(data)
         if self.ticket and ticket.isdecimal() and int(ticket) in self.dialect.tickets:
-            text = codec.said(data).removeprefix(ticket)
+            text = codec.sent_text(data).removeprefix(ticket)
             data = self.frame(text, self.ticket)
         self.say_bytes(data)
 
     def frame(self, text: str, ticket: str) -> bytes:
-        """Return a frame as this client is spoken to."""
+        """Return a frame in the client's dialect."""
         dialect = self.dialect
         content = text.encode(dialect.encoding, "replace")
         return dialect.frame(content, ticket[: dialect.width], length=dialect.digits > 0)
@@ -99,34 +99,34 @@ class TicketedCodec(LineCodec):
         """Return a new reader that cuts a client's bytes into frames."""
         return TicketedFramer(self)
 
-    def said(self, data: bytes) -> str:
+    def sent_text(self, data: bytes) -> str:
         """Return the text of a frame without its header."""
         found = self.header.match(data)
         return data[found.end() if found else 0 :].removesuffix(b"\r\n").decode(self.encoding)
 
     def request_key(self, data: bytes) -> str:
         """Return the ticket of a request."""
-        return self.content(self.said(data))[0]
+        return self.content(self.sent_text(data))[0]
 
     def text(self, data: bytes) -> str:
         """Return a request without header and ticket."""
-        return self.content(self.said(data))[1]
+        return self.content(self.sent_text(data))[1]
 
     def content(self, text: str) -> tuple[str, str]:
-        """Return the ticket, "" for none, and what follows."""
+        """Return the ticket, "" for none, and the content."""
         found = self._ticket.match(text)
         return ("", text) if found is None else (found[0], text[found.end() :])
 
 
 class TicketedFramer(LineFramer):
-    """Cuts a client's frames, whichever form they have."""
+    """Cuts a client's frames of either form."""
 
     def __init__(self, codec: TicketedCodec) -> None:
         super().__init__(codec)
         self._frames = codec
 
     def next_frame(self) -> Frame | None:
-        """Return the next frame, None if it is not whole yet; FrameError: it is too long."""
+        """Return the next frame, None if it is incomplete; FrameError: it is too long."""
         codec = self._frames
         found = codec.header.match(self._buffer)
         if found is None:
@@ -147,13 +147,13 @@ class TicketedFramer(LineFramer):
 
 
 class TicketedCamera(LineCamera):
-    """An emulated camera that hears frames, each with a ticket that its answer carries back.
+    """An emulated camera that reads frames, each with a ticket that its answer repeats.
 
-    A subclass overrides :meth:`answer`, or :meth:`hear` where an answer needs time: requests are
-    heard while earlier ones are done.
+    A subclass overrides :meth:`answer`, or :meth:`hear` if an answer needs time: further requests
+    are read meanwhile.
 
     Attributes:
-        also_hears: requests that other clients ask, beside those of the dialect.
+        also_hears: requests of other clients, beside those of the dialect.
         client_class: class of its clients.
     """
 
@@ -165,14 +165,14 @@ class TicketedCamera(LineCamera):
         """Return the frames of its protocol's first dialect.
 
         Raises:
-            ConfigurationError: the dialect has none with tickets.
+            ConfigurationError: the dialect has no tickets.
         """
         dialect = next(iter(self.protocol.dialects.values()))
         if not isinstance(dialect, TicketedDialect):
             raise ConfigurationError(
                 f"{type(self).__name__}: dialect {dialect.name} has no tickets"
             )
-        *rows, last = dialect.rows  # which may be any line
+        *rows, last = dialect.rows  # the last row may match any line
         return TicketedCodec(replace(dialect, rows=(*rows, *self.also_hears, last), split=None))
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
@@ -184,12 +184,12 @@ class TicketedCamera(LineCamera):
     def tell(
         self, ticket: str, content: Callable[[Any], str], to: Callable[[Any], object] = bool
     ) -> None:
-        """Say something under a ticket of the camera's own.
+        """Send a message under a ticket of the camera's own.
 
         Args:
             ticket: the ticket, which a row of the dialect has as its word.
             content: function that returns the content for a client.
-            to: function that tells whether a client gets it; default all.
+            to: function that returns whether a client gets it; default all clients do.
         """
         row = self.lines.row_of_word(ticket)
         for client in list(self._clients.values()):
@@ -199,4 +199,4 @@ class TicketedCamera(LineCamera):
     def begun(self, client: LineClient, message: HeardLine) -> None:
         """Note the ticket of a request."""
         if isinstance(client, TicketedClient) and isinstance(self.lines, TicketedCodec):
-            client.ticket = self.lines.content(self.lines.said(message.data))[0]
+            client.ticket = self.lines.content(self.lines.sent_text(message.data))[0]

@@ -1,4 +1,4 @@
-"""The emulator's log of what went over the wire, and waits for an entry to appear in it."""
+"""The emulator's log of frames on the wire, and waits for an entry to appear in it."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 
 
 MAX_ENTRIES = 10_000
-"""Largest number of entries kept; the oldest go first. A day of a fast line is not what the log is
-for."""
+"""Largest number of entries kept; the oldest are dropped first. The log is not meant for a day of a
+fast line."""
 
 MAX_BYTES = 1 << 25
-"""Largest number of bytes that the entries hold, read or not; the oldest go first. 10,000 results
-of seven parts fit; of the largest containers, 64 kB, it keeps 120."""
+"""Largest number of bytes of all entries, read or not; the oldest are dropped first. It keeps
+10,000 results of seven parts, or 120 of the largest containers, 64 kB."""
 
 MAX_IDS = 1000
-"""Message ids of which it is counted how often they came. Those of the dialect always are: more
-than these only a client makes that sends anything."""
+"""Largest number of unknown message ids that are counted; those of the dialect always are. Only a
+client that sends anything at all uses more."""
 
-_ENTRY = 400  # bytes of an entry with its message, without what is as long as the payload
-_PER_BYTE = 4  # of each byte of a payload: one in the message, three in hex
+_ENTRY = 400  # bytes of an entry with its message, without the payload
+_PER_BYTE = 4  # bytes for each of a payload: one in the message, three in hex
 
 MAX_VISITS = 1000
-"""Largest number of connections that have ended of which a record is kept; the oldest go first."""
+"""Largest number of ended connections whose record is kept; the oldest are dropped first."""
 
 
 Direction = Literal["in", "out"]
@@ -49,17 +49,17 @@ class LogEntry(NamedTuple):
         direction: ``in`` from a client, ``out`` to it.
         peer: address and port of the client.
         message_id: id of the frame, None for bytes that make no frame.
-        message: what the frame says; None for an unknown id, a body that does not fit, and bytes
+        message: the decoded message; None for an unknown id, a body that does not fit, and bytes
             that make no frame.
         hex: the frame's payload, or the first bytes that make no frame.
         error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
-        fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
-            behind them where it was lost for that reason. None if none did. The entry of a message
-            is made when it has passed, or is lost. What the camera sends is told as it meant it,
-            what it hears as it heard it.
-        wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
-            of the frame.
+        fault: kinds of the faults that acted on it, in order; followed by ``connection ended`` or
+            ``not sent`` if it was lost for that reason. None without faults. The entry of a message
+            is made when it has passed, or is lost. A message of the camera is logged as meant, a
+            message of a client as received.
+        wire: the bytes that really passed, header included, as hex; empty for nothing. None: the
+            bytes of the frame.
     """
 
     time: float
@@ -74,7 +74,7 @@ class LogEntry(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Text of a camera that speaks lines; what was heard is without its line end."""
+        """Text of a camera that uses lines; a client's line is without its end."""
         text = bytes.fromhex(self.hex).decode("latin-1")
         return text.rstrip("\r\n\0") if self.direction == "in" else text
 
@@ -96,27 +96,27 @@ class Visit(NamedTuple):
 
 
 _Traced: TypeAlias = tuple[float, str, Sender, Frame | bytes, str | None, bytes | None]
-"""Time, peer, sender, frame or bytes, faults, what passed: all that an entry is made of."""
+"""Time, peer, sender, frame or bytes, faults, and passed bytes: the parts of an entry."""
 
 _DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out"}
 
 
 class Log(Sequence[LogEntry]):
-    """The last frames in both directions, oldest first; the oldest go where it is full.
+    """The last frames in both directions, oldest first; the oldest are dropped when it is full.
 
-    Entries are made when somebody reads: until then a frame is kept as it went over the wire. What
-    counts as full does not depend on it.
+    Entries are made when they are read: until then a frame is kept as it went over the wire. The
+    bounds do not depend on that.
 
     Args:
         dialect: dialect in which frames are decoded.
-        maxlen: entries kept.
-        max_bytes: what they hold at most; the last one is kept however large it is.
+        maxlen: largest number of entries.
+        max_bytes: largest number of bytes of all entries; the last one is kept at any size.
 
     Attributes:
-        maxlen: entries kept.
-        max_bytes: what they hold at most.
-        pushed_out: entries that are gone because it was full, since the beginning or the last
-            :meth:`clear`.
+        maxlen: largest number of entries.
+        max_bytes: largest number of bytes of all entries.
+        pushed_out: number of entries dropped because the log was full, since the beginning or the
+            last :meth:`clear`.
     """
 
     def __init__(
@@ -127,10 +127,10 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # entries after those
+        self._unread: deque[LogEntry | _Traced] = deque()  # frames after those, not yet read
         self._weights: deque[int] = deque()  # sizes of both, in the same order, bytes
         self._size = 0  # sum of these, bytes
-        self._gone = 0  # entries that there have been before them
+        self._gone = 0  # number of entries removed before them
 
     def __repr__(self) -> str:
         return f"Log({list(self)!r})"
@@ -160,7 +160,7 @@ class Log(Sequence[LogEntry]):
         return self._size
 
     def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
-        """Put a frame that went over the wire as it is behind the others; as :meth:`append`."""
+        """Add a frame that passed unchanged; as :meth:`append`."""
         self._unread.append((time, peer, sender, frame, fault, None))
         weight = _ENTRY + _PER_BYTE * len(frame[1])
         if fault is not None:
@@ -171,11 +171,11 @@ class Log(Sequence[LogEntry]):
             self._push_out()
 
     def append(self, entry: LogEntry | _Traced) -> None:
-        """Put an entry, or what one is made of, behind the others."""
+        """Add an entry, or the parts of one."""
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
             weight = _ENTRY + _PER_BYTE * size + sum(len(text) for text in texts if text)
-        else:  # as it will be when it is read
+        else:  # its size once it is read
             _, _, _, what, fault, wire = entry
             size = len(what.payload if isinstance(what, Frame) else what)
             weight = _ENTRY + _PER_BYTE * size
@@ -187,7 +187,7 @@ class Log(Sequence[LogEntry]):
         self._push_out()
 
     def _push_out(self) -> None:
-        """Have the oldest entries go where it is full."""
+        """Drop the oldest entries while the log is full."""
         weights = self._weights
         while len(weights) > self.maxlen or (self._size > self.max_bytes and len(weights) > 1):
             (self._entries or self._unread).popleft()
@@ -195,18 +195,18 @@ class Log(Sequence[LogEntry]):
             self.pushed_out += 1
 
     def since(self, serial: int, limit: int | None = None) -> tuple[list[LogEntry], int]:
-        """Return the entries behind the first ``serial`` ones, and how many there have been.
+        """Return the entries after the first ``serial`` ones, and the number of all so far.
 
         ::
 
             new, count = emulator.log.since(serial)
             missed = count - serial - len(new)
 
-        Entries that are gone by then are missing in the list.
+        Entries that were dropped before the call are missing in the list.
 
         Args:
-            serial: how many are known already.
-            limit: entries that are returned at most, the oldest; default all.
+            serial: number of entries that the caller knows already.
+            limit: largest number of entries returned, the oldest first; default all.
         """
         entries = self._read()
         first = min(max(0, serial - self._gone), len(entries))
@@ -214,7 +214,7 @@ class Log(Sequence[LogEntry]):
         return list(islice(entries, first, last)), self._gone + len(entries)
 
     def popleft(self) -> LogEntry:
-        """Take the oldest entry away.
+        """Remove and return the oldest entry.
 
         Raises:
             IndexError: there is no entry.
@@ -224,7 +224,7 @@ class Log(Sequence[LogEntry]):
         return entry
 
     def clear(self) -> None:
-        """Take all away."""
+        """Remove all entries."""
         self._gone += len(self)
         self._entries.clear()
         self._unread.clear()
@@ -232,7 +232,7 @@ class Log(Sequence[LogEntry]):
         self._size = self.pushed_out = 0
 
     def _forget_oldest(self) -> None:
-        """Leave the entry out of the account that was taken away in front."""
+        """Remove the oldest entry from the account."""
         self._gone += 1
         self._size -= self._weights.popleft()
 
@@ -267,7 +267,7 @@ class TrafficLog:
 
     def __init__(self, dialect: WireCodec) -> None:
         self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)  # the last connections that have ended
-        self.entries: Log = Log(dialect)  # the last ones
+        self.entries: Log = Log(dialect)  # the last frames
         self._dialect = dialect
         self._received: Tally[int | type[Message] | None] = Tally(
             {row.message_id: 0 for row in dialect.table}
@@ -282,9 +282,9 @@ class TrafficLog:
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
-        """Keep a frame, bytes that make no frame, or why they are ignored (:class:`LogEntry`)."""
+        """Add a frame, bytes that make no frame, or the reason why they are ignored."""
         if isinstance(what, RemoteProtocolError):
-            # not kept itself: it holds on to the place where it was raised
+            # only its text: the error keeps its traceback alive
             data, error = what.data.hex(" "), str(what)
             self.entries.append(
                 LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
@@ -307,7 +307,7 @@ class TrafficLog:
             ) from exc
 
     def count(self, frame: Frame) -> None:
-        """Count a frame that the camera has heard."""
+        """Count a frame that the camera has received."""
         message_id, payload = frame
         received = self._received
         if message_id in received or len(received) < MAX_IDS:

@@ -1,7 +1,7 @@
-"""The base of emulated cameras, whatever they speak: port, links, faults, timeline, log.
+"""The base of emulated cameras of every make: port, links, faults, timeline, log.
 
-Everything that happens is a *step*: bring the device's time up, do it, deliver, set one timer for
-the device's next event.
+Every action is a *step*: advance the device's time, act, deliver, set one timer for the device's
+next event.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_LINKS = 32
-"""Largest number of clients that are looked at. The camera serves one; a few more may wait to take
-over. A newcomer always gets in: the one without a session for longest makes room."""
+"""Largest number of clients that are connected. The camera serves one; a few more may wait to take
+over. A newcomer always gets in: the client without a session for longest makes room."""
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read, or held back by faults; more end its connection."""
@@ -74,10 +74,10 @@ _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
 
 @dataclass(slots=True, eq=False)
 class _Bracket:
-    """A context that begins and ends something; inside itself it does nothing."""
+    """A context that begins and ends something; nested uses do nothing."""
 
-    _begin: Callable[[], None]  # called on the way in; where it raises there is no step
-    _end: Callable[[], None]  # called on the way out, after an error too
+    _begin: Callable[[], None]  # called on entering; if it raises there is no step
+    _end: Callable[[], None]  # called on leaving, also after an error
     _depth: int = 0
 
     def __enter__(self) -> None:
@@ -102,12 +102,12 @@ class _Bracket:
 
 
 class WireCamera(Server):
-    """An emulated camera of any make on a real port; what it says is its subclass' matter.
+    """An emulated camera of any make on a real port; a subclass implements its messages.
 
     Args:
         spoken: codec of the messages on the wire.
-        device: the camera behind the wire, whose operator's methods faults call.
-        host: address to listen on; nothing but this.
+        device: the camera itself, whose operator's methods faults call.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``.
         dialect: name of the wire dialect.
@@ -117,19 +117,19 @@ class WireCamera(Server):
         timeline: events that happen by themselves, with their times.
 
     Raises:
-        ConfigurationError: the camera cannot do what the timeline wants.
+        ConfigurationError: the camera cannot do something in the timeline.
     """
 
     max_links: int = MAX_LINKS
-    """Clients that are looked at."""
+    """Largest number of clients."""
     write_limit: int = WRITE_LIMIT
     """Bytes kept for a client that does not read, or held back by faults; more end its
     connection."""
     takes: ClassVar[frozenset[str]] = frozenset()
     """The options among ``scenario``, ``dialect``, ``transport``, ``seed``, ``web`` and ``replay``
-    that the camera takes."""
+    that the camera accepts."""
     device: Any
-    """The device behind the wire."""
+    """The camera itself, without the wire."""
     states: ClassVar[frozenset[DeviceState]] = frozenset()
     """The states that the camera can enter, for a timeline."""
 
@@ -167,7 +167,7 @@ class WireCamera(Server):
         self._listener: Listener = _LISTENERS[Transport(transport)](self)
         self._port = Port(self._listener, host, port, name)
         self._traffic = TrafficLog(spoken)
-        self._shows = False  # whether the log wants each frame, looked at once a step
+        self._shows = False  # whether each frame is logged, checked once a step
         self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
         self._stage = Stage(
             device=device,
@@ -196,36 +196,36 @@ class WireCamera(Server):
         clock: Clock | None = None,
         seed: int | None = None,
     ) -> WireCamera:
-        """Return a camera of a scenario; what is given beside it goes before it.
+        """Return a camera of a scenario; the other arguments override it.
 
         Raises:
-            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+            ConfigurationError: an argument is wrong, or not supported by such a camera.
         """
 
     @classmethod
     @abstractmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+        """Return the place of something unsupported in a scenario, and the reason; or None."""
 
     @classmethod
     def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which a program is active, and runs, from the beginning.
+        """Return the options for a camera whose program is active, and runs, from the start.
 
-        Nothing, where such a camera knows no programs.
+        Empty for cameras without programs.
         """
         return {}
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     @abstractmethod
     def url(self) -> str:
-        """Its address."""
+        """The camera's address."""
 
     @property
     @abstractmethod
     def application_ids(self) -> list[int]:
-        """Ids of the programs on it."""
+        """Ids of the camera's programs."""
 
     @property
     @abstractmethod
@@ -239,12 +239,12 @@ class WireCamera(Server):
 
     @property
     def scene(self) -> TableScene | None:
-        """The table it looks at; None for a camera without."""
+        """The table that the camera sees; None for a camera without one."""
         return None
 
     @property
     def table(self) -> TableScene | None:
-        """The table that its pages show; None if it looks at none."""
+        """The table that the camera's pages show; None without one."""
         return self.scene
 
     @property
@@ -254,11 +254,11 @@ class WireCamera(Server):
 
     @property
     def last_report(self) -> LastReport | None:
-        """The last run's report, whether anybody heard it or not; None if none is kept."""
+        """The last run's report, even if no client received it; None without one."""
         return None
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
-        """Return the application that describes a result; None if none does."""
+        """Return the application that describes a result; None without one."""
         return None
 
     def shown(self) -> dict[str, Any]:
@@ -273,7 +273,7 @@ class WireCamera(Server):
             "endian": 0,
             "next_number": None,
             "queued_inputs": None,
-            "run_ends": "ResultContainer",  # what tells a client so
+            "run_ends": "ResultContainer",  # message that reports it to a client
             "applications": [],
             "cells": {},
             "quirks": {},
@@ -282,7 +282,7 @@ class WireCamera(Server):
 
     @property
     def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
+        """The port that the camera listens on; the given one until it is started."""
         return self._port.number
 
     @property
@@ -297,7 +297,7 @@ class WireCamera(Server):
 
     @property
     def crowded_out(self) -> int:
-        """Clients without a session that were sent away because too many were connected."""
+        """Clients without a session that were closed because too many were connected."""
         return self._listener.places.crowded_out
 
     @property
@@ -312,7 +312,7 @@ class WireCamera(Server):
 
     @property
     def is_random(self) -> bool:
-        """True if chance has a part in the timeline."""
+        """True if the timeline depends on chance."""
         return any(cue.is_random for cue in self._cues)
 
     @property
@@ -340,7 +340,7 @@ class WireCamera(Server):
 
         Args:
             what: a message id, or a message type.
-            count: how many, those that came before this call included.
+            count: number of messages, including those before this call.
             timeout: seconds.
 
         Raises:
@@ -359,12 +359,12 @@ class WireCamera(Server):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open the port; does nothing if it is started already.
+        """Open the port; do nothing if the camera is started already.
 
         Raises:
             ConfigurationError: the server cannot listen there.
 
-        Cancellation: leaves it stopped.
+        Cancellation: leaves the camera stopped.
         """
         if self._started:
             return
@@ -386,7 +386,7 @@ class WireCamera(Server):
             _log.info("= %s: chance has the seed %d", self.name, self.seed)
 
     async def stop(self) -> None:
-        """Close the port and every connection; the device stands still. Does nothing if stopped.
+        """Close the port and every connection; the device stands still. Do nothing if stopped.
 
         Cancellation: everything is closed nevertheless.
         """
@@ -400,7 +400,7 @@ class WireCamera(Server):
             await self._port.wait_closed()
 
     def __del__(self) -> None:
-        # the event loop has it until it is stopped; so nobody has it when that is gone, too
+        # the event loop refers to the camera until it is stopped; so here the loop is gone, too
         if vars(self).get("_started", False):
             text = f"emulated camera at {self.url} was not stopped"
             warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
@@ -408,9 +408,9 @@ class WireCamera(Server):
     # ------------------------------------------------------------------ faults
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
-        """Add faults behind those that wait; what waits for no message happens now.
+        """Add faults after those that wait; faults that wait for no message happen now.
 
-        Call it in the event loop's thread. Before the emulator is started they wait until then.
+        Call it in the event loop's thread. Before the emulator's start they wait for it.
 
         Args:
             faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.
@@ -419,7 +419,7 @@ class WireCamera(Server):
             ConfigurationError: one of the faults is wrong, or too many would wait; none was added.
         """
         with self.step():
-            self._collect()  # what was said before is not changed
+            self._collect()  # messages from before are not changed
             self.queue.add(faults)
             if self._started:
                 self._act_at_once()
@@ -437,8 +437,8 @@ class WireCamera(Server):
     def clear_faults(self) -> None:
         """Forget the faults that wait, and end those that last.
 
-        BUSY falls, the port opens, the second client goes, connections that are half open or
-        stalled are reset. What is delayed comes at its time, and a reboot takes its time.
+        BUSY is cleared, the port opens, the second client leaves, connections that are half open or
+        stalled are reset. Delayed messages come at their time, and a reboot takes its time.
         """
         self.queue.clear()
         with self.step():
@@ -448,7 +448,7 @@ class WireCamera(Server):
                 link.heal()
 
     def _refuse(self, seconds: float) -> None:
-        """Close the port for a time; connections that are open stay."""
+        """Close the port for a time; open connections stay."""
         self._refused_until = max(self._refused_until, self.clock.now + seconds)
         if self._refusal is not None:
             self._refusal.cancel()
@@ -457,7 +457,7 @@ class WireCamera(Server):
         self._refusal = self.clock.call_at(self._refused_until, self._wake_port)
 
     def _let_second_client_in(self) -> None:
-        """Let another client connect; where several are served, nothing comes of it."""
+        """Let another client connect; it has no effect on a camera that serves several."""
 
     def _make_timeline(self) -> Timeline:
         return Timeline(
@@ -465,7 +465,7 @@ class WireCamera(Server):
         )
 
     def _entered(self, state: DeviceState) -> None:
-        """Note that the device has entered a state, after everything that it said before."""
+        """Note that the device has entered a state, after all its earlier messages."""
         self._collect()
         self._timeline.entered(state)
 
@@ -473,7 +473,7 @@ class WireCamera(Server):
         self._act(self.queue.at_once(), None)
 
     def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
-        """Let the device faults happen that come before a message; return all it brings about."""
+        """Run the device faults that come before a message; return all that it triggers."""
         if not waiting:
             return ()
         faults = self.queue.by_message(waiting, message)
@@ -481,7 +481,7 @@ class WireCamera(Server):
         return faults
 
     def _act(self, faults: Iterable[Fault], when: Literal["before", "after"] | None) -> None:
-        """Let device faults happen; what the camera says to it wakes no other device fault."""
+        """Run device faults; the camera's answers trigger no other device fault."""
         for fault in faults:
             if isinstance(fault, DeviceFault) and when in {None, fault.when}:
                 act(self._stage, fault)
@@ -495,7 +495,7 @@ class WireCamera(Server):
 
     @abstractmethod
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Take a message of a link."""
+        """Handle a message of a link."""
 
     @abstractmethod
     def serves(self, link: ClientLink) -> bool:
@@ -526,7 +526,7 @@ class WireCamera(Server):
             self._show_last()
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """Note in the log a message that passed or is lost, as faults have made it."""
+        """Log a message that passed or is lost, as faults have changed it."""
         faults = ", ".join(message.faults) or None
         self._note(link.peer, sender, message.what, faults, message.wire)
 
@@ -546,15 +546,15 @@ class WireCamera(Server):
         entry = self.log[-1]
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
         faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
-        said = entry.error or entry.message or f"message {entry.message_id}: {entry.hex}"
-        _log.debug("%s %s: %s%s", mark, entry.peer, said, faulty)
+        content = entry.error or entry.message or f"message {entry.message_id}: {entry.hex}"
+        _log.debug("%s %s: %s%s", mark, entry.peer, content, faulty)
 
     # ------------------------------------------------------------------ steps
 
     def step(self) -> AbstractContextManager[None]:
-        """Bring the device's time up, do the body, deliver what came of it, set the timer.
+        """Advance the device's time, run the body, deliver the messages, set the timer.
 
-        Inside another step it is a part of that one.
+        Inside another step it is a part of that step.
         """
         return self._step
 
@@ -573,27 +573,27 @@ class WireCamera(Server):
 
     @abstractmethod
     def _move(self) -> None:
-        """Bring the device's time up."""
+        """Advance the device's time."""
 
     @abstractmethod
     def _collect(self) -> None:
-        """Put what the device said into the next write."""
+        """Put the device's messages into the next write."""
 
     @abstractmethod
     def _settle(self) -> None:
-        """Deliver what came of a step, and set the timer."""
+        """Deliver the messages of a step, and set the timer."""
 
     def _deliver_at_once(self) -> None:
         """Send the messages that a fault made the device send; they trigger no other fault."""
 
     def _began(self) -> None:
-        """Follow the start; the first step is to come."""
+        """Called after the start, before the first step."""
 
     def _ends(self) -> None:
-        """Precede the stop; links are still there."""
+        """Called before the stop, while links are still there."""
 
     def _end_device_faults(self) -> None:
-        """End the faults of the device that last."""
+        """End the lasting faults of the device."""
 
     # ------------------------------------------------------------------ the port
 

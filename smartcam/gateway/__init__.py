@@ -1,8 +1,8 @@
-"""Lines to robots and PLCs: a controller asks for a part over TCP, and gets its pose or the reason.
+"""Serve robots and PLCs over TCP: a controller asks for a part and gets its pose, or an error.
 
 :class:`Gateway` has a camera and listens; a controller sends ``TRIGGER`` and ``NEXT``, and each
-request has one answer, within a deadline. :class:`GatewaySettings` say how an answer is written:
-each make of robot has its own form. ``smartcam gateway`` is the command.
+request has one answer, within a deadline. :class:`GatewaySettings` set the form of the answers,
+which differs between makes of robots. ``smartcam gateway`` is the command.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The account of a gateway: what became of each request and of each part."""
+"""The account of a gateway: the outcomes of requests and parts."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ class GatewayAccount:
     ``parts == delivered + forgotten + waiting``, at any time.
 
     Attributes:
-        robots: connections that were taken.
-        refused: connections that were refused, since as many as may be were open.
+        robots: connections that were accepted.
+        refused: connections that were refused, because too many were open.
         requests: requests that came.
-        answered: requests that were answered with a part, or with what was asked.
+        answered: requests that were answered with a part, or with the state or reason asked for.
         errors: requests that were answered with an error.
-        abandoned: requests whose robot was gone before the answer.
-        open: requests under way.
+        abandoned: requests whose robot had disconnected before the answer.
+        open: requests that are not answered yet.
         parts: parts in all results that robots' requests brought.
         delivered: parts that were sent to a robot.
-        forgotten: parts that nobody asked for before a newer result came, the robot left, or they
+        forgotten: parts that no robot asked for before a newer result came, the robot left, or they
             became too old.
-        waiting: parts that may be asked for.
+        waiting: parts that a robot may still ask for.
     """
 
     robots: int = 0

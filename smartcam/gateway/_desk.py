@@ -1,4 +1,4 @@
-"""One robot at a gateway: what it asks, what is done for it, which parts it may still have."""
+"""One robot at a gateway: its requests, their answers, and the parts that it may still get."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from smartcam.models import Result
 
 GRACE: Final = 0.2
-"""Seconds beyond the deadline after which a call that has not ended by itself is ended."""
+"""Seconds after the deadline after which a call that has not ended by itself is cancelled."""
 
 ASKING_FOR_PARTS = ("TRIGGER", "NEXT", "WAIT")
 """Words of requests for a part."""
@@ -58,7 +58,7 @@ CODES: tuple[tuple[type[BaseException], AnswerCode], ...] = (
     (ConfigurationError, AnswerCode.REFUSED),
     (SmartCamError, AnswerCode.FAULT),
 )
-"""The code of an error; the first that matches."""
+"""The code of an error; the first class that matches counts."""
 
 
 class SharedDesk:
@@ -67,11 +67,11 @@ class SharedDesk:
     Args:
         camera: the camera.
         settings: deadlines and ages.
-        account: where parts are counted.
+        account: account that counts the parts.
 
     Attributes:
-        camera: the camera, which may be exchanged for one that is opened anew.
-        turn: lock of whoever triggers.
+        camera: the camera; another object may replace it.
+        turn: lock of the robot that triggers.
     """
 
     def __init__(
@@ -88,20 +88,20 @@ class Desk:
     """The requests of one robot, one after the other.
 
     Args:
-        shared: what it shares with other robots.
+        shared: the parts that it shares with other robots.
     """
 
     def __init__(self, shared: SharedDesk) -> None:
         self._shared = shared
         self._rows: list[Row] | None = None  # rows of the last result; None without one
-        self._until = 0.0  # the loop time up to which they may be asked for
+        self._until = 0.0  # loop time until which the rows may be asked for
         self._last = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._given = False  # the answer under way takes the first row with it
+        self._given = False  # the answer being written has the first row
 
     # ------------------------------------------------------------------ a request
 
     async def answer(self, request: RobotRequest, deadline: float) -> RobotAnswer:
-        """Return the answer to a request, at the deadline at the latest, and :data:`GRACE`."""
+        """Return the answer to a request, no later than :data:`GRACE` after the deadline."""
         try:
             async with asyncio.timeout_at(deadline + GRACE):
                 answer = await self._answer(request, deadline)
@@ -168,7 +168,7 @@ class Desk:
         return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
 
     def sent(self) -> None:
-        """Take the part of the last answer as delivered; called when it was written."""
+        """Count the part of the last answer as delivered; called when it was written."""
         if self._given and self._rows:
             del self._rows[0]
             self._shared.account.waiting -= 1
@@ -176,26 +176,26 @@ class Desk:
         self._given = False
 
     def failed(self, words: str) -> RobotAnswer:
-        """Return the answer in place of one that cannot be written; the result is forgotten."""
+        """Return the answer that replaces one that cannot be written; the result is forgotten."""
         self.forget()
         self._last = RobotAnswer(AnswerCode.UNREADABLE, words=words)
         return self._last
 
     def forget(self) -> None:
-        """Forget the last result: a newer one is asked for, or the robot is gone."""
+        """Forget the last result: a newer one is asked for, or the robot has disconnected."""
         rows, self._rows, self._given = self._rows or [], None, False
         self._shared.account.waiting -= len(rows)
         self._shared.account.forgotten += len(rows)
 
 
 def _left(deadline: float) -> float:
-    """Return the seconds until a deadline, a millisecond at least."""
+    """Return the seconds until a deadline, at least a millisecond."""
     return max(0.001, deadline - asyncio.get_running_loop().time())
 
 
 @contextlib.asynccontextmanager
 async def _turn(lock: asyncio.Lock, deadline: float) -> AsyncIterator[None]:
-    """Hold the lock as long as the block runs; raise CameraBusyError if it is not free in time."""
+    """Hold the lock while the block runs; raise CameraBusyError if it is not free in time."""
     try:
         async with asyncio.timeout_at(deadline):
             await lock.acquire()

@@ -1,4 +1,4 @@
-"""The gateway: a camera, a port, and the robots that ask."""
+"""The gateway: a camera, a port, and the robots that connect."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Gateway(Server):
             async with Gateway(camera, GatewaySettings(robot="ur")) as gateway:
                 print(gateway.address)
 
-    Nobody is asked for a password: whoever reaches the port may trigger.
+    No password is asked for: any program that reaches the port may trigger.
 
     Args:
-        camera: the camera; whoever made it opens and closes it. While it has no session, requests
-            are answered with the reason.
+        camera: the camera; the caller opens and closes it. While it has no session, requests are
+            answered with the reason.
         settings: address to listen on, and form of the answers.
 
     Raises:
@@ -75,7 +75,7 @@ class Gateway(Server):
 
     @property
     def camera(self) -> Camera:
-        """The camera; one that could not be opened may be replaced by another object."""
+        """The camera; another object may replace it if it could not be opened."""
         return self._shared.camera
 
     @camera.setter
@@ -83,12 +83,12 @@ class Gateway(Server):
         self._shared.camera = camera
 
     async def start(self) -> None:
-        """Open the port; does nothing if it is open.
+        """Open the port; do nothing if it is open.
 
         Raises:
             ConfigurationError: the gateway cannot listen there.
 
-        Cancellation: leaves it closed.
+        Cancellation: leaves the port closed.
         """
         if self._socket is not None:
             return
@@ -103,7 +103,7 @@ class Gateway(Server):
         self._acceptor.open(self._socket)
 
     async def stop(self) -> None:
-        """Close the port and all connections; what is under way ends without an answer."""
+        """Close the port and all connections; open requests get no answer."""
         listener, self._socket = self._socket, None
         if listener is None:
             return

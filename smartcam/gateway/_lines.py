@@ -1,4 +1,4 @@
-"""Take a robot's requests apart, and put the gateway's answers together."""
+"""Parse a robot's requests, and format the gateway's answers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BLANKS = b" \t\r\n\0"
 
 
 class AnswerCode(enum.IntEnum):
-    """The code with which an answer begins; 0 and 1 are none of the errors."""
+    """The code with which an answer begins; 0 and 1 are no errors."""
 
     PART = 0
     NONE = 1
@@ -54,7 +54,7 @@ class AnswerCode(enum.IntEnum):
 
     @property
     def is_error(self) -> bool:
-        """True if the request was not done."""
+        """True if the request failed."""
         return self > AnswerCode.NONE
 
 
@@ -91,23 +91,23 @@ class RobotAnswer(NamedTuple):
 
 
 class NotWritableError(ValueError):
-    """A part that an answer has no room for, or that is no number for a controller."""
+    """An answer has no room for a part, or a controller cannot read one of its numbers."""
 
 
 def _behind_blanks(data: bytes, at: int) -> int:
-    """Return the place of the first byte from a place on that is no blank and ends no line."""
+    """Return the place of the first byte, from a place on, that is no blank or line end."""
     found = _BLANK_RUN.match(data, at)
     return found.end() if found else at
 
 
 class RequestReader:
-    """Cuts what comes of a connection into requests.
+    """Cuts the bytes of a connection into requests.
 
     A line ends with CR, LF or both; blanks and zeros around it do not count, since some controllers
-    send arrays of a fixed length. XML ends with the closing tag of what it began with.
+    send arrays of a fixed length. XML ends with the closing tag of its first element.
 
     Args:
-        form: form of the lines, as a :class:`Style` names it.
+        form: form of the lines, as :attr:`Style.form`.
     """
 
     def __init__(self, form: str) -> None:
@@ -115,7 +115,7 @@ class RequestReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[RobotRequest]:
-        """Return the requests that are whole now.
+        """Add received bytes; return the requests that are complete now.
 
         Raises:
             NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
@@ -133,9 +133,9 @@ class RequestReader:
         return found
 
     def _end(self, data: bytes, at: int) -> int:
-        """Return the place behind the request that begins at ``at``; 0 if it is not whole."""
+        """Return the place after the request that begins at ``at``; 0 if it is incomplete."""
         begin = _XML_BEGIN.match(data, at) if self._xml else None
-        if begin is None:  # a line; of whatever kind instead of XML, it is one request
+        if begin is None:  # a line; also instead of XML, a line is one request
             mark = _LINE_END.search(data, at)
             return mark.end() if mark else 0
         closing = b"</" + begin[1] + b">"
@@ -163,7 +163,7 @@ class RequestReader:
 
 
 class AnswerWriter:
-    """Writes answers as a robot takes them.
+    """Writes answers in a robot's form.
 
     Args:
         style: the form, units and bounds.
@@ -210,7 +210,7 @@ class AnswerWriter:
 
     def _brackets(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
         if answer.words and not answer.code.is_error:
-            return plain(answer.words)[: self._style.longest]  # what WHY asked for
+            return plain(answer.words)[: self._style.longest]  # the reason that WHY asked for
         filled = values + ["0"] * (len(self.names) - len(values))
         head = [str(one) for one in (tag, int(answer.code), answer.left) if one is not None]
         if len(head) + len(filled) > MAX_BRACKETED_NUMBERS:
@@ -220,7 +220,7 @@ class AnswerWriter:
         return f"({','.join([*head, *filled])})"
 
     def _xml(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
-        # every element each time: EthernetKRL has a queue for each, which would get out of step
+        # all elements each time: EthernetKRL has a queue for each, which would get out of step
         filled = values + ["0"] * (len(self.names) - len(values))
         part = " ".join(
             f"{name.upper()}={quoteattr(value)}"

@@ -1,4 +1,4 @@
-"""A robot's connection: its requests are answered one by one, and it leaves nothing behind."""
+"""A robot's connection, whose requests are answered one by one."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from smartcam.gateway._lines import AnswerWriter, RobotRequest
 
 MAX_WAITING_REQUESTS: Final = 8
-"""RequestReader with a number that may wait while another one is under way."""
+"""Largest number of requests with a number that wait while another one is being answered."""
 
 MAX_UNSENT_BYTES: Final = 1 << 16
 """Largest number of bytes that a robot which reads nothing may leave unsent."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
-"""Seconds without a byte until the system asks whether the robot is there, and how often."""
+"""Seconds without a byte until the system checks the connection, and the repetitions."""
 
 _log = logging.getLogger("smartcam.gateway")
 
@@ -33,13 +33,13 @@ class RobotLink(asyncio.Protocol):
     """One connection.
 
     Args:
-        shared: what robots share, the camera among it.
-        writer: how answers are written.
-        acceptor: gives it a place.
+        shared: the camera and other objects that all robots share.
+        writer: writer of answers.
+        acceptor: acceptor that gives the connection its place.
 
     Attributes:
-        settled: whether the robot has asked for a part: then it keeps its place, which one that
-            said nothing, or anything else, has to leave for a newcomer.
+        settled: whether the robot has asked for a part: then it keeps its place. A robot that has
+            not asked makes room for a newcomer.
     """
 
     _transport: asyncio.Transport
@@ -61,7 +61,7 @@ class RobotLink(asyncio.Protocol):
     # ------------------------------------------------------------------ from the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take a place, or say that there is none."""
+        """Take a place, or report that there is none."""
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
@@ -79,7 +79,7 @@ class RobotLink(asyncio.Protocol):
         self._set_idle()
 
     def data_received(self, data: bytes) -> None:
-        """Take requests."""
+        """Read requests."""
         if self._closed:
             return
         self._set_idle()
@@ -94,7 +94,7 @@ class RobotLink(asyncio.Protocol):
                 self._take(request)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End what is under way; parts that nobody asked for are forgotten."""
+        """End the open requests; parts that no robot asked for are forgotten."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
     def turn_away(self, why: str) -> None:
@@ -112,7 +112,7 @@ class RobotLink(asyncio.Protocol):
             self._account.open += 1
             self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
         elif request.tag is None:
-            # it has given up waiting, and would take the answer under way for that to this one
+            # the robot has given up waiting, and would take the earlier answer for this request's
             self._account.abandoned += 1
             self._close("a request without a number came before the answer to the one before")
         elif len(self._waiting) >= MAX_WAITING_REQUESTS:
@@ -124,7 +124,7 @@ class RobotLink(asyncio.Protocol):
             self._waiting.append((request, deadline))
 
     async def _serve(self, request: RobotRequest, deadline: float) -> None:
-        """Answer a request, and those that came meanwhile."""
+        """Answer a request, and the requests that came meanwhile."""
         while True:
             answer = await self._desk.answer(request, deadline)
             self._account.open -= 1
@@ -141,7 +141,7 @@ class RobotLink(asyncio.Protocol):
         self._task = None
 
     def _write(self, answer: RobotAnswer, tag: int | None) -> bool:
-        """Write an answer, or why it cannot be written; return whether that is an error."""
+        """Write an answer, or an error if that is impossible; return whether it is an error."""
         try:
             data = self._writer.write(answer, tag)
         except NotWritableError as exc:
@@ -156,7 +156,7 @@ class RobotLink(asyncio.Protocol):
     def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            self._account.abandoned += 1  # its answer would be taken for that to another one
+            self._account.abandoned += 1  # the robot would take another request's answer for its
             return
         self._account.errors += 1
         self._write(answer, tag)
@@ -201,7 +201,7 @@ class RobotLink(asyncio.Protocol):
 
 
 def _keep_alive(sock: socket.socket | None) -> None:
-    """Have the system find out that a robot is gone which was switched off."""
+    """Make the system detect a robot that was switched off."""
     if sock is None:
         return
     with contextlib.suppress(OSError):

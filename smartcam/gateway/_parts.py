@@ -27,8 +27,8 @@ class Parts:
     """Makes rows of values: poses in a robot's convention, records in its units.
 
     Args:
-        settings: the convention, the units, and what stands behind a pose.
-        spec: what ``interpret_as`` is of the camera: its layout says which values are lengths.
+        settings: the convention, the units, and the values that follow a pose.
+        spec: ``interpret_as`` of the camera: its layout shows which values are lengths.
     """
 
     def __init__(self, settings: GatewaySettings, spec: object) -> None:
@@ -40,7 +40,7 @@ class Parts:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the values of a part; those of a record where the layout is known."""
+        """Names of the values of a part; for records, their fields' if the layout is known."""
         layout = next(iter(self._layouts.values()), None)
         if layout is None or {"x", "y"} <= {field.name for field in layout.fields}:
             return (*self._convention.numbers, *self._settings.also)
@@ -80,7 +80,7 @@ class Parts:
     def _pose(self, part: Localization) -> Row:
         x, y, z, w = part.pose.orientation
         if self._settings.tool_flip:
-            x, y, z, w = w, z, -y, -x  # times (1, 0, 0, 0): half a turn about x
+            x, y, z, w = w, z, -y, -x  # multiplied by (1, 0, 0, 0): half a turn about x
         pose = Transform(
             "robot",
             "part",
@@ -109,7 +109,7 @@ class Parts:
 
 
 def _layouts(spec: object) -> dict[int | None, Layout]:
-    """Return the layouts of what ``interpret_as`` says, by application; None: of any."""
+    """Return the layouts in ``interpret_as``, by application; None: for any application."""
     if spec is None:
         return {}
     one = spec if isinstance(spec, Mapping) else {None: spec}
@@ -122,7 +122,7 @@ def _layouts(spec: object) -> dict[int | None, Layout]:
 
 
 def _records_of(table: Any) -> object:
-    """Return the rows of a table of numpy's as mappings; anything else as it is."""
+    """Return the rows of a numpy table as mappings; anything else as it is."""
     names = getattr(table.dtype, "names", None)
     if not names:
         return cast("object", table)

@@ -1,4 +1,4 @@
-"""Settings of a gateway: by name of a make, option by option, or in YAML."""
+"""Settings of a gateway: by name of a make, as single options, or from YAML."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ DEFAULT_TIMEOUT = 5.0
 """Seconds within which a request is answered."""
 
 MAX_SECONDS = 86_400.0
-"""Seconds that a deadline, an age or a pause may be set to."""
+"""Largest number of seconds of a deadline, an age or a pause."""
 
 MAX_CLIENTS = 100
-"""Robots that may be allowed at a time."""
+"""Largest number of robots that may be connected at a time."""
 
 _LISTEN = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 
@@ -35,7 +35,7 @@ Also = Literal["quality", "photo_index", "feature_id"]
 
 
 class Style(NamedTuple):
-    """The style of answers, with nothing left open.
+    """The style of answers, with every option set.
 
     Attributes:
         form: form of an answer: ``text``, ``brackets`` or ``xml``.
@@ -45,8 +45,8 @@ class Style(NamedTuple):
         decimals: digits after the decimal point.
         separator: text between two values.
         line_end: text after an answer.
-        width: bytes that each answer has, filled with blanks; 0: as many as it needs.
-        longest: bytes that an answer may have; words are cut, numbers never.
+        width: bytes of each answer, filled with blanks; 0: as many as it needs.
+        longest: largest number of bytes of an answer; words are cut, numbers never.
     """
 
     form: str = "text"
@@ -67,7 +67,7 @@ STYLES: Mapping[str, Style] = {
     "fanuc": Style(pose="fanuc", line_end="\r", longest=120),
     "siemens": Style(width=96, longest=96),
 }
-"""Styles that each make of controller takes; the page on robots has the source of each."""
+"""Styles that each make of controller reads; the page on robots has the source of each."""
 
 
 def _listen(text: str) -> str:
@@ -89,7 +89,7 @@ Seconds = Annotated[float, Field(gt=0, le=MAX_SECONDS, allow_inf_nan=False)]
 
 
 class GatewaySettings(BaseModel):
-    """The settings of a gateway; options without a value are as the robot's make takes them."""
+    """The settings of a gateway; options without a value are those of the robot's make."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
 
@@ -98,7 +98,7 @@ class GatewaySettings(BaseModel):
         description="address that robots connect to, tcp/HOST:PORT; port 0 takes a free one",
     )
     robot: Literal["plain", "ur", "kuka", "fanuc", "siemens"] = Field(
-        default="plain", description="the make of the controller, which says what is not said below"
+        default="plain", description="make of the controller, with defaults of other options"
     )
     form: Literal["text", "brackets", "xml"] | None = Field(
         default=None,
@@ -106,18 +106,18 @@ class GatewaySettings(BaseModel):
         "socket_read_ascii_float; xml: for EthernetKRL",
     )
     pose: Literal["ur", "abb", "kuka", "fanuc", "meca500"] | None = Field(
-        default=None, description="convention of poses: which numbers say how a part is turned"
+        default=None, description="convention of poses: the numbers for a part's orientation"
     )
     length: Literal["m", "mm"] | None = Field(default=None, description="unit of lengths")
     angle: Literal["rad", "deg"] | None = Field(default=None, description="unit of angles")
     decimals: Annotated[int, Field(ge=0, le=9)] | None = Field(
-        default=None, description="digits behind the decimal point"
+        default=None, description="digits after the decimal point"
     )
     separator: Annotated[str, AfterValidator(_separator)] | None = Field(
-        default=None, description="between two values of a text"
+        default=None, description="text between two values"
     )
     line_end: Literal["lf", "crlf", "cr", "none"] | None = Field(
-        default=None, description="behind each answer; a request may end with any of them"
+        default=None, description="end of each answer; a request may end with any of them"
     )
     width: Annotated[int, Field(ge=0, le=1000)] | None = Field(
         default=None, description="bytes of each answer, filled with blanks; 0: as many as it needs"
@@ -147,19 +147,19 @@ class GatewaySettings(BaseModel):
 
     @property
     def style(self) -> Style:
-        """Style of the answers, which is the make's but for the options that are given."""
+        """Style of the answers: the make's, changed by the given options."""
         names = ("form", "pose", "length", "angle", "decimals", "separator", "width")
-        said = {name: value for name in names if (value := getattr(self, name)) is not None}
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.pose is not None:
             metre = ROBOTS[self.pose].metre
             own = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
             own["angle"] = "rad" if self.pose == "ur" else "deg"
-            said = {**own, **said}
+            given = {**own, **given}
         if self.line_end is not None:
-            said["line_end"] = LINE_ENDS[self.line_end]
+            given["line_end"] = LINE_ENDS[self.line_end]
         if self.width:
-            said["longest"] = self.width
-        return STYLES[self.robot]._replace(**said)
+            given["longest"] = self.width
+        return STYLES[self.robot]._replace(**given)
 
     @model_validator(mode="after")
     def _can_be_read(self) -> Self:
@@ -196,8 +196,8 @@ class GatewayFile(GatewaySettings):
         """Read a file.
 
         Raises:
-            ConfigurationError: the file cannot be read, or a field is wrong; told with line and
-                field.
+            ConfigurationError: the file cannot be read, or a field is wrong; the error gives line
+                and field.
             MissingExtraError: the extra ``yaml`` is not installed.
         """
         file = read_model(path, "gateway", cls, "listen", _mistake)

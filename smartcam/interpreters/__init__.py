@@ -1,4 +1,4 @@
-"""Interpreters: what a result container's bytes mean. Pure; no clock, no socket.
+"""Interpreters of the bytes of result containers. Pure; no clock, no socket.
 
 ``localizations``, ``strings50``, ``record``, ``table`` and ``raw`` come with smartcam, others as
 entry points of the group ``smartcam.interpreters``.

@@ -1,9 +1,9 @@
 """The base of interpreters: a result container's bytes in, a value out.
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
-over a :class:`Reader`; one that takes a layout is a subclass of :class:`Interpreter`.
-:func:`resolve` turns what the user wrote into one; the functions whose names begin with ``run`` are
-the only places that call it.
+over a :class:`Reader`; an interpreter with a layout is a subclass of :class:`Interpreter`.
+:func:`resolve` turns the user's ``interpret_as`` into an interpreter; only the functions whose
+names begin with ``run`` call it.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(slots=True)
 class Context:
-    """The facts that an interpreter may know about a container beside its bytes.
+    """The facts about a container, beside its bytes, that an interpreter may use.
 
     Attributes:
         camera: name of the camera.
         application: id of the application that made it.
         number: the client's own count of containers.
         received_at: when its last byte arrived, UTC.
-        byte_order: order of the bytes of a number, as the camera's status says.
+        byte_order: order of the bytes of a number, from the camera's status.
         y_down: whether the camera's y axis points down; poses are turned to y up.
         lenient: take any byte but zero for a true bool.
-        empty_slots: records of zeros that were skipped; the interpreter counts here.
+        empty_slots: number of records of zeros that were skipped; the interpreter counts them.
     """
 
     camera: str = ""
@@ -74,12 +74,11 @@ class Reader:
 
     Args:
         data: the container's bytes after the application id.
-        context: what else is known about it.
-        layout: the layout the user gave, None without one.
+        context: other facts about the container.
+        layout: the user's layout, None without one.
 
     All offsets are bytes from the start of ``data``. Every method raises
-    :class:`~smartcam.InterpretationError` with offset, expected and got where the bytes asked for
-    are not all there.
+    :class:`~smartcam.InterpretationError` with offset, expected and got if bytes are missing.
     """
 
     __slots__ = ("context", "data", "layout")
@@ -98,7 +97,7 @@ class Reader:
         return len(self.data)
 
     def get_bool(self, first_byte: int) -> bool:
-        """Return a bool: 0xFF is true, 0x00 false, another byte an error unless lenient."""
+        """Return a bool: 0xFF is true, 0x00 false; other bytes are errors unless ``lenient``."""
         raw = self._take(first_byte, 1, "a bool")[0]
         if raw not in (0x00, 0xFF) and not self.context.lenient:
             raise InterpretationError(
@@ -171,7 +170,7 @@ class Reader:
         """Return the offsets of records of ``size`` bytes, which fill the container.
 
         Raises:
-            InterpretationError: bytes are left behind the last whole record.
+            InterpretationError: bytes are left after the last whole record.
         """
         if size < 1:
             raise ValueError(f"expected a record of at least 1 byte, got {size}")
@@ -212,15 +211,14 @@ class Interpreter(ABC):
         layout: layout of the container's fields; default :attr:`default_layout`.
 
     Raises:
-        ConfigurationError: a layout that this interpreter does not take, or none where it needs
-            one.
+        ConfigurationError: the interpreter does not take the layout, or needs one.
     """
 
     default_layout: ClassVar[str | None] = None
-    """Text of the layout that is used where the user gives no layout."""
+    """Text of the layout that is used if the user gives no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
-    """Use of a layout: none, one that may be given, or one that must be given."""
+    """Use of a layout: it must not, may or must be given."""
 
     def __init__(self, layout: Layout | None = None) -> None:
         name = type(self).__name__.removesuffix("Interpreter").lower()
@@ -231,7 +229,7 @@ class Interpreter(ABC):
         if layout is None and self.layout_use == "required":
             raise ConfigurationError(
                 f"interpreter {name}: expected a layout, got none; "
-                f'write one behind the name, as in "{name}: x: real32 mm, y: real32 mm"'
+                f'write one after the name, as in "{name}: x: real32 mm, y: real32 mm"'
             )
         self.layout: Layout | None = layout
 
@@ -255,9 +253,9 @@ class Interpreter(ABC):
 
 
 class PlainInterpreter(Interpreter):
-    """An interpreter that takes the bytes by itself and keeps neither them nor the context.
+    """An interpreter that reads bytes without a :class:`Reader` and keeps no context.
 
-    The client makes no :class:`Reader` for it, and uses one context for all containers.
+    The client uses one context for all containers.
     """
 
     def __init_subclass__(cls) -> None:
@@ -280,8 +278,7 @@ class PlainInterpreter(Interpreter):
     def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
         """Return the values of several containers that came together; as :meth:`read` for each.
 
-        It is there to be overridden where that is quicker. Where it raises they are read again,
-        one by one.
+        Override it for a quicker way. If it raises, the containers are read again, one by one.
         """
         values: list[object] = []
         for data in containers:
@@ -298,13 +295,13 @@ Function: TypeAlias = Callable[[Reader], object]
 """The shortest interpreter: a function of a reader; ``reader.layout`` is the user's layout."""
 
 Spec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | type[Any] | Function | None
-"""Values that ``interpret_as`` takes for one application."""
+"""Values of ``interpret_as`` for one application."""
 
 AnySpec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | Mapping[int, Any] | None
-"""The kinds of ``interpret_as`` of which a type checker cannot know the type of the values."""
+"""Values of ``interpret_as`` that do not show a type checker the type of a result's value."""
 
 TypedSpec: TypeAlias = Callable[[Reader], T] | type[T]
-"""The kinds of ``interpret_as`` that name the type of their values."""
+"""Values of ``interpret_as`` that show the type of a result's value."""
 
 
 class _FunctionInterpreter(Interpreter):
@@ -323,7 +320,7 @@ class _FunctionInterpreter(Interpreter):
 
 
 class _ClassInterpreter(PlainInterpreter):
-    """Gives objects of a class that says a layout."""
+    """Returns objects of a class that declares a layout."""
 
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
@@ -343,8 +340,8 @@ class _ClassInterpreter(PlainInterpreter):
 def run(interpreter: Interpreter, reader: Reader) -> object:
     """Return the value of a container by an interpreter.
 
-    Whatever an interpreter raises comes out as an InterpretationError, so a slip in somebody's
-    plug-in is an outcome like any other.
+    Any error of an interpreter becomes an InterpretationError, so a mistake in a plug-in is an
+    outcome like any other.
 
     Raises:
         InterpretationError: the bytes do not fit, or the interpreter failed; then the cause is
@@ -375,7 +372,7 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
 
 
 def plain(interpreter: Interpreter) -> PlainInterpreter | None:
-    """Return an interpreter that :func:`run_plain` takes, None if it wants a :class:`Reader`."""
+    """Return the interpreter if :func:`run_plain` can run it, None if it needs a Reader."""
     if not isinstance(interpreter, PlainInterpreter):
         return None
     overridden = type(interpreter).interpret is not PlainInterpreter.interpret
@@ -407,12 +404,12 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
     Args:
         spec: None (``raw``), a name (``"localizations"``), a layout text, a name with a layout
             (``"table: x: real32 mm"``), a :class:`~smartcam.Layout`, an interpreter, its class,
-            a function of a :class:`Reader`, or a class that says a layout
+            a function of a :class:`Reader`, or a class that declares a layout
             (:meth:`smartcam.Layout.of`).
         lenient: take any byte but zero for a true bool.
 
     Raises:
-        PluginError: the name is unknown, or what it stands for cannot be loaded.
+        PluginError: the name is unknown, or its plug-in cannot be loaded.
         LayoutError: a mistake in the layout text; the position counts from the start of ``spec``.
         ConfigurationError: the interpreter needs a layout, or takes none.
     """
@@ -444,7 +441,7 @@ def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
 
 
 SURE_SLIP = 0.8
-"""Score of a group's name, from which it is a slip of an interpreter's name."""
+"""Score of a group's name above which the name counts as a misspelled interpreter."""
 
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
@@ -456,12 +453,12 @@ def _is_type(rest: str) -> bool:
 
 
 def _check_name(spec: str, name: str, rest: str) -> None:
-    """Complain of a mistyped interpreter's name, which no layout text would begin with."""
+    """Raise for a mistyped interpreter's name, if no layout text would begin with it."""
     word = _FIRST_WORD.match(rest)
     another_colon = word is not None and word[2] and word[1] not in TYPES
     if re.fullmatch(r"[\w.-]+", name) and (another_colon or not name.isidentifier()):
         _fail_name(spec, name)
-    # "localization: (...)*" is a layout text whose group has a name, and surely a slip
+    # "localization: (...)*" is a valid layout text with a named group, but surely a slip
     if rest.lstrip().startswith("(") and name != "records":
         known = [info.name for info in INTERPRETERS.available()]
         close = closest(name, known, least=SURE_SLIP)
@@ -475,7 +472,7 @@ def _check_name(spec: str, name: str, rest: str) -> None:
 
 
 def _fail_name(spec: str, name: str) -> NoReturn:
-    """Say that ``name`` is no interpreter, with those that are, nor ``spec`` a layout text."""
+    """Raise: ``spec`` is no interpreter, with the known names, and no layout text."""
     nor = ""
     try:
         Layout(spec)

@@ -1,4 +1,4 @@
-"""The interpreters that need a layout at most: raw, record, table, strings50."""
+"""The interpreters raw, record, table and strings50."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class Strings50Interpreter(PlainInterpreter):
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
     def read(self, data: bytes, context: Context) -> list[str]:
-        """Return the texts in order; empty ones are kept, so places stay what they are.
+        """Return the texts in order; empty texts keep their places.
 
         Raises:
-            InterpretationError: bytes are left behind the last whole string, or one is not UTF-8.
+            InterpretationError: bytes are left after the last whole text, or one is not UTF-8.
         """
         try:
             return [raw.partition(b"\0")[0].decode() for (raw,) in _TEXT.iter_unpack(data)]
         except (struct.error, UnicodeDecodeError):
             pass
-        reader = Reader(data)  # it says where
+        reader = Reader(data)  # its error names the offset
         return [reader.get_string(offset, WIDTH) for offset in reader.records(WIDTH)]
 
 

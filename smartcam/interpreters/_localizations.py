@@ -27,7 +27,7 @@ _DEFAULTS: dict[str, Any] = {
     "y": 0.0,
     "theta": 0.0,
 }
-"""Defaults of the fields that are used beside ``z``, for layouts without these fields.
+"""Defaults of the fields that a layout may leave out, except ``z``.
 
 The order is that of the default layout.
 """
@@ -47,30 +47,30 @@ _QUANTITIES = {
 _POSE = ("x", "y", "z", "theta")
 
 _SIGMAS = ("sigma_x", "sigma_y", "sigma_theta")
-"""Fields that have to be there for the errors of a pose."""
+"""Fields that are needed for the errors of a pose."""
 
 _CORRELATIONS = ("correlation_xy", "correlation_xt", "correlation_yt")
-"""Fields that may be there beside them; without one the errors are independent."""
+"""Optional fields beside these; without them the errors are independent."""
 
 MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
 
 MAX_NAMES = 64
-"""Largest number of names of features that are kept as texts: an application has a handful, a peer
-could send any."""
+"""Largest number of feature names that are kept as texts. An application has a handful, but a peer
+could send any number."""
 
 # half the time of the NamedTuples' own; the cast because a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
 class LocalizationsInterpreter(PlainInterpreter):
-    """Parts that were found, a :class:`~smartcam.Localization` each: feature, quality, pose.
+    """Found parts, a :class:`~smartcam.Localization` each: feature, quality, pose.
 
     Args:
         layout: ``x`` and ``y`` must be in its records. Without ``feature_id`` it is ``""``,
             without ``quality`` 1.0 (the camera reported the part as found), without
             ``photo_index``, ``z`` or ``theta`` 0. ``sigma_x``, ``sigma_y`` and ``sigma_theta``,
-            and ``correlation_xy``, ``correlation_xt`` and ``correlation_yt`` where they are there,
+            and the optional ``correlation_xy``, ``correlation_xt`` and ``correlation_yt``
             become ``pose.sigma``. Other fields are ignored. Lengths without a unit are metres,
             angles radians; ``px`` stays pixels.
 
@@ -137,7 +137,7 @@ class LocalizationsInterpreter(PlainInterpreter):
                 if not 0.0 <= quality <= best:
                     self._check_numbers(data, context)
                 if y_down:
-                    y, theta = 0.0 - y, 0.0 - theta  # and no minus zero
+                    y, theta = 0.0 - y, 0.0 - theta  # avoids minus zero
                 total += x + y + theta + z
                 half = 0.5 * theta
                 orientation = new(Quaternion, (0.0, 0.0, sin(half), cos(half)))
@@ -162,7 +162,7 @@ class LocalizationsInterpreter(PlainInterpreter):
     def _with_sigmas(
         self, found: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
-        """Return localizations with the errors of their poses, where these are numbers."""
+        """Return localizations with the errors of their poses, if these are numbers."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
         taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
@@ -190,9 +190,9 @@ class LocalizationsInterpreter(PlainInterpreter):
         return data[begin : begin + self.layout.size] == self._empty
 
     def _check_numbers(self, data: bytes, context: Context) -> None:
-        """Raise for the first impossible number; for a bad text or bool before it.
+        """Raise for the first impossible number, or for a bad text or bool before it.
 
-        Impossible are NaN and infinity in a pose, and a quality that is not between 0 and 1.
+        NaN and infinity in a pose are impossible, and a quality that is not between 0 and 1.
         """
         offset = self.layout.head_size
         for number, record in enumerate(self.layout.parse_records(data, context.byte_order)):
@@ -217,8 +217,8 @@ class _Use(NamedTuple):
     """The use of each field of a record.
 
     Attributes:
-        missing: defaults of the fields that the record lacks; they go behind its own.
-        pick: function that puts the values into the order of use; None if they are in it.
+        missing: defaults of the fields that the record lacks; they are put after its own fields.
+        pick: function that puts the values into the order of use; None if they are in order.
         z: place of ``z``, which is rare; None without it.
         scales: factors that turn the values into SI; None if they are SI.
         checks: True if unused texts and bools have to be checked, too.
@@ -234,7 +234,7 @@ class _Use(NamedTuple):
 
 
 class _SigmaUse(NamedTuple):
-    """The fields of a record that say the errors of its pose."""
+    """The fields of a record with the errors of its pose."""
 
     sigmas: tuple[tuple[int, float], ...]  # places of those in _SIGMAS, and their factors for SI
     # places of those in _CORRELATIONS; None if it is missing

@@ -437,11 +437,11 @@ class Layout:
         if not isinstance(repeat, str) or repeat == "*":
             return count
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
-        told = int(head.read_field(payload, 0, index))
-        if not 0 <= told <= count:
+        found = int(head.read_field(payload, 0, index))
+        if not 0 <= found <= count:
             more = f", as many records of {codec.size} bytes as the container holds"
-            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", told, more=more)
-        return told
+            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", found, more=more)
+        return found
 
     def _misfit(
         self, codec: RecordCodec, got: int, start: int, count: int | None

@@ -1,4 +1,4 @@
-"""Read layouts from classes, whose annotations say how each field is encoded on the wire.
+"""Read layouts from classes, whose annotations give each field's encoding on the wire.
 
 ::
 

@@ -193,8 +193,8 @@ class LayoutSpec(NamedTuple):
     @property
     def is_list(self) -> bool:
         """True if the value is a plain list: an unnamed group, without other values."""
-        told = (field.sequence or field.name == self.repeat for field in self.head)
-        return self.repeat is not None and self.group is None and all(told)
+        special = (field.sequence or field.name == self.repeat for field in self.head)
+        return self.repeat is not None and self.group is None and all(special)
 
     @property
     def group_field(self) -> str:
@@ -322,7 +322,7 @@ class _Parser:
     def _repeat(self, head: tuple[Field, ...]) -> str | int:
         if self._take_mark("*"):
             return "*"
-        self._expect("[", "'*', '[number]' or '[name]' behind the group")
+        self._expect("[", "'*', '[number]' or '[name]' after the group")
         token = self._take()
         repeat: str | int
         if token.kind == "number":
@@ -350,7 +350,7 @@ class _Parser:
 
     def _field(self, what: str) -> Field:
         name = self._name(what)
-        self._expect(":", f"':' and a type behind {name!r}")
+        self._expect(":", f"':' and a type after {name!r}")
         type_, length = self._type()
         unit = self._unit(type_)
         return Field(name, type_, length, unit, self._sequence(type_, unit))
@@ -405,7 +405,7 @@ class _Parser:
             self._fail(f"expected '@{SEQUENCE}', got '@' and {self._peek()}", at)
         self._take()
         if not TYPES[type_].is_integer or unit is not None:
-            self._fail(f"expected '@{SEQUENCE}' only behind an integer without a unit", at)
+            self._fail(f"expected '@{SEQUENCE}' only after an integer without a unit", at)
         if self._has_sequence:
             self._fail(f"expected one '@{SEQUENCE}', got a second", at)
         self._has_sequence = True
@@ -472,7 +472,7 @@ class _Parser:
         self._fail(f"expected {expected}, got {token}", token)
 
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
-        """Raise the error after a whole field: say what could have followed."""
+        """Raise the error after a whole field, naming the parts that could have followed."""
         here = self._peek()
         if here.kind == "name":
             self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)

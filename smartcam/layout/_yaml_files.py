@@ -25,7 +25,7 @@ M = TypeVar("M", bound=BaseModel)
 _SHOWN = 20  # number of mistakes that are reported at once
 
 MAX_FILES_BESIDE = 1000
-"""At most this many files of a folder are compared with a wrong file name."""
+"""Largest number of files of a folder that are compared with a wrong file name."""
 
 
 def read_model(
@@ -97,7 +97,7 @@ def _beside(path: Path) -> list[str]:
 
 
 def _got(item: ErrorDetails) -> str:
-    """Return an addition to pydantic's error that says what came, if its text does not."""
+    """Return an addition to pydantic's error with the given value, if its text lacks it."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
     came: object = item["input"]
@@ -134,7 +134,7 @@ def _children(schema: Any, one: Any, part: int | str) -> list[Any]:
 
 
 def _branches(schema: Any, node: Any) -> Iterator[Any]:
-    """Return the schemas that a part of a schema stands for: a reference, each type of a union."""
+    """Yield the schemas that a part of a schema refers to: a reference, each type of a union."""
     if "$ref" in node:
         yield from _branches(schema, schema["$defs"][node["$ref"].rpartition("/")[2]])
     kinds = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ())]

@@ -1,4 +1,4 @@
-"""Read YAML from others within bounds, since a few lines may stand for millions of values."""
+"""Read YAML of other people within bounds, since a few lines may stand for millions of values."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ MAX_YAML_TEXT_CHARACTERS = 1 << 23
 """A YAML document has at most this many characters: a container of 1 MiB in hex takes a quarter."""
 
 MAX_NODES = 500_000
-"""A YAML document has at most this many values, where each alias and each merged mapping counts
-with everything that it stands for: that is 50,000 applications of a scenario. PyYAML reads this
-many in about 15 seconds."""
+"""Largest number of values of a YAML document, in which each alias and each merged mapping counts
+with all its values: that is 50,000 applications of a scenario. PyYAML reads this many in about 15
+seconds."""
 
 MAX_DEPTH = 50
-"""Largest number of values of a YAML document are nested this deep; smartcam's files have ten
-levels. PyYAML examines all open brackets for each token, and recurses for each of them."""
+"""Largest depth of nested values of a YAML document; smartcam's files have ten levels. PyYAML
+examines all open brackets for each token, and recurses for each of them."""
 
 MAX_BITS = 64
-"""An integer has at most this many bits, as the largest in a container.
+"""Largest number of bits of an integer, as in a container.
 
 Python takes seconds for the digits of much larger ones, or refuses.
 """
@@ -46,7 +46,7 @@ class BadYamlError(ConfigurationError):
 def load(text: str, *, what: str = "YAML") -> Any:
     """Return the data of a document; None for an empty one.
 
-    ``what``: thing that needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
+    ``what``: the feature that needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
     exceeds a bound; MissingExtraError if PyYAML is not installed.
     """
     root = compose(text, what=what)
@@ -66,7 +66,7 @@ def compose(text: str, *, what: str = "YAML") -> Any:
     try:
         return yaml.compose(text, _loader(yaml))
     except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        raise _told(exc) from exc
+        raise _as_bad_yaml(exc) from exc
 
 
 def construct(root: Any) -> Any:
@@ -80,7 +80,7 @@ def construct(root: Any) -> Any:
         _count(root, {})
         return loader.construct_document(root)
     except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        raise _told(exc) from exc
+        raise _as_bad_yaml(exc) from exc
     finally:
         loader.dispose()
 
@@ -90,7 +90,7 @@ def yaml_module(what: str) -> Any:
     return _extras.load("yaml", f"{what} needs")
 
 
-def _told(exc: Exception) -> BadYamlError:
+def _as_bad_yaml(exc: Exception) -> BadYamlError:
     if isinstance(exc, BadYamlError):
         return exc
     mark = getattr(exc, "problem_mark", None)

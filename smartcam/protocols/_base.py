@@ -1,8 +1,8 @@
 """The parts of a protocol: dialects, roles with their policies, the entry point.
 
 A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
-``framed/dialect.py`` has the one of binary frames. Who may do what with broken input is a
-:class:`Policy`, chosen by role and transport.
+``_framed/dialect.py`` has the dialect of binary frames. A :class:`Policy`, chosen by role and
+transport, decides how broken input is handled.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Policy:
             input that causes any other error is dropped and counted.
         exact_length: True if a known message must have exactly its documented length; otherwise a
             longer body is accepted and counted.
-        tells: True if a known message of the wrong length is an event instead of being dropped.
-        bounded: True if a frame counts as broken when it announces more bytes than its message may
-            have, or does not become whole in time.
+        tells: True if a known message of the wrong length is reported as an event, not dropped.
+        bounded: True if a frame is broken when it announces more bytes than its message may have,
+            or is not complete in time.
     """
 
     fatal: tuple[type[RemoteProtocolError], ...]
@@ -101,11 +101,11 @@ class CodeMeaning(NamedTuple):
 
 
 UNDOCUMENTED = CodeMeaning("not documented", Verdict.REFUSED)
-"""Meaning of a result code that no document has."""
+"""Meaning of a result code that no document explains."""
 
 
 class Spelled(NamedTuple):
-    """A frame in words.
+    """A frame in readable form.
 
     Attributes:
         message_id: id on the wire, None if the dialect has no such ids.
@@ -124,9 +124,9 @@ class RawRequest(NamedTuple):
     """A request by its id.
 
     Attributes:
-        message: what to send.
-        answer: what its answer is known by: a message type, or an id.
-        answered: whether the documents say that it is answered; True for an unknown id.
+        message: the message to send.
+        answer: the answer's message type, or its id.
+        answered: whether it is answered by the documents; True for an unknown id.
         known: whether the dialect knows the id.
     """
 
@@ -138,14 +138,14 @@ class RawRequest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dialect(ABC):
-    """One wire variant of a protocol: what the client needs to know of it.
+    """One wire variant of a protocol, as far as the client needs it.
 
     Args:
         name: name as in ``?dialect=``.
         about: one line for people.
         source: document that describes the dialect, with its grade.
-        quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.
-        shows_triggers: the status tells of each trigger that is taken: Waiting for Trigger drops.
+        quirks: names of this dialect's deviations, as in ``?quirks=``.
+        shows_triggers: the status shows each accepted trigger: Waiting for Trigger drops.
     """
 
     name: str
@@ -155,13 +155,13 @@ class Dialect(ABC):
     shows_triggers: bool = True
 
     in_order: ClassVar[bool] = False
-    """True if the camera does one thing after the other: when a request is answered, all that was
-    asked for before it is over, its result included. Or if its results say which trigger they
-    answer, so that no order is needed."""
+    """True if the camera handles one request after the other: an answer shows that all earlier
+    requests are finished, with their results. Or if its results name their trigger, so that no
+    order is needed."""
     exclusive: ClassVar[bool] = True
     """True if the camera serves one client, and a newcomer takes it."""
     has_login: ClassVar[bool] = False
-    """True if a session that is refused is refused for good: a wrong password stays wrong."""
+    """True if a refused session is final: a wrong password stays wrong."""
 
     @property
     def label(self) -> str:
@@ -212,28 +212,28 @@ class Dialect(ABC):
         return tuple(name for name, _ in wire_fields(message_type))
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status that another dialect has read as this one reads it."""
+        """Return a status, which another dialect has read, as this dialect reads it."""
         return report
 
     def data_begins(self, sender: Sender, message_id: int) -> int | None:
-        """Return the bytes of a body in front of its ``data``, which is the rest of it.
+        """Return the length of a body before its ``data``, which is the rest of the body.
 
-        :meth:`spell` makes all else of these bytes and the body's length. None where a message has
-        no such data.
+        :meth:`spell` needs only these bytes and the body's length. None if a message has no such
+        data.
         """
         return None
 
     @abstractmethod
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
-        """Return a frame in words, for a trace; it never raises."""
+        """Return a frame in readable form, for a trace; it never raises."""
 
     @abstractmethod
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for users who know it better than the table.
+        """Return any request by its id, for users who know more than the table.
 
         Raises:
-            LocalProtocolError: what only the client itself may say, as Connect and Disconnect.
-            UnsupportedError: its ids are of another kind.
+            LocalProtocolError: only the client itself may send it, such as Connect and Disconnect.
+            UnsupportedError: the protocol's ids are of another kind.
         """
 
     @abstractmethod
@@ -241,7 +241,7 @@ class Dialect(ABC):
         """Return the bytes of the answer to a raw request.
 
         Raises:
-            CommandRejectedError: the bytes say nothing but that the camera refused.
+            CommandRejectedError: the bytes only say that the camera refused.
         """
 
     def unsupported(self, message_type: type[Message]) -> UnsupportedError:
@@ -264,10 +264,10 @@ class Dialect(ABC):
     def for_layout(self, layout: Layout | None) -> Dialect:
         """Return the dialect for a session whose results are read with a layout.
 
-        Overridden where the camera can be told what its results are to hold.
+        Overridden if the client can tell the camera which values its results shall hold.
 
         Args:
-            layout: the fields; None for results that are taken as they come.
+            layout: the fields; None for results as the camera sends them.
 
         Raises:
             ConfigurationError: the camera cannot give such results.
@@ -275,7 +275,7 @@ class Dialect(ABC):
         return self
 
     def with_parameters(self, parameters: Mapping[str, str]) -> Dialect:
-        """Return the dialect with what a URL says for it; overridden where there is anything.
+        """Return the dialect with the parameters of a URL; overridden if the dialect has any.
 
         Raises:
             ConfigurationError: a parameter cannot be used.
@@ -285,24 +285,24 @@ class Dialect(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """A family of dialects under one name: what an entry point ``smartcam.protocols`` gives.
+    """A family of dialects under one name, from an entry point of ``smartcam.protocols``.
 
     Attributes:
         name: name of the protocol.
         schemes: the transport of each URL scheme.
-        default_port: port where a URL names none.
+        default_port: port if a URL names none.
         models: camera models that speak it.
         dialects: the protocol's dialects by name.
-        machine: function that makes the client's machine of a link; of the dialects given, which
-            begin a session alike, it finds out which one the camera speaks.
-        parameters: what else a URL may say, and what it is; ``user`` and ``password`` stand before
-            the host there.
-        detection: what a client tries that was told no dialect, the most probable first, each on a
-            fresh link: dialects that begin a session alike. Default: each dialect by itself.
-        emulator: ``module:attribute`` of the class of its emulated cameras, a
-            :class:`~smartcam.emulator.LineCamera` for one; "" if it brings none.
-        greeting: what a camera says first to a client that has just come and has said nothing;
-            ``b""`` if it keeps silent until it is spoken to, None if that is not known.
+        machine: function that makes the client's machine of a link. It gets dialects that begin a
+            session alike, and finds out which of them the camera speaks.
+        parameters: other parameters of a URL, and their meanings; ``user`` and ``password`` stand
+            before the host there.
+        detection: groups of dialects that a client without a given dialect tries, the most probable
+            first, each on a fresh link. A group begins a session alike. Default: one dialect each.
+        emulator: ``module:attribute`` of the class of its emulated cameras, such as a
+            :class:`~smartcam.emulator.LineCamera`; "" if it brings none.
+        greeting: bytes that a camera sends to a new client before it received anything; ``b""`` if
+            it waits for the client, None if that is not known.
     """
 
     name: str
@@ -325,13 +325,13 @@ class Protocol:
         quirks: Iterable[str] = (),
         parameters: Mapping[str, str] | None = None,
     ) -> list[tuple[Dialect, ...]]:
-        """Return the dialects to try: each group, which begins a session alike, on a fresh link.
+        """Return the dialects to try: groups that begin a session alike, each on a fresh link.
 
         Args:
-            transport: what carries them.
-            dialect: the one that is pinned; its quirks are found out where none is pinned.
+            transport: transport of the link.
+            dialect: name of the pinned dialect; without it, quirks are found out, too.
             quirks: names of the quirks that are pinned.
-            parameters: what else the URL says.
+            parameters: other parameters of the URL.
 
         Raises:
             ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
@@ -350,10 +350,10 @@ def load_protocol(name: str) -> Protocol:
     """Return the protocol of this name.
 
     Raises:
-        PluginError: unknown, or it failed to load.
+        PluginError: the name is unknown, or the protocol failed to load.
         ConfigurationError: the entry point gives something else.
     """
-    from smartcam.registry import PROTOCOLS  # which logs, what a core has no need of
+    from smartcam.registry import PROTOCOLS  # imported late: it logs
 
     protocol = PROTOCOLS.load(name)
     if not isinstance(protocol, Protocol):

@@ -121,7 +121,7 @@ HANDBOOK = FramedDialect(
     header=HeaderLayout(magic=bytes.fromhex("50535642"), code="I", order="length, id"),
     word="I",
     table=MESSAGES,
-    about="magic 50 53 56 42, 32 bit, the length counts what follows the message id",
+    about="magic 50 53 56 42, 32 bit, the length counts the bytes after the message id",
     source="SC manual p. 28, 29 and vector A-1 (mvBlueGEMINI manual p. 30), published",
 )
 
@@ -338,7 +338,7 @@ BID = FramedDialect(
     source="BVS ID guide p. 52, 206 to 232, published",
     status_bits=StatusBits(
         # The examples show Ready as bit 5 where p. 216 says "4th bit": the bytes are trusted.
-        # Where the other error bits stand is unknown, so they have no meaning here.
+        # Where the other error bits are is unknown, so they have no meaning here.
         named={
             0x0001: Status.WAITING_FOR_TRIGGER,  # p. 210, published
             0x0100: Status.OVERTRIGGERED,  # Trigger Error; from the example on p. 227, derived
@@ -353,12 +353,12 @@ BID = FramedDialect(
 
 
 class _Bvs(Protocol):
-    """A protocol whose dialects are of the type that they are here."""
+    """A protocol whose dialects are framed."""
 
     dialects: Mapping[str, FramedDialect]
 
 
-# while it is open which of the last two it is, frames are shown as those of bid, which is published
+# while either of the last two may be spoken, frames are shown as bid's, which is published
 _16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
 BVS: _Bvs = _Bvs(

@@ -1,10 +1,10 @@
-"""Results that do not say of which application they are, held until the camera has said it.
+"""Hold results without an application until the camera has named the application.
 
-The camera is asked for its application behind each result, and in front of each trigger. A result
-is told when the question behind it is answered. Where all that the camera has said of its
-application around the result is one number, that is the result's; else it has a fault, so that it
-is no value of any application. Everything that comes behind a held result waits with it: what
-comes keeps its order.
+The client asks the camera for its application after each result, and before each trigger. A result
+is reported when the question after it is answered. If all answers around the result name one
+application, it is the result's; otherwise the result gets a fault, so that it
+counts for no application. All events after a held result wait with it, so that events
+keep their order.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from smartcam.protocols._machine import Event
 
 MAX_HELD = 4096
-"""Largest number of events that may wait for a result's application: the camera answers within a
+"""Largest number of events that wait for a result's application; the camera answers within a
 round trip."""
 
 MAX_HELD_BYTES = 1 << 26
-"""Largest number of bytes of the results among them: four pictures of 16 MB."""
+"""Largest number of bytes of the waiting results: four pictures of 16 MB."""
 
 
 @dataclass(slots=True, eq=False)
@@ -32,10 +32,10 @@ class _Held:
     """Messages of one answer or one line, with a result among them.
 
     Attributes:
-        messages: what is told.
+        messages: the messages to report.
         size: bytes of the results.
-        question: number of the question that will tell the application.
-        front: number of the question in front of the trigger, 0 for none.
+        question: number of the question whose answer names the application.
+        front: number of the question before the trigger, 0 for none.
         seen: applications that the camera has named around the result.
     """
 
@@ -56,11 +56,11 @@ class HeldResults:
         self._asked = 0  # number of the last question
         self._open: set[int] = set()  # numbers of questions without an answer
         self._named: int | None = None  # the application that the camera named last
-        self._front = 0  # number of the question in front of the last trigger
+        self._front = 0  # number of the question before the last trigger
         self._seen: set[int] | None = None  # applications named since that question
 
     def ask(self, *, trigger: bool = False) -> int:
-        """Return the number of the question that is put now, maybe in front of a trigger."""
+        """Return the number of a new question, which may stand before a trigger."""
         self._asked += 1
         self._open.add(self._asked)
         if trigger:
@@ -68,10 +68,10 @@ class HeldResults:
         return self._asked
 
     def add(self, messages: tuple[Event, ...], *, answers_trigger: bool) -> bool:
-        """Take what came; return True if a question is to be put now for a result in it.
+        """Add messages; return True if a result among them needs a question now.
 
         Raises:
-            FrameError: too much waits for an answer.
+            FrameError: too many events wait for an answer.
         """
         results = [one for one in messages if isinstance(one, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
@@ -93,18 +93,18 @@ class HeldResults:
         return bool(results) and not self._open
 
     def pass_on(self, events: tuple[Event, ...]) -> None:
-        """Take what can be told as it is."""
+        """Add events that need no application."""
         self._ready += events
 
     def name(self, application: int, question: int = 0) -> bool:
-        """Take the application that the camera says is active now.
+        """Note the application that the camera names as active now.
 
         Args:
             application: id of the application.
-            question: number of the question that this answers, 0 for one that was not put here.
+            question: number of the question that the message answers, 0 for none.
 
         Returns:
-            Whether a question is to be put now for a result that came since the last one.
+                True if a question is needed now for a result that came since the last one.
         """
         self._named = application
         self._open.discard(question)
@@ -116,12 +116,12 @@ class HeldResults:
         return bool(self._waiting) and held[-1].question > self._asked and not self._open
 
     def take(self) -> list[Event]:
-        """Return the events that can be told, in order; the caller owns the list."""
+        """Return the events that can be reported, in order; the caller owns the list."""
         ready, self._ready = self._ready, []
         return ready
 
     def end(self) -> None:
-        """Note that nothing is answered any more: what waits is told with a fault."""
+        """Note that no more answers come: the waiting results are reported with a fault."""
         self._release(ended=True)
 
     def _release(self, *, ended: bool = False) -> None:

@@ -14,8 +14,8 @@ class LineReader:
     """Cuts lines, prompts and counted text from a stream of bytes.
 
     Args:
-        ends: what ends a line, one or two bytes.
-        max_line: bytes of a line, its end not counted.
+        ends: pattern of a line's end, one or two bytes.
+        max_line: largest number of bytes of a line, without its end.
         encoding: encoding of its characters; bytes that are not valid are replaced.
     """
 
@@ -24,25 +24,25 @@ class LineReader:
         self._max_line = max_line
         self._encoding = encoding
         self._buffer = bytearray()
-        self._searched = 0  # no end begins before this
+        self._searched = 0  # no line end begins before this place
 
     def __len__(self) -> int:
-        """Return the number of bytes that wait."""
+        """Return the number of bytes that are kept."""
         return len(self._buffer)
 
     @property
     def pending(self) -> bytes:
-        """Copy of the bytes that wait for more."""
+        """Copy of the bytes that are kept."""
         return bytes(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Take bytes. The caller bounds what waits, by :func:`len`."""
+        """Add bytes. The caller bounds the kept bytes, by :func:`len`."""
         self._buffer += data
 
     def next_line(self) -> str | None:
         """Return the next line without its end, None if no whole one is there.
 
-        Raises FrameError: it is too long; the stream cannot be read on.
+        Raises FrameError: the line is too long; the stream cannot be read on.
         """
         found = self._ends.search(self._buffer, self._searched)
         size = found.start() if found is not None else len(self._buffer)
@@ -69,7 +69,7 @@ class LineReader:
         return data
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Take a prompt, which has no line end, if it is what comes next and all of it is there."""
+        """Remove a prompt, which has no line end, if it comes next and is complete."""
         if not self._buffer.startswith(prompt):
             return False
         self.take(len(prompt))

@@ -1,8 +1,8 @@
 """Cameras that speak in lines of text: each request is a line, and so is its answer.
 
-What a camera says stands in a table of :class:`LineRow`; dialect and machine are made of it. The
-shapes that answers have: one line, in order; several lines; an echo and then a result; known by a
-word or a ticket that the request carried, in any order.
+A table of :class:`LineRow` holds the camera's requests and answers; dialect and machine are made of
+it. Answers have several shapes: one line, in order; several lines; an echo and then a result; or
+lines in any order, matched to their request by a word or a ticket that it carried.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
     from smartcam.protocols._machine import Event
 
-    Told = m.Message | tuple[m.Message, ...]
+    Reported = m.Message | tuple[m.Message, ...]
     """One message, or several, that an answer becomes."""
 
-    Script = Generator[str, str, Told]
-    """Yields lines, is sent the answer to each, and returns what it found out."""
+    Script = Generator[str, str, Reported]
+    """Yields lines, receives the answer to each, and returns the facts in them."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
@@ -70,30 +70,30 @@ _COMMAND_WORD = re.compile(r"\w+\??")
 
 
 class LineRow(NamedTuple):
-    """A request, and what answers it; or what the camera says by itself.
+    """A request and its answer, or a line that the camera sends by itself.
 
     Attributes:
-        request: what the client asks for; None for a line that the camera says unasked.
+        request: the client's request; None for a line that the camera sends unasked.
         line: the line of the request, with the message's fields in braces: ``"PROGRAM
             {application}"``.
-        answer: what the answer is; None for a request that is not answered.
-        read: function that makes it of the answer's line, or several messages of it; a ValueError
-            or LookupError says that it is no answer.
-        word: what its answer is known by, in a dialect that splits answers: by default, and always
-            behind the first line of a script, the first word of the line; "" for an answer without
-            a word of its own. A dialect with tickets needs none, but for what is said unasked.
-        echo: line that comes in front of the answer.
+        answer: message type of the answer; None for a request without an answer.
+        read: function that makes one or several messages of the answer's line; a ValueError
+            or LookupError means that the line is no answer.
+        word: word that matches the answer, if the dialect splits answers. Default, and always after
+            the first line of a script: the first word of the line; "" for an answer without its
+            own word. A dialect with tickets needs it only for unasked lines.
+        echo: line that comes before the answer.
         until: first words that end an answer of several lines, which ``read`` gets joined by line
             feeds.
-        also: what else its answer may be told as, beside ``answer``.
-        script: where a request takes several lines: is given the dialect and the message, yields
-            lines and is sent what answers each. ``line`` is then the one that people know it by.
+        also: other message types that the answer may become, beside ``answer``.
+        script: function for a request of several lines; it gets the dialect and the message, yields
+            lines and receives the answer to each. ``line`` is then the line for error texts.
     """
 
     request: type[m.Request] | None
     line: str
     answer: type[m.Report] | None
-    read: Callable[[str], Told]
+    read: Callable[[str], Reported]
     word: str | None = None
     echo: str = ""
     until: tuple[str, ...] = ()
@@ -110,7 +110,7 @@ class LineReply(m.Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineCommand(m.Request):
-    """A line of the user's own; a dialect has it where a row says how it is answered."""
+    """The user's own line; a dialect has it if a row gives the form of its answer."""
 
     answer: ClassVar[type[m.Message] | None] = LineReply
 
@@ -118,7 +118,7 @@ class LineCommand(m.Request):
 
 
 def unread(line: str) -> m.Message:
-    """Refuse every line: what a row without an answer, or with a script, reads with.
+    """Refuse every line: the ``read`` of a row without an answer, or with a script.
 
     Raises:
         ValueError: always.
@@ -132,19 +132,19 @@ class LineDialect(Dialect):
 
     Args:
         name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
-        rows: what is said; ``Connect`` and ``Query`` are needed.
+        rows: requests and answers; ``Connect`` and ``Query`` are needed.
         ids: the ids that applications may have.
-        line_end: ends each line, one or two bytes.
-        max_line: bytes of a line, its end not counted; a longer one breaks the protocol.
+        line_end: end of each line, one or two bytes.
+        max_line: bytes of a line, without its end; a longer line breaks the protocol.
         encoding: encoding of its characters.
-        split: splits an answer into what it is known by, "" for nothing, and the text that is read;
-            None if answers come in order and say nothing of their request.
+        split: splits an answer into its word, "" for none, and the text that is read; None if
+            answers come in order and do not name their request.
         tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
-            what :meth:`pack` makes of it. Empty where they carry none.
-        at_once: requests are said without waiting for earlier answers; needs ``split``.
-        codes: the meaning of each result code of the answers; without any all are done.
-        names_application: results say of which application they are, or all are of one. Else the
-            camera is asked in front of each trigger and behind each result, by the row of Query.
+            added by :meth:`pack`. Empty without tickets.
+        at_once: requests are sent without waiting for earlier answers; needs ``split``.
+        codes: the meaning of each result code of the answers; without codes every answer is done.
+        names_application: results name their application, or all are of one. Otherwise the
+            camera is asked before each trigger and after each result, by the row of Query.
         make: name of the maker or make, for errors.
     """
 
@@ -170,7 +170,7 @@ class LineDialect(Dialect):
 
     @property
     def capabilities(self) -> Capabilities:
-        """Abilities of a camera in this dialect, as the rows say."""
+        """Abilities of a camera in this dialect, from its rows."""
         able = {name: True for kind, name in _ABILITIES.items() if self.row(kind) is not None}
         unasked = {row.answer for row in self.rows if row.request is None}
         return Capabilities(
@@ -187,7 +187,7 @@ class LineDialect(Dialect):
         return next((row for row in self.rows if row.request is request), None)
 
     def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
-        """Return the meaning of a code; all are done in a dialect without codes."""
+        """Return the meaning of a code; done in a dialect without codes."""
         return self.codes.get(code, UNDOCUMENTED) if self.codes else DONE
 
     def has(self, message_type: type[m.Message]) -> bool:
@@ -230,7 +230,7 @@ class LineDialect(Dialect):
         return row.line.format_map({"ticket": "{ticket}", **texts})
 
     def script(self, row: LineRow, message: m.Message) -> Script:
-        """Return the lines of a request, one after the other, and what their answers become."""
+        """Return the script of a request, which yields its lines one after the other."""
         if row.script is not None:
             return row.script(self, message)
         return _one_line(row, self.line(message))
@@ -252,13 +252,13 @@ class LineDialect(Dialect):
         """Return a new reader that cuts a stream into lines.
 
         Args:
-            max_length: bytes of an answer at most, where its dialect has another bound than lines.
+            max_length: largest answer in bytes, if the dialect bounds answers other than by lines.
         """
         ends = re.compile(re.escape(self.line_end))
         return LineReader(ends, max_line=self.max_line, encoding=self.encoding)
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
-        """Return a line in words."""
+        """Return a line in readable form."""
         text = frame.payload.decode(self.encoding, "replace")
         return Spelled(None, "line", {"text": text}, frame.payload + self.line_end)
 
@@ -271,13 +271,12 @@ class LineDialect(Dialect):
         return line
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a line of the user's own; the payload stands behind it.
+        """Return a line of the user's own; the payload follows it.
 
         Raises:
             UnsupportedError: how another line is answered is not known.
             ConfigurationError: the text is no line that can be sent.
-            LocalProtocolError: the line triggers, and nothing in its answer would tell whose
-                trigger.
+            LocalProtocolError: the line triggers, and its answer would not name the trigger.
         """
         if self.row(LineCommand) is None or not isinstance(message_id, str):
             raise UnsupportedError(f"dialect {self.name}: there are no other requests")
@@ -294,13 +293,13 @@ class LineDialect(Dialect):
         return RawRequest(message, LineReply, answered=answered, known=True)
 
     def _twin(self, message: LineCommand) -> LineRow | None:
-        """Return the row of a request of the client's own that says the same command."""
+        """Return the row of a request of the client that sends the same command."""
         word = _command_word(message.line)
         own = (row for row in self.rows if row.request not in {None, LineCommand})
         return next((row for row in own if _command_word(row.line) == word), None)
 
     def row_of(self, message: m.Message) -> LineRow | None:
-        """Return the row by which a message is said; a user's line is answered as its twin is."""
+        """Return the row of a message; a user's line is answered like the client's same command."""
         row = self.row(type(message))
         twin = self._twin(message) if isinstance(message, LineCommand) else None
         if row is None or twin is None:
@@ -313,18 +312,18 @@ class LineDialect(Dialect):
         """Return the bytes of the answer to a line of the user's own.
 
         Raises:
-            UnsupportedError: the camera says that it does not know the line.
-            CommandRejectedError: the camera says that it did not do it.
+            UnsupportedError: by its answer, the camera does not know the line.
+            CommandRejectedError: by its answer, the camera did not carry it out.
         """
         if not isinstance(answer, LineReply):
             raise LocalProtocolError(f"{type(answer).__name__} is no answer to a line")
         meaning = self.code(answer.code)
         if meaning.verdict is Verdict.DONE:
             return answer.data
-        said = f"the camera answered {answer.data[:64]!r} ({meaning.text})"
+        refusal = f"the camera answered {answer.data[:64]!r} ({meaning.text})"
         if meaning.verdict is Verdict.UNKNOWN:
-            raise UnsupportedError(said)
-        raise CommandRejectedError(said, code=answer.code)
+            raise UnsupportedError(refusal)
+        raise CommandRejectedError(refusal, code=answer.code)
 
 
 def _first_word(line: str) -> str:
@@ -333,7 +332,7 @@ def _first_word(line: str) -> str:
 
 
 def _command_word(line: str) -> str:
-    """Return the word that says what a line does, "PROGRAM?" being another one than "PROGRAM"."""
+    """Return the word of a command; "PROGRAM?" is another word than "PROGRAM"."""
     found = _COMMAND_WORD.match(line)
     return line if found is None else found[0]
 
@@ -348,15 +347,15 @@ class _OpenRequest:
 
     Attributes:
         row: row of the request.
-        script: what is left to be said and heard for it.
-        line: what is said now.
-        known_by: what the next answer is known by once ``line`` is said; None: by its first word.
-        word: what the next answer is known by.
-        said: whether ``line`` is said.
-        echoed: whether the echo in front of the answer has come.
-        lines: what came of an answer of several lines.
-        size: characters of these.
-        question: number of a question for the application that the machine has put by itself.
+        script: rest of its lines and answers.
+        line: line to send now.
+        known_by: word that the next answer is matched by once ``line`` is sent; None: its first.
+        word: word or ticket that the next answer is matched by.
+        sent: whether ``line`` was sent.
+        echoed: whether the echo before the answer has come.
+        lines: received lines of an answer of several lines.
+        size: number of characters of these.
+        question: number of a question for the application, which the machine asks by itself.
     """
 
     row: LineRow
@@ -364,7 +363,7 @@ class _OpenRequest:
     line: str
     known_by: str | None
     word: str = ""
-    said: bool = False
+    sent: bool = False
     echoed: bool = False
     lines: list[str] = field(default_factory=list[str])
     size: int = 0
@@ -372,23 +371,23 @@ class _OpenRequest:
 
 
 class LineMachine:
-    """One connection's lines, in the client's role; what a link needs.
+    """One connection's lines, in the client's role, as a link needs it.
 
-    See :class:`~smartcam.protocols.LinkMachine`. Where nothing in a line says what it answers, a
-    request is said when the one before it is answered, so that one that is lost does not make the
-    answers of later ones its own; a line is the answer to it, unless a row says that the camera
-    says such a line unasked. Where answers say what they answer, they may come in any order.
+    See :class:`~smartcam.protocols.LinkMachine`. If lines do not name their request, a
+    request is sent when the one before it is answered, so that a lost answer does not shift the
+    answers of later requests; a line is the answer to the open request, unless a row says that the
+    camera sends such a line unasked. If answers name their request, they may come in any order.
 
     A container that answers a Trigger is marked as asked for, and one that comes unasked as not;
-    so no client takes one for the other.
+    so no client confuses them.
 
     Args:
-        dialect: what is spoken.
+        dialect: the dialect of the camera.
         role: the client's.
         transport: TCP.
-        max_length: bytes of an answer of several lines at most; one line is bounded by the dialect.
-        trace: function that is called with each line in both directions, and with what broke the
-            protocol.
+        max_length: largest answer of several lines, bytes; the dialect bounds one line.
+        trace: function that is called with each line in both directions, and with bytes that broke
+            the protocol.
         kin: unused, there is one dialect.
 
     Raises:
@@ -417,7 +416,7 @@ class LineMachine:
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
         self._store = memoryview(bytearray(MAX_READ_BYTES))
-        self._asked: list[_OpenRequest] = []  # open requests in order; at most one of a kind
+        self._open: list[_OpenRequest] = []  # open requests in order; at most one of a kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)
@@ -433,7 +432,7 @@ class LineMachine:
 
     @property
     def pending(self) -> bytes:
-        """Copy of the bytes that wait for their line's end."""
+        """Copy of the bytes of an unfinished line."""
         return self._reader.pending
 
     def room(self) -> memoryview:
@@ -441,12 +440,12 @@ class LineMachine:
         return self._store
 
     def filled(self, count: int, now: float = 0.0) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`."""
+        """Accept ``count`` bytes that were written into :meth:`room`."""
         self.receive_data(bytes(self._store[:count]))
         return True
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes; call :meth:`events` next. Never raises for what is in them."""
+        """Add received bytes; call :meth:`events` next. Never raises for bad bytes."""
         if self.state in {State.FAILED, State.CLOSED}:
             return
         self.counters.bytes_received += len(data)
@@ -454,7 +453,7 @@ class LineMachine:
         try:
             while (line := self._reader.next_line()) is not None:
                 self.counters.frames_received += 1
-                self._tell(m.Sender.CAMERA, line)
+                self._trace_line(m.Sender.CAMERA, line)
                 self._read(line)
         except RemoteProtocolError as error:
             if self._trace is not None:
@@ -462,7 +461,7 @@ class LineMachine:
             self._end(State.FAILED, LinkFailed(error=error))
 
     def receive_eof(self) -> None:
-        """Take note that the camera will send no more; call :meth:`events` next."""
+        """Note that the camera will send no more; call :meth:`events` next."""
         if self.state not in {State.FAILED, State.CLOSED}:
             self._end(State.CLOSED, LinkEnded(pending=len(self._reader)))
 
@@ -471,12 +470,12 @@ class LineMachine:
         return self._held.take()
 
     def _read(self, line: str) -> None:
-        """Take a line; FrameError where it is neither an answer nor said unasked."""
+        """Handle a line; FrameError if it is neither an answer nor an unasked line."""
         split = self.dialect.split
         if split is None:
-            asked = self._asked[0] if self._asked else None
+            asked = self._open[0] if self._open else None
             begun = asked is not None and (asked.echoed or asked.lines)
-            if not begun and self._say_unasked("", line):
+            if not begun and self._report_unasked("", line):
                 return
             word, text = "", line
         else:
@@ -485,40 +484,40 @@ class LineMachine:
             except (ValueError, LookupError) as exc:
                 raise FrameError(f"{line[:64]!r} came, no answer of this dialect") from exc
             asked = self._known_by(word) if word else None
-            if asked is None and self._say_unasked(word, text, by_word=True):
+            if asked is None and self._report_unasked(word, text, by_word=True):
                 return
             asked = asked or self._known_by("")
-            if asked is None and self._say_unasked(word, text):
+            if asked is None and self._report_unasked(word, text):
                 return
         if asked is None:
             raise FrameError(f"{line[:64]!r} came, nothing was asked")
         self._take(asked, text)
 
     def _known_by(self, word: str) -> _OpenRequest | None:
-        """Return the request whose answer is known by a word."""
-        return next((one for one in self._asked if one.said and one.word == word), None)
+        """Return the request whose answer is matched by a word."""
+        return next((one for one in self._open if one.sent and one.word == word), None)
 
-    def _say_unasked(self, word: str, text: str, *, by_word: bool = False) -> bool:
-        """Tell a line that the camera says by itself; return False where no row has such a line.
+    def _report_unasked(self, word: str, text: str, *, by_word: bool = False) -> bool:
+        """Report a line that the camera sent by itself; return False if no row has such a line.
 
         Args:
-            word: what the line is known by.
+            word: word of the line.
             text: the rest.
-            by_word: ask the rows that name this word, not those that name none.
+            by_word: try the rows that name this word, not those without a word.
         """
         for row in self._unasked:
             if by_word != bool(row.word) or (by_word and row.word != word):
                 continue
             try:
-                told = row.read(text)
+                reported = row.read(text)
             except (ValueError, LookupError):
                 continue
-            self._add(told, asked=False)
+            self._add(reported, asked=False)
             return True
         return False
 
     def _take(self, asked: _OpenRequest, text: str) -> None:
-        """Take a line of an answer; where it is whole, say what follows from it."""
+        """Handle a line of an answer; if the answer is complete, report its messages."""
         row = asked.row
         if row.echo and not asked.echoed and text == row.echo:
             asked.echoed, asked.word = True, ""
@@ -536,34 +535,34 @@ class LineMachine:
         try:
             asked.line = asked.script.send(text)
         except StopIteration as done:
-            told: Told = done.value
+            reported: Reported = done.value
         except (ValueError, LookupError) as exc:
             name = row.answer.__name__ if row.answer is not None else "nothing"
             raise FrameError(
                 f"{text[:64]!r} came, {name} to {row.line[:32]!r} was expected"
             ) from exc
         else:
-            asked.said = asked.echoed = False
+            asked.sent = asked.echoed = False
             asked.known_by = None
             asked.lines, asked.size = [], 0
             if self.state in {State.CONNECTING, State.CONNECTED}:
-                self._say(asked)
+                self._send_line(asked)
             else:
-                self._asked.remove(asked)  # Disconnect was the last word
+                self._open.remove(asked)  # Disconnect was the last request
             return
-        self._asked.remove(asked)
+        self._open.remove(asked)
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
         if asked.question:
-            self._name(told, asked.question)
+            self._name(reported, asked.question)
         else:
-            self._add(told, asked=row.request is m.Trigger)
-        if self._asked and not self._asked[0].said and self.state is State.CONNECTED:
-            self._say(self._asked[0])
+            self._add(reported, asked=row.request is m.Trigger)
+        if self._open and not self._open[0].sent and self.state is State.CONNECTED:
+            self._send_line(self._open[0])
 
-    def _add(self, told: Told, *, asked: bool) -> None:
-        """Tell messages; containers with whether a Trigger has asked for them, if that is known."""
-        messages = told if isinstance(told, tuple) else (told,)
+    def _add(self, reported: Reported, *, asked: bool) -> None:
+        """Report messages; mark containers as answers to a Trigger or not, if that is known."""
+        messages = reported if isinstance(reported, tuple) else (reported,)
         if self._marks:
             messages = tuple(
                 replace(one, asked=asked) if isinstance(one, m.ResultContainer) else one
@@ -576,16 +575,16 @@ class LineMachine:
             self._ask_application()
         self._name(messages)
 
-    def _name(self, told: Told, question: int = 0) -> None:
-        """Take which application is active, and ask again for results since the question."""
-        for one in told if isinstance(told, tuple) else (told,):
+    def _name(self, reported: Reported, question: int = 0) -> None:
+        """Note which application is active, and ask again for results since the question."""
+        for one in reported if isinstance(reported, tuple) else (reported,):
             if not isinstance(one, m.QueryAnswer | m.SwitchAnswer):
                 continue
             if self._held.name(one.application, question):
                 self._ask_application()
 
     def _ask_application(self, *, trigger: bool = False) -> None:
-        """Ask which application is active, in front of a trigger or behind a result."""
+        """Ask which application is active, before a trigger or after a result."""
         if self._query is None or self.state not in {State.CONNECTING, State.CONNECTED}:
             self._held.end()
             return
@@ -593,9 +592,9 @@ class LineMachine:
         self._begin(self._query, m.Query(), question=number)
 
     def _end(self, state: State, event: Event) -> None:
-        """Say and read nothing more; tell the reason last."""
+        """Send and read nothing more; report the reason last."""
         self.state = state
-        self._asked.clear()
+        self._open.clear()
         self._reader = self.dialect.reader(0)
         self._held.end()
         self._held.pass_on((event,))
@@ -605,15 +604,15 @@ class LineMachine:
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        """Say a request, or put it in line; write :meth:`data_to_send` next.
+        """Send a request, or put it in line; write :meth:`data_to_send` next.
 
-        A Get status whose answer is owed is not repeated: it is new enough. Disconnect has no
-        words, the connection's end is that. A request without an answer goes out at once.
+        A Get status whose answer is pending is not repeated: it is new enough. Disconnect sends
+        nothing, it ends the connection. A request without an answer is sent at once.
 
         Raises:
-            LocalProtocolError: not in this state, or an answer of the same kind is still owed.
+            LocalProtocolError: not in this state, or an answer of the same kind is pending.
             UnsupportedError: the dialect has no such message.
-            ConfigurationError: a field of it cannot stand in a line.
+            ConfigurationError: one of its fields cannot stand in a line.
         """
         kind = type(message)
         self.dialect.message_id(kind)
@@ -626,7 +625,7 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        if any(row.request is one.row.request and not one.question for one in self._asked):
+        if any(row.request is one.row.request and not one.question for one in self._open):
             if kind is m.GetStatus:
                 return
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
@@ -637,23 +636,23 @@ class LineMachine:
             self.state = State.CONNECTING
 
     def _begin(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
-        """Say the first line of a request, or put it in line."""
+        """Send the first line of a request, or put the request in line."""
         script = self.dialect.script(row, message)
         asked = _OpenRequest(row, script, next(script), row.word, question=question)
-        if row.answer is None or self.dialect.at_once or not self._asked:
-            self._say(asked)
+        if row.answer is None or self.dialect.at_once or not self._open:
+            self._send_line(asked)
         else:
-            self.dialect.pack(asked.line, "")  # where it cannot be said, nothing has changed
+            self.dialect.pack(asked.line, "")  # if this raises, nothing has changed
         if row.answer is not None:
-            self._asked.append(asked)
+            self._open.append(asked)
 
-    def _say(self, asked: _OpenRequest) -> None:
-        """Say the line of a request; its answer is known by its ticket, or by its word."""
+    def _send_line(self, asked: _OpenRequest) -> None:
+        """Send the line of a request; its answer is matched by its ticket, or by its word."""
         ticket = self._next_ticket() if self.dialect.tickets else ""
         data = self.dialect.pack(asked.line, ticket)
         word = asked.known_by
         asked.word = ticket or (_first_word(asked.line) if word is None else word)
-        asked.said = True
+        asked.sent = True
         self._outbox.append(data)
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)
@@ -661,8 +660,8 @@ class LineMachine:
             self._trace(m.Sender.CLIENT, Frame(0, data.removesuffix(self.dialect.line_end)))
 
     def _next_ticket(self) -> str:
-        """Return a ticket that no request which waits for its answer has."""
-        used = {one.word for one in self._asked}
+        """Return a ticket that no waiting request has."""
+        used = {one.word for one in self._open}
         return next(ticket for ticket in self._tickets if ticket not in used)
 
     def data_to_send(self) -> list[bytes]:
@@ -670,6 +669,6 @@ class LineMachine:
         outbox, self._outbox = self._outbox, []
         return outbox
 
-    def _tell(self, sender: m.Sender, line: str) -> None:
+    def _trace_line(self, sender: m.Sender, line: str) -> None:
         if self._trace is not None:
             self._trace(sender, Frame(0, line.encode(self.dialect.encoding, "replace")))

@@ -49,7 +49,7 @@ class Frame(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class ResultBurst:
-    """Result containers of one application, one right after the other; two or more as they come.
+    """Two or more result containers of one application that came one right after the other.
 
     The client's machine returns it for containers that came in one delivery, so that a free-running
     camera costs no object for each. Iterating yields them one by one.
@@ -95,18 +95,18 @@ Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 
 
 class LinkMachine(Protocol):
-    """The machine's side of a link in the client's role: the methods that a link calls.
+    """The methods of a machine in the client's role that a link calls.
 
-    Each kind of protocol brings its own: for frames, for lines of text. Received bytes go in by
-    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram); they come out
-    of :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever their form on the
+    Each kind of protocol has its own: for frames, for lines of text. Received bytes go in by
+    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram). :meth:`events`
+    returns them as messages of :mod:`smartcam.protocols.messages`, whatever their form on the
     wire.
     """
 
     transport: Transport
     """The transport of the link."""
     replies: bool
-    """True if the machine may have bytes to send after it received some."""
+    """True if the machine may have bytes to send after receiving some."""
     counters: Counters
     """The counters of bytes and messages."""
 
@@ -117,7 +117,7 @@ class LinkMachine(Protocol):
 
     @property
     def kin(self) -> Sequence[Dialect]:
-        """The dialects that this may be: more than one until :meth:`adopt` says which."""
+        """The dialects that the camera may speak: several until :meth:`adopt` chooses one."""
         ...
 
     @property
@@ -127,7 +127,7 @@ class LinkMachine(Protocol):
 
     @property
     def pending(self) -> bytes:
-        """Received bytes of an unfinished frame."""
+        """Copy of the received bytes of an unfinished frame."""
         ...
 
     def adopt(self, dialect: Dialect) -> None:
@@ -138,17 +138,17 @@ class LinkMachine(Protocol):
         ...
 
     def filled(self, count: int, now: float) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
+        """Accept ``count`` bytes that were written into :meth:`room`; False for no events yet.
 
-        ``now`` serves to bound the time that a frame may take: seconds since any beginning.
+        ``now``: seconds of any clock, which bound the time that a frame may take.
         """
         ...
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
+        """Add bytes of a stream, or one whole datagram; never raises for bad bytes."""
 
     def receive_eof(self) -> None:
-        """Take note that the peer will send no more."""
+        """Note that the peer will send no more."""
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; the caller owns the list."""
@@ -168,13 +168,13 @@ class LinkMachine(Protocol):
 
 
 def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
-    """Say messages that go out together, one after the other.
+    """Send messages one after the other, which go out together.
 
-    A second Query among them is no second request: a trigger stands between the two. A status that
-    is asked for comes by itself as well, so it is owed to nobody.
+    A second Query among them is allowed, since a trigger stands between the two. A status also
+    comes by itself, so a request for it leaves no answer pending.
 
     Raises:
-        LocalProtocolError: the protocol's state forbids one; those before it are said.
+        LocalProtocolError: the protocol's state forbids a message; those before it are sent.
     """
     queried = False
     for message in messages:

@@ -1,7 +1,7 @@
 """Cameras that speak in frames with a header of text: a ticket, the length, and the content.
 
-Each request carries a ticket, and its answer carries it back, so answers may come in any order, and
-with other things between. A dialect of this kind is one of lines whose lines are cut by length.
+Each request carries a ticket that its answer repeats, so answers may come in any order, and
+with other frames between. Such a dialect is a dialect of lines whose lines are cut by length.
 Contents are bytes; as texts they are Latin-1, in which each character is one byte.
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _DIGIT = re.compile(rb"[0-9]")
 
 ENCODING = "latin-1"
-"""One byte for each character, whatever is in it."""
+"""One byte for each character, whatever the content."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,7 +32,7 @@ class TicketedDialect(LineDialect):
 
     Args:
         digits: digits of the length, 0 for frames without a header, which end with their first
-            ``CR LF``. The length counts the ticket, the content and the ``CR LF`` behind it.
+            ``CR LF``. The length counts the ticket, the content and the ``CR LF`` after it.
         asks_with_length: requests have the header, too.
     """
 
@@ -89,8 +89,8 @@ class TicketedDialect(LineDialect):
         return LineReader(ends, max_line=max_length, encoding=ENCODING)
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
-        """Return a frame in words."""
-        asked = sender.value == "client"  # whose frames are traced with their header
+        """Return a frame in readable form."""
+        asked = sender.value == "client"  # the client's frames are traced with their header
         headed = asked and self.asks_with_length
         body = frame.payload.partition(b"\r\n")[2] if headed else frame.payload
         ticket, content = body[: self.width].decode(ENCODING), body[self.width :]
@@ -104,9 +104,9 @@ class HeaderReader(LineReader):
     """Cuts frames with a header of text from a stream of bytes.
 
     Args:
-        width: digits of a ticket, 0 for frames without.
+        width: digits of a ticket, 0 for frames without tickets.
         digits: digits of the length.
-        max_length: bytes of a content at most.
+        max_length: largest number of bytes of a content.
     """
 
     def __init__(self, width: int, digits: int, max_length: int) -> None:
@@ -119,7 +119,7 @@ class HeaderReader(LineReader):
     def next_line(self) -> str | None:
         """Return the next frame's ticket and content, None if no whole one is there.
 
-        Raises FrameError: what came is no frame; the stream cannot be read on.
+        Raises FrameError: the bytes are no frame; the stream cannot be read on.
         """
         header = bytes(self._buffer[: self._size])
         if len(header) < self._size:
@@ -144,6 +144,6 @@ class HeaderReader(LineReader):
         return body[:-2].decode(ENCODING)
 
     def _may_begin(self, header: bytes) -> bool:
-        """Return True if a frame may begin with these bytes, of which there are too few."""
+        """Return True if these bytes, too few for a header, may begin a frame."""
         model = b"0" * self._width + b"L" + b"0" * (self._size - self._width - 3) + b"\r\n"
         return _DIGIT.sub(b"0", header) == model[: len(header)]

@@ -1,11 +1,11 @@
-"""The words that client and camera exchange, whatever the wire looks like.
+"""The messages that client and camera exchange, whatever the wire looks like.
 
-Each message is a frozen dataclass that declares its body once: a field's annotation says what it is
+Each message is a frozen dataclass that declares its body once: a field's annotation is its form
 on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table
-(``protocols/_bvs.py``) says which message has which id, and which of its fields the dialect leaves
-out; codecs, construct views and the documentation are made from both. When a message may come is
-said in ``protocols/_framed/machine.py``: a request or report that is new stands among those of a
-session there.
+(``protocols/_bvs.py``) gives each message its id, and lists the fields that the dialect leaves
+out; codecs, construct views and the documentation are made from both. ``TRANSITIONS`` in
+``protocols/_framed/machine.py`` lists when messages may come; new requests and reports join those
+of a session there.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ StatusWord = Annotated[Status, Wire.WORD]
 class Message:
     """Base of all messages.
 
-    One without fields of its own is what its base makes of it, and no dataclass by itself: making
-    one takes as long as importing a module.
+    A message without fields of its own is no dataclass, since making a dataclass takes as long as
+    importing a module.
 
     Attributes:
         sender: side of the link that may send the message.
@@ -117,7 +117,7 @@ class Request(Message):
 
 
 class Report(Message):
-    """A message from camera to client: an answer, or sent by itself."""
+    """A message from camera to client: an answer, or sent unasked."""
 
     __slots__ = ()
     sender: ClassVar[Sender] = Sender.CAMERA
@@ -125,10 +125,10 @@ class Report(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement(Report):
-    """The answer to a command in a dialect with result codes; which code means what it says.
+    """The answer to a command in a dialect with result codes; the dialect explains the codes.
 
     Attributes:
-        code: what became of the request; a dialect without result codes leaves it out: 0.
+        code: outcome of the request; 0 in a dialect without result codes.
     """
 
     code: Word = 0
@@ -136,7 +136,7 @@ class Acknowledgement(Report):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectAnswer(Acknowledgement):
-    """The session is there. ``version`` counts up with the protocol; 1 is the only one known."""
+    """The session has begun. ``version`` counts up with the protocol; only 1 is known."""
 
     version: Word
 
@@ -154,7 +154,7 @@ class StatusReport(Report):
     Attributes:
         status: the bits.
         endian: byte order of result containers and input data: 0 little (published), 1 big
-            (inferred). It does not affect headers and messages. Where a dialect leaves it out
+            (inferred). It does not affect headers and messages. In a dialect without this field
             everything is little endian.
     """
 
@@ -163,11 +163,11 @@ class StatusReport(Report):
 
 
 UNNAMED_APPLICATION = -1
-"""Application of a result container that does not say whose it is, or that has no id."""
+"""Application of a result container that does not name its application, or that has no id."""
 
 
 class CellValue(NamedTuple):
-    """A value as text: the name of its cell, and the text, None for a cell that has none."""
+    """A value as text: the name of its cell, and the text, None for a cell without a value."""
 
     cell: str
     text: str | None
@@ -180,12 +180,11 @@ class ResultContainer(Report):
     Attributes:
         application: id of the application.
         data: bytes of the values.
-        cells: the values that ``data`` was put together from, where the protocol has them as
-            texts. The fields of a layout are these values, in order.
-        fault: reason why the values cannot come from one inspection, None if nothing speaks against
-            it.
-        asked: whether the wire says that it answers a trigger of this client, the one that is under
-            way or was given up last, or that it answers none; None if the wire does not say so.
+        cells: the values of which ``data`` was made, if the protocol sends them as texts. The
+            fields of a layout are these values, in order.
+        fault: reason why the values cannot come from one inspection, None if there is none.
+        asked: True if the wire shows that it answers a trigger of this client, the running or the
+            last given-up one; False if it answers none; None if the wire does not show it.
     """
 
     application: Word = UNNAMED_APPLICATION
@@ -197,12 +196,12 @@ class ResultContainer(Report):
 
 @dataclass(frozen=True, slots=True)
 class Notice(Report):
-    """A remark of the camera's own that is neither a status nor a result.
+    """A notice of the camera that is neither a status nor a result.
 
     Attributes:
         kind: ``"error"``, ``"notification"`` or ``"debug"``.
-        code: the camera's number of it, 0 where it has none.
-        text: what the camera says.
+        code: the camera's number of the notice, 0 without one.
+        text: the camera's text.
     """
 
     kind: str = "error"
@@ -219,25 +218,25 @@ class QueryAnswer(Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwitchAnswer(Acknowledgement):
-    """Comes after the switch. ``code`` says what became of it; ``application`` is active now."""
+    """Comes after the switch. ``code`` is its outcome; ``application`` is active now."""
 
     application: Word
 
 
 class TriggerAnswer(Acknowledgement):
-    """The trigger was understood; not whether an inspection began."""
+    """The trigger was understood; an inspection may not have begun."""
 
     __slots__ = ()
 
 
 class SetClockAnswer(Acknowledgement):
-    """The clock is set, or why not."""
+    """The clock is set, or the code gives the reason why not."""
 
     __slots__ = ()
 
 
 class SetInputAnswer(Acknowledgement):
-    """The input data (BVS ID: the reference value) is taken, or why not."""
+    """The input data (BVS ID: the reference value) is taken, or the code gives the reason."""
 
     __slots__ = ()
 
@@ -249,13 +248,13 @@ class ResetErrorsAnswer(Acknowledgement):
 
 
 class StartAnswer(Acknowledgement):
-    """Run mode is entered, or why not."""
+    """Run mode is entered, or the code gives the reason why not."""
 
     __slots__ = ()
 
 
 class StopAnswer(Acknowledgement):
-    """Run mode is left, or why not."""
+    """Run mode is left, or the code gives the reason why not."""
 
     __slots__ = ()
 
@@ -324,7 +323,7 @@ class SwitchApplication(Request):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadFile(Request):
-    """Load the application of a file's name; the active one must be stopped."""
+    """Load an application by the name of its file; the active one must be stopped."""
 
     answer: ClassVar[type[Message] | None] = SwitchAnswer
 
@@ -386,7 +385,7 @@ class Trigger(Request):
 
 
 class EndTrigger(Request):
-    """End the trigger under way now: what the camera has by then is its result."""
+    """End the running trigger now: its result has the codes that were read by then."""
 
     __slots__ = ()
 
@@ -423,7 +422,7 @@ class UnknownMessage(Message):
 class MalformedMessage(Message):
     """A whole frame with a known id whose body is too short or too long.
 
-    A camera that answers with result codes gets it; elsewhere such a frame is dropped.
+    The machine of a camera with result codes reports it; other machines drop such a frame.
     """
 
     message_id: int
@@ -433,7 +432,7 @@ class MalformedMessage(Message):
 def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
     """Return name and wire type of each field of a message's body, in order.
 
-    They are all that any dialect has; a dialect's row says which of them are on its wire.
+    It has all fields of all dialects; a dialect's row lists those on its wire.
     """
     found = _WIRE_FIELDS.get(message_type)
     if found is None:

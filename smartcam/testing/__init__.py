@@ -1,4 +1,4 @@
-"""Tools for tests of a client, a camera or a plug-in; nothing but tests imports them.
+"""Tools for tests of a client, a camera or a plug-in; only tests import them.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Expectations on what went over the wire, for tests of anybody's client.
+"""Expectations on the messages on the wire, for tests of any client.
 
 ::
 
@@ -6,7 +6,7 @@
     emulated_camera.log.expect_nothing_while_busy()
     emulated_camera.log.expect_disconnect_before_close()
 
-What is expected may still be on its way, so each of them looks again and again until its time is
+Expected messages may still be on their way, so each method looks again and again until its time is
 over. A failure is an ``AssertionError`` that shows the log.
 """
 
@@ -43,7 +43,7 @@ ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
     m.GetStatus,
     m.Disconnect,
 )
-"""Messages that a client may send while the camera is BUSY: they ask for nothing that takes the
+"""Messages that a client may send while the camera is BUSY, since they take none of the
 camera's time (inferred)."""
 
 MAX_SHOWN_ENTRIES = 40
@@ -54,13 +54,13 @@ LOOK_INTERVAL = 0.005
 
 
 class CameraLog(Sequence["LogEntry"]):
-    """The log of an emulated camera's traffic, oldest first; looked at anew each time.
+    """The log of an emulated camera's traffic, oldest first; read anew for each use.
 
     Args:
         read: function that returns the entries.
         visits: function that returns the connections that have ended.
-        links: function that returns who is connected; nobody where there are no connections.
-        pushed_out: function that returns how many entries are gone because the log was full.
+        links: function that returns the connected clients; empty without connections.
+        pushed_out: function that returns the number of entries dropped because the log was full.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class CameraLog(Sequence["LogEntry"]):
 
     @property
     def pushed_out(self) -> int:
-        """Entries that are gone because the log was full; what is expected of all then fails."""
+        """Entries dropped because the log was full; expectations about all entries then fail."""
         return self._pushed_out()
 
     @property
@@ -111,17 +111,17 @@ class CameraLog(Sequence["LogEntry"]):
     # ------------------------------------------------------------------ expectations
 
     def expect(self, *expected: Expected, only: bool = False, timeout: float = 5.0) -> None:
-        """See that these messages went over the wire, in this order.
+        """Check that these messages went over the wire, in this order.
 
         Args:
             expected: messages of the client and of the camera; others may stand between them.
-            only: the client sent nothing else. What the camera said is not looked at unless it is
+            only: the client sent no other message. The camera's messages are ignored unless
                 expected.
-            timeout: seconds that they may still take.
+            timeout: seconds to wait for them.
 
         Raises:
-            AssertionError: the messages did not.
-            ConfigurationError: no message is called so.
+            AssertionError: the messages did not come.
+            ConfigurationError: there is no message of this name.
         """
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
@@ -132,18 +132,18 @@ class CameraLog(Sequence["LogEntry"]):
     def expect_nothing_while_busy(
         self, *also: type[m.Message], grace: float = 0.0, timeout: float = 0.0
     ) -> None:
-        """See that clients sent nothing between the camera's BUSY and the status without it.
+        """Check that clients sent nothing between the camera's BUSY and the status without it.
 
-        Queries, Get status, Connect and Disconnect are allowed. What comes in one piece with the
-        message that made the camera BUSY was sent before.
+        Queries, Get status, Connect and Disconnect are allowed. Messages in one piece with the
+        message that made the camera BUSY count as sent before.
 
         Args:
-            also: what else is allowed.
+            also: other types of messages that are allowed.
             grace: seconds after BUSY in which a message may have been on its way already.
-            timeout: seconds to wait for it to become true; it hardly ever does.
+            timeout: seconds to wait until it is true; waiting rarely helps.
 
         Raises:
-            AssertionError: something else was sent.
+            AssertionError: another message was sent.
         """
         __tracebackhide__ = True
         grace = check_seconds(grace, "grace", "expect_nothing_while_busy")
@@ -155,12 +155,12 @@ class CameraLog(Sequence["LogEntry"]):
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
     def expect_disconnect_before_close(self, *, timeout: float = 5.0) -> None:
-        """See that every client that had a session ended it by Disconnect, and then its connection.
+        """Check that every client with a session ended it by Disconnect, and then its connection.
 
-        Over UDP there is no connection: Disconnect has to be the last message of each.
+        Over UDP there is no connection: Disconnect has to be the last message of each client.
 
         Args:
-            timeout: seconds that it may still take.
+            timeout: seconds to wait for that.
 
         Raises:
             AssertionError: one of the clients did not, or is still connected.
@@ -170,10 +170,10 @@ class CameraLog(Sequence["LogEntry"]):
         self._until(self._unfinished, timeout, whole=True)
 
     def expect_no_errors(self) -> None:
-        """See that all that clients sent was frames that the camera accepts.
+        """Check that the camera accepted all frames of clients.
 
         Raises:
-            AssertionError: something was ignored.
+            AssertionError: a frame was ignored.
         """
         __tracebackhide__ = True
         self._until(_refused, 0.0, whole=True)
@@ -197,7 +197,7 @@ class CameraLog(Sequence["LogEntry"]):
     def _until(
         self, finding: Callable[[list[LogEntry]], str | None], timeout: float, *, whole: bool
     ) -> None:
-        """Look until nothing is found; with ``whole`` nothing may be missing in the log."""
+        """Look until nothing is found; with ``whole`` the log must be complete."""
         __tracebackhide__ = True
         end = time.monotonic() + timeout
         while True:
@@ -244,7 +244,7 @@ def _fits(entry: LogEntry, expected: Expected) -> bool:
 
 
 def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) -> str | None:
-    """Return the mistake in words, None if all is there."""
+    """Return the mistake as text, None without one."""
     frames = [entry for entry in entries if entry.error is None]
     place = 0
     for entry in frames:
@@ -305,7 +305,7 @@ def _text(entry: LogEntry) -> str:
 
 
 def _shown(entries: list[LogEntry]) -> str:
-    """Return the log as it stands in a failure."""
+    """Return the log as text for a failure."""
     lines = (
         [f"  ... {len(entries) - MAX_SHOWN_ENTRIES} before"]
         if len(entries) > MAX_SHOWN_ENTRIES

@@ -1,6 +1,6 @@
 """Emulated cameras in a thread with an event loop of its own.
 
-So they serve any test and any program: a synchronous one, one of asyncio, of trio, of another
+So they serve any test and any program: synchronous, with asyncio, with trio, in another
 language. All methods are synchronous and may be called in any thread::
 
     with ThreadedCamera(active=21, running=True) as emulator:
@@ -49,14 +49,14 @@ class _InThread:
 
 @dataclass(eq=False, repr=False)
 class _InLoop:
-    """Something with ``start()`` and ``stop()`` that lives in a thread's loop."""
+    """An object with ``start()`` and ``stop()`` that lives in a thread's loop."""
 
     _thread: LoopThread
     _hosted: WireCamera | EmulatedFleet
     _owns_thread: bool  # True if the thread starts and ends with this object
 
     def start(self) -> None:
-        """Start what lives in the thread; do nothing if it runs.
+        """Start the object in the thread; do nothing if it runs.
 
         Raises:
             ConfigurationError: the server cannot listen; nothing is started.
@@ -70,11 +70,11 @@ class _InLoop:
             raise
 
     def stop(self) -> None:
-        """Stop what lives in the thread; the log can still be read. Harmless when called twice."""
+        """Stop the object in the thread; the log can still be read. Harmless when called twice."""
         try:
             self._thread.call(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:
-            return  # it does not run
+            return  # the object does not run
         finally:
             if self._owns_thread:
                 self._thread.stop()
@@ -104,10 +104,10 @@ class ThreadedCamera(_InLoop):
             protocol brings.
 
     Attributes:
-        log: what went over the wire, with expectations.
+        log: the messages on the wire, with expectations.
 
     Raises:
-        ConfigurationError: something given is wrong; names what the camera takes.
+        ConfigurationError: an argument is wrong; the error names the possible ones.
         UnsupportedError: the protocol brings no emulated camera.
     """
 
@@ -123,7 +123,7 @@ class ThreadedCamera(_InLoop):
 
     @classmethod
     def in_thread(cls, thread: LoopThread, emulator: WireCamera) -> Self:
-        """Return the synchronous face of an emulator that lives in a thread already."""
+        """Return the synchronous object for an emulator that lives in a thread already."""
         self = cls.__new__(cls)
         self._host(thread, emulator, owns=False)
         return self
@@ -141,21 +141,21 @@ class ThreadedCamera(_InLoop):
     def __repr__(self) -> str:
         return f"<ThreadedCamera {self.name} {self.url}>"
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def url(self) -> str:
-        """Its address with the dialect pinned."""
+        """The camera's address with the dialect pinned."""
         return self._emulator.url
 
     @property
     def host(self) -> str:
-        """The address it listens on."""
+        """The address that the camera listens on."""
         return self._emulator.host
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """The port that the camera listens on."""
         return self._emulator.port
 
     @property
@@ -165,17 +165,17 @@ class ThreadedCamera(_InLoop):
 
     @property
     def dialect(self) -> str:
-        """Name of its wire dialect."""
+        """Name of the camera's wire dialect."""
         return self._emulator.dialect
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The camera's name."""
         return self._emulator.name
 
     @property
     def seed(self) -> int:
-        """Seed of all that is left to chance."""
+        """Seed of all random numbers."""
         return self._emulator.seed
 
     @property
@@ -185,12 +185,12 @@ class ThreadedCamera(_InLoop):
 
     @property
     def device(self) -> Device:
-        """The camera behind the wire; its methods and properties work in any thread."""
+        """The camera itself; its methods and properties work in any thread."""
         return cast("Device", _InThread(self._thread, self._emulator.device))
 
     @property
     def scene(self) -> TableScene:
-        """The table it looks at; ``scene.pieces`` may be changed in any thread."""
+        """The table that the camera sees; ``scene.pieces`` may be changed in any thread."""
         return self._bvs("scene").scene
 
     @property
@@ -220,7 +220,7 @@ class ThreadedCamera(_InLoop):
 
     @property
     def commands(self) -> tuple[str, ...]:
-        """The commands that its timeline knows."""
+        """The commands of the camera's timeline."""
         return self._emulator.commands
 
     @property
@@ -228,7 +228,7 @@ class ThreadedCamera(_InLoop):
         """Number of times that each cue of the timeline has happened."""
         return self._look(lambda: self._emulator.cues_done)
 
-    # ------------------------------------------------------------------ what it does
+    # ------------------------------------------------------------------ actions
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
         """Add faults; as :meth:`~smartcam.emulator.EmulatedCamera.inject`."""
@@ -247,7 +247,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.command, name)
 
     def advance(self, seconds: float) -> None:
-        """Move the camera's manual clock on; all that falls due has happened then.
+        """Advance the camera's manual clock; all events that fall due have happened on return.
 
         Raises:
             ConfigurationError: the clock runs in real time, or the time is negative.
@@ -266,7 +266,7 @@ class ThreadedCamera(_InLoop):
     ) -> None:
         """Wait until clients have sent that many messages of a kind; the device has handled them.
 
-        In a coroutine use :meth:`received`: this holds up the event loop that calls it.
+        In a coroutine use :meth:`received`, since this method blocks the calling event loop.
 
         Raises:
             ResponseTimeoutError: the messages did not come in time.
@@ -292,7 +292,7 @@ class ThreadedCamera(_InLoop):
         try:
             asyncio.get_running_loop()
         except RuntimeError:
-            import anyio.to_thread  # who has trio and no asyncio has anyio
+            import anyio.to_thread  # a test with trio and without asyncio has anyio
 
             await anyio.to_thread.run_sync(future.result, abandon_on_cancel=True)
         else:
@@ -305,7 +305,7 @@ class ThreadedCamera(_InLoop):
         raise UnsupportedError(f"{self._emulator!r} has no {what}; an EmulatedCamera has")
 
     def _look(self, function: Callable[[], T]) -> T:
-        """Call in the thread, or in this one where the thread has ended and nothing changes."""
+        """Call a function in the thread; in the caller's if the thread has ended."""
         try:
             return self._thread.run(function)
         except ConfigurationError:
@@ -320,7 +320,7 @@ class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
         options: options of :class:`~smartcam.emulator.EmulatedFleet`.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     def __init__(self, scenarios: Any, **options: Any) -> None:
@@ -335,7 +335,7 @@ class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
         """Return a camera.
 
         Raises:
-            KeyError: no camera is called so.
+            KeyError: no camera has this name.
         """
         return self._cameras[name]
 
@@ -347,5 +347,5 @@ class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
 
     @property
     def urls(self) -> dict[str, str]:
-        """Their addresses by name."""
+        """The cameras' addresses by name."""
         return self._fleet.urls

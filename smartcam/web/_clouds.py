@@ -1,8 +1,8 @@
-"""The site of clouds: the newest one, to whoever looks.
+"""The site that shows the newest cloud to its viewers.
 
-Each viewer has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
-goes when the page says that it has shown the last. A cloud crosses as it lies in memory, in parts,
-so that the loop goes on meanwhile. A large one is thinned for the page, which says so.
+Each viewer has a WebSocket, with one cloud on the way at a time: when the page reports that it has
+shown the last cloud, the newest one is sent. A cloud is sent as it lies in memory, in parts, so
+that the event loop runs meanwhile. A large cloud is thinned for the page, with a note.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_CLOUD_POINTS: Final = 1_000_000
 """Largest number of points of a cloud that are sent to a page; a cloud of more is thinned."""
 
 MAX_VIEWERS: Final = 8
-"""Pages that may be open at a time; each may have a cloud of 15 MB on the way."""
+"""Largest number of pages open at a time; each may have a cloud of 15 MB on the way."""
 
 PROTOCOL: Final = "smartcam.cloud"
 """Subprotocol of the WebSockets that send clouds."""
@@ -39,13 +39,13 @@ PART_BYTES: Final = 1 << 16
 """Bytes of a message that are written at a time."""
 
 SLOW: Final = 60.0
-"""Seconds within which a page must have taken a cloud and shown it."""
+"""Seconds within which a page must have received and shown a cloud."""
 
 Up: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 class _Packed(NamedTuple):
-    """A cloud as it crosses."""
+    """A cloud in the form in which it is sent."""
 
     about: dict[str, Any]
     body: bytes  # float32 x, y, z of all points, then uint8 red, green, blue of all, if there are
@@ -64,12 +64,12 @@ class CloudSite(ThreadedSite):
         cloud: the cloud shown first; None: the page waits for one.
         up: the axis that points up when the page is opened; ``-y`` is up for a camera that stands
             level.
-        host: address to listen on; nothing but this.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry, as :class:`~smartcam.web.FramesSite` has it.
+        token: token that every call must carry, as for :class:`~smartcam.web.FramesSite`.
 
     Raises:
-        ConfigurationError: the token cannot be used, it is no cloud, or no such axis.
+        ConfigurationError: the token cannot be used, ``cloud`` is no cloud, or ``up`` no axis.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class CloudSite(ThreadedSite):
         self.viewers: set[CloudViewer] = set()
         self._up = up
         self._cloud: Cloud = Cloud(np.empty((0, 3)))
-        self._number = 0  # of the cloud; 0: there is none yet
+        self._number = 0  # number of the cloud; 0: none yet
         self._newer = asyncio.Event()
         self._packing: tuple[int, asyncio.Future[_Packed]] | None = None
         if cloud is not None:
@@ -96,8 +96,8 @@ class CloudSite(ThreadedSite):
     def show(self, cloud: Cloud) -> None:
         """Show a cloud in place of the last one, from the event loop's thread.
 
-        A viewer gets it as soon as the last one is shown; one that is replaced before is
-        skipped. It is thinned and packed in a thread.
+        A viewer gets it as soon as it has shown the last one; a cloud that is replaced before that
+        is skipped. It is thinned and packed in a thread.
 
         Raises:
             ConfigurationError: the value is no cloud.
@@ -110,7 +110,7 @@ class CloudSite(ThreadedSite):
         self._newer = asyncio.Event()
 
     async def stop(self) -> None:
-        """Close the port; nobody looks any longer."""
+        """Close the port, and end the viewers."""
         for one in self.viewers:
             one.end()
         try:
@@ -119,9 +119,9 @@ class CloudSite(ThreadedSite):
             self._packing = None
 
     async def newer(self, number: int) -> tuple[int, _Packed]:
-        """Return the newest cloud after one of a number, packed once for all, and its number.
+        """Return the newest cloud after a number, packed once for all viewers, and its number.
 
-        Cancellation: safe; others who wait for it get it.
+        Cancellation: safe; other callers that wait for the cloud get it.
         """
         while self._number <= number:
             await self._newer.wait()
@@ -146,13 +146,13 @@ class CloudSite(ThreadedSite):
 
 def _seen(made: asyncio.Future[_Packed]) -> None:
     if not made.cancelled():
-        made.exception()  # the asker may be gone, and then nobody else asks
+        made.exception()  # marks the error as handled if all callers are gone
 
 
 def packed(cloud: Cloud) -> _Packed:
-    """Return a cloud as it crosses, thinned where it is large; it belongs into a thread.
+    """Return a cloud in its form for sending, thinned if it is large; call it in a thread.
 
-    What makes it impossible crosses in its place.
+    If that fails, the reason is sent instead.
     """
     try:
         return _packed(cloud)
@@ -184,11 +184,11 @@ def _packed(cloud: Cloud) -> _Packed:
 
 
 def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
-    """Return a cloud of at most so many points, and the voxels' size in metres if it is thinned."""
+    """Return a cloud of at most so many points, and the voxels' size in metres if thinned."""
     if len(cloud) <= most:
         return cloud, None
     reach = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
-    # Not below what float32 tells apart, so far from the origin.
+    # not below the precision of float32 at this distance from the origin
     size = max(reach / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
     while len(thin := voxel_grid(cloud, size)) > most:
         size *= max(1.05, (len(thin) / most) ** 0.5)  # surfaces have as many as 1 / size**2
@@ -199,12 +199,12 @@ class CloudViewer(PageSocket):
     """The WebSocket of a page that shows the cloud."""
 
     def __init__(self, site: CloudSite, request: web.Request) -> None:
-        # one that vanished while nothing was to be sent gives its place back
+        # a page that vanished while nothing was sent gives its place back
         super().__init__(request, PROTOCOL, "cloud", heartbeat=SLOW)
         self._site = site
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show clouds, as any page is shown something."""
+        """Show clouds until the page goes."""
         self._site.viewers.add(self)
         try:
             return await super().serve()
@@ -212,7 +212,7 @@ class CloudViewer(PageSocket):
             self._site.viewers.discard(self)
 
     async def _show(self) -> None:
-        """Send the newest, and wait until it is shown; TimeoutError: it is not."""
+        """Send the newest cloud, and wait until the page shows it; TimeoutError: too late."""
         number = 0
         while True:
             number, cloud = await self._site.newer(number)
@@ -225,7 +225,7 @@ class CloudViewer(PageSocket):
                 await self._shown.wait()
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[CloudSite] = Calls()
 """All calls."""
@@ -246,8 +246,8 @@ def _cloud(site: CloudSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/clouds",
-    about="A WebSocket: the newest cloud after each `next` that one says. JSON, which says how "
-    "many bytes follow; then these in parts: x, y, z as float32, red, green, blue as uint8.",
+    about="A WebSocket: the newest cloud after each `next`. JSON with the number of "
+    "bytes; then these in parts: x, y, z as float32, red, green, blue as uint8.",
 )
 async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)

@@ -1,8 +1,8 @@
 """The site on which a colour is picked: the picture of a camera beside the mask of a range.
 
-A page asks for each picture when it has shown the last one, so one is on its way at a time, and
-who is slow skips. What it was shown is kept for it: a click is about that picture, not about the
-newest one, and another range is shown at once where the next picture takes long.
+A page asks for each picture when it has shown the last one, so one is on its way at a time, and a
+slow page skips pictures. The pictures that a page shows are kept for it: a click is about such a
+picture, not about the newest one, and another range is shown at once without a new picture.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
 
 MAX_LOOKS: Final = 16
-"""Largest number of pictures asked for at a time: eight people, two each."""
+"""Largest number of pictures that are asked for at a time: two for each of eight viewers."""
 
 MAX_KEPT: Final = 8
-"""Viewers whose pictures are kept."""
+"""Largest number of viewers whose pictures are kept."""
 
 PICTURES_PER_VIEWER: Final = 2
-"""Pictures kept for each viewer: the one that is shown, and the one on its way."""
+"""Pictures kept for each viewer: the shown one, and the one on its way."""
 
 THREADS: Final = 2
 """Threads that make pictures and masks."""
@@ -66,18 +66,18 @@ class ColourSite(ThreadedSite):
 
     Args:
         source: source that the caller opens and closes. It streams for each picture that is asked
-            for; ``linger`` lets it stream on in between.
+            for; ``linger`` keeps it streaming in between.
         colours: range of colours that the page begins with.
-        quality: quality of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as
-            it is.
-        host: address to listen on; nothing but this.
+        quality: quality of the JPEGs that are made, 1 to 100. JPEGs of the camera stay as they
+            are.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``, as
-            :class:`~smartcam.web.LiveSite` has it.
+        token: token that every call must carry in ``Authorization: Bearer``, as for
+            :class:`~smartcam.web.LiveSite`.
 
     Attributes:
-        source: source that was given.
-        colours: colours that were given.
+        source: the given source.
+        colours: the given colours.
 
     Raises:
         ConfigurationError: the token cannot be used, or the quality is not valid.
@@ -108,7 +108,7 @@ class ColourSite(ThreadedSite):
         self._kept: OrderedDict[str, deque[Frame]] = OrderedDict()
 
     async def stop(self) -> None:
-        """Close the port; nothing is kept."""
+        """Close the port, and drop all pictures."""
         try:
             await super().stop()
         finally:
@@ -142,7 +142,7 @@ class ColourSite(ThreadedSite):
         """Return the last frame that a viewer got, or the one with a number.
 
         Raises:
-            RefusedError: the frame is not kept any longer.
+            RefusedError: the frame is no longer kept.
         """
         for frame in reversed(self._kept.get(viewer, ())):
             if sequence in {None, frame.sequence}:
@@ -151,12 +151,12 @@ class ColourSite(ThreadedSite):
         raise RefusedError(409, f"{which} that is not kept any longer", "the one that is shown")
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
-        """Have a thread do something with a frame.
+        """Run a function on a frame in a thread.
 
         Raises:
-            RefusedError: its bytes are wrong, or the site is stopped.
+            RefusedError: the frame's bytes are wrong, or the site is stopped.
 
-        Cancellation: safe; a thread that has begun goes on to the end.
+        Cancellation: safe; a function that has begun runs to its end.
         """
         try:
             return await self.in_thread(what, *args)
@@ -164,20 +164,20 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a frame that can be read") from exc
 
     def segmented(self, frame: Frame, colours: ColourRange) -> bytes:
-        """Return a frame as the page gets it; it takes milliseconds, and belongs into a thread.
+        """Return a frame in the page's form; call it in a thread, since it takes milliseconds.
 
         Returns:
             The length of the JSON in four bytes, the lowest first, the JSON, a JPEG of the frame
             and a PNG of the mask; ``jpeg`` in the JSON is the length of the JPEG.
 
         Raises:
-            FrameFormatError: its bytes are wrong.
+            FrameFormatError: the frame's bytes are wrong.
         """
         picture = jpeg(frame, self._quality)
         mask = colours.mask_hsv(hsv(frame))
         _, png = load("cv2").imencode(".png", mask.view(np.uint8) * 255)
         regions = find_regions(mask, area=(MIN_REGION_SHARE * mask.size, np.inf), most=MAX_REGIONS)
-        said = {
+        values = {
             "sequence": frame.sequence,
             "width": frame.width,
             "height": frame.height,
@@ -199,7 +199,7 @@ class ColourSite(ThreadedSite):
             ],
             "jpeg": len(picture),
         }
-        head = json.dumps(said).encode()
+        head = json.dumps(values).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture, png.tobytes()))
 
     @contextlib.contextmanager
@@ -214,7 +214,7 @@ class ColourSite(ThreadedSite):
             self._looks -= 1
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[ColourSite] = Calls()
 """All calls."""
@@ -223,7 +223,7 @@ _Viewer = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class RangeBody(CallBody):
-    """A range of colours, as :class:`ColourRange` has it."""
+    """A range of colours, with the fields of :class:`ColourRange`."""
 
     hue: list[int]
     saturation: list[int]
@@ -233,7 +233,7 @@ class RangeBody(CallBody):
         """Return the range.
 
         Raises:
-            RefusedError: the text is not valid.
+            RefusedError: a value is not valid.
         """
         try:
             return ColourRange(**self.model_dump())
@@ -242,7 +242,7 @@ class RangeBody(CallBody):
 
 
 class LookBody(CallBody):
-    """A picture is wanted."""
+    """The query of a picture."""
 
     viewer: _Viewer
     range: RangeBody
@@ -250,7 +250,7 @@ class LookBody(CallBody):
 
 
 class AroundBody(CallBody):
-    """The colours around a pixel of a picture are wanted."""
+    """The query of the colours around a pixel of a picture."""
 
     viewer: _Viewer
     sequence: int
@@ -275,7 +275,7 @@ def _source(site: ColourSite, _call: CallRequest) -> object:
     f"{API}/look",
     body=LookBody,
     sample='{"viewer": "me", "range": {"hue": [0, 179], "saturation": [0, 255], "value": [0, 60]}}',
-    about="The next frame as a JPEG and the mask of a range as a PNG, behind JSON with the regions;"
+    about="The next frame as a JPEG and the mask of a range as a PNG, after JSON with the regions;"
     ' `"again": true`: of the last frame that this viewer got. The device streams for it.',
 )
 async def _look(site: ColourSite, call: CallRequest) -> web.Response:

@@ -1,7 +1,7 @@
-"""The connections of a site: how many there are, and how long each may take for a request.
+"""The connections of a site: their number, and their time for a request.
 
-It is the policy of every port (:mod:`smartcam._accepting`), and holds before a token is looked at.
-A whole request counts as a session while it is answered.
+The policy is that of every port (:mod:`smartcam._accepting`), and applies before the token is
+checked. A complete request counts as a session while it is answered.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_CONNECTIONS = 64
-"""Largest number of connections at a time, event streams among them. A browser opens six, a page
-keeps one of them for its events; some systems give a process 256 file descriptors."""
+"""Largest number of connections at a time, including event streams. A browser opens six, of which a
+page keeps one for its events; some systems give a process 256 file descriptors."""
 
 HEAD_TIMEOUT = 10.0
-"""Seconds within which a request's head must have come, from its first byte; the first head of a
-connection from its beginning."""
+"""Seconds within which a request's head must be complete, from its first byte; for the first head
+of a connection, from the connection's beginning."""
 
 KEEP_ALIVE = 60.0
-"""Seconds that a connection stays open without a request, or with an answer that nobody reads."""
+"""Seconds that a connection stays open without a request, or with an unread answer."""
 
 MAX_HEAD_BYTES = 1 << 15
-"""Largest number of bytes of a request's head: about four times what a browser with many cookies
-sends."""
+"""Largest number of bytes of a request's head: about four times that of a browser with many
+cookies."""
 
 _HEAD_END = b"\r\n\r\n"
 _BUSY = (
@@ -46,7 +46,7 @@ class Visitors:
     """The connections of a site.
 
     Args:
-        make: function that returns what speaks HTTP on a connection.
+        make: function that returns a new HTTP protocol for a connection.
     """
 
     def __init__(self, make: Callable[[], asyncio.Protocol]) -> None:
@@ -61,24 +61,24 @@ class Visitors:
 
 
 class Visitor(asyncio.Protocol):
-    """A connection: stands between its transport and what speaks HTTP."""
+    """A connection, between its transport and its HTTP protocol."""
 
     _transport: asyncio.Transport
 
     def __init__(self, visitors: Visitors) -> None:
-        self.settled: bool = False  # whether a request that has come completely is being answered
+        self.settled: bool = False  # whether a complete request is being answered
         self._visitors = visitors
         self._acceptor = visitors.acceptor
-        self._inner: asyncio.Protocol | None = None  # protocol that takes the bytes; None: nobody
-        self._head: bytearray | None = None  # while a head is awaited: what came of it
-        self._idle = False  # its first byte may take long
-        self._rest: StreamReader | None = None  # a body that was refused before it had come
+        self._inner: asyncio.Protocol | None = None  # protocol for the bytes; None: none
+        self._head: bytearray | None = None  # received part of an unfinished head
+        self._idle = False  # between requests, when the next may take long
+        self._rest: StreamReader | None = None  # body of a request that was refused before its end
         self._peer = "?"
 
     # ------------------------------------------------------------------ from the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take a place, or go."""
+        """Take a place, or close the connection."""
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
@@ -96,14 +96,14 @@ class Visitor(asyncio.Protocol):
             self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Pass the bytes on, unless they are a head without end."""
+        """Pass the bytes on, unless they are an endless head."""
         if self._head is not None:
             self._look_at(data, self._head)
         if self._inner is not None and not self._transport.is_closing():
             self._inner.data_received(data)
 
     def eof_received(self) -> bool | None:
-        """Pass the end on."""
+        """Pass the end of the input on."""
         return None if self._inner is None else self._inner.eof_received()
 
     def pause_writing(self) -> None:
@@ -121,14 +121,14 @@ class Visitor(asyncio.Protocol):
         self._acceptor.leave(self)
         if self._inner is not None:
             self._inner.connection_lost(exc)
-        if self._rest is not None:  # for which aiohttp would wait even now
+        if self._rest is not None:  # aiohttp would still wait for its end
             self._rest.feed_eof()
 
     # ------------------------------------------------------------------ from the site
 
     @contextlib.contextmanager
     def request(self, request: web.BaseRequest) -> Iterator[None]:
-        """Mark a request whose head has come, as long as the block runs."""
+        """Mark a request whose head is complete, while the block runs."""
         self._acceptor.expect(self, None, "")
         self._head = None
         try:
@@ -137,13 +137,13 @@ class Visitor(asyncio.Protocol):
             if request.content.is_eof():
                 self._head, self._idle = bytearray(), True
                 self._acceptor.expect(self, KEEP_ALIVE, "no request")
-            else:  # the connection ends with it
+            else:  # the connection ends with the request
                 self._rest = request.content
                 self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager
     def answer(self) -> Iterator[None]:
-        """Mark a whole request as being answered as long as the block runs: it keeps its place."""
+        """Mark a request as being answered while the block runs, so that it keeps its place."""
         self.settled = True
         try:
             yield
@@ -160,7 +160,7 @@ class Visitor(asyncio.Protocol):
     # ------------------------------------------------------------------ inside
 
     def _look_at(self, data: bytes, head: bytearray) -> None:
-        """Look for the end of the head that is awaited."""
+        """Look for the end of the unfinished head."""
         if self._idle:
             self._idle = False
             self._acceptor.expect(self, HEAD_TIMEOUT, "half a request")
@@ -174,6 +174,6 @@ class Visitor(asyncio.Protocol):
 
 
 def visitor_of(request: web.BaseRequest) -> Visitor | None:
-    """Return the connection that a request came on; None if it is gone."""
+    """Return the connection of a request; None if it is gone."""
     protocol = None if request.transport is None else request.transport.get_protocol()
     return protocol if isinstance(protocol, Visitor) else None

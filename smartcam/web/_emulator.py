@@ -1,4 +1,4 @@
-"""The emulator's site: its page, and an HTTP call for everything the page does."""
+"""The emulator's site: its page, and an HTTP call for every action of the page."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from smartcam.emulator import TableScene, WireCamera
 
 MAX_ENTRIES = 1000
-"""Log entries that one answer tells; ``next`` says where to go on."""
+"""Largest number of log entries in one answer; ``next`` is where to continue."""
 
 MAX_WAIT = 30.0
 """Seconds that a call may wait for a log entry."""
 
 MAX_WAITING_CHANGES = 16
-"""Largest number of calls that may wait for a log entry at a time: with the event streams half of
-the places."""
+"""Largest number of calls that may wait for a log entry at a time: together with the event streams,
+half of the places."""
 
 LOOK_AGAIN = 0.02
 """Seconds between two looks for a log entry."""
@@ -48,8 +48,8 @@ MAX_NAMES = 20
 class EmulatorSite(Site):
     """A page and HTTP calls that show and control emulated cameras.
 
-    The site runs in the emulators' own event loop. The emulators may be started and stopped on
-    their own; each call looks into the mapping anew.
+    The site runs in the emulators' own event loop. Emulators may be started and stopped at any
+    time; each call looks into the mapping anew.
 
     ::
 
@@ -57,11 +57,11 @@ class EmulatorSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        cameras: the cameras by the names that stand in paths.
-        host: address to listen on; nothing but this.
+        cameras: the cameras by their names in paths.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
-            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+        token: token that every call must carry in ``Authorization: Bearer``: at least 16 letters,
+            digits, ``-`` and ``_``. None: no token on a loopback address; else one is made.
 
     Raises:
         ConfigurationError: a name or the token cannot be used.
@@ -85,7 +85,7 @@ class EmulatorSite(Site):
     async def wait_for(
         self, request: web.Request, condition: Callable[[], bool], seconds: float
     ) -> None:
-        """Wait until something holds, for some time, and as long as site and client are there.
+        """Wait until a condition holds, at most so long, and while site and client are there.
 
         Raises:
             RefusedError: 503, :data:`MAX_WAITING_CHANGES` calls wait already.
@@ -105,7 +105,7 @@ class EmulatorSite(Site):
             self._waiting -= 1
 
 
-# ---------------------------------------------------------------------- what calls take
+# ---------------------------------------------------------------------- arguments of calls
 
 
 class _ApplicationBody(CallBody):
@@ -142,7 +142,7 @@ class _PartPose(CallBody):
 
 
 class _Place(BaseModel):
-    """The place where a look into the log begins."""
+    """Place in the log at which a query begins."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
@@ -150,7 +150,7 @@ class _Place(BaseModel):
 
 
 class _Part(_Place):
-    """The part of the log that is wanted."""
+    """The part of the log that a query wants."""
 
     limit: int = Field(default=MAX_ENTRIES, ge=1, le=MAX_ENTRIES)
     wait: float = Field(default=0.0, ge=0, le=MAX_WAIT, allow_inf_nan=False)
@@ -163,7 +163,7 @@ def _as_list(value: object) -> object:
 _FAULTS: TypeAdapter[Any] = TypeAdapter(Annotated[list[Fault], BeforeValidator(_as_list)])
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[EmulatorSite] = Calls()
 """All calls; ``docs/control.md`` shows them."""
@@ -187,7 +187,7 @@ def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
 
 
 def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
-    """Return a method of the camera's operator; RefusedError: the camera has no such method."""
+    """Return a method of the camera's operator; RefusedError: the camera does not have it."""
     emulator = _emulator(site, call)
     if not hasattr(emulator.device, what):
         able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
@@ -196,7 +196,7 @@ def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
 
 
 def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
-    """Return the table that a camera looks at; RefusedError: it looks at none."""
+    """Return the table that a camera sees; RefusedError: it has no table."""
     scene = _emulator(site, call).table
     if scene is None:
         raise RefusedError(409, "a camera without a scene", "one that looks at a table")
@@ -217,7 +217,7 @@ def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", _CAMERA)
 def _state(site: EmulatorSite, call: CallRequest) -> object:
-    """All that one camera's state is."""
+    """The whole state of one camera."""
     name = _name(site, call)
     emulator = site.cameras[name]
     return {
@@ -229,7 +229,7 @@ def _state(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/trigger")
 def _trigger(site: EmulatorSite, call: CallRequest) -> object:
-    """Trigger by the digital input; `taken` tells whether an inspection began."""
+    """Trigger by the digital input; `taken`: whether an inspection began."""
     taken = _operator(site, call, "trigger")()
     return {"taken": taken, "camera": _state(site, call)}
 
@@ -252,7 +252,7 @@ def _stop(site: EmulatorSite, call: CallRequest) -> object:
     "POST", f"{_CAMERA}/application", body=_ApplicationBody, sample='{"id": 7, "running": true}'
 )
 def _application(site: EmulatorSite, call: CallRequest) -> object:
-    """Load another application behind the client's back; 409 while one is loaded."""
+    """Load another application, like an operator; 409 while one is loaded."""
     switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
     if wanted.id not in emulator.application_ids:
@@ -261,14 +261,14 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
         raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
     if not switch(wanted.id, running=wanted.running):
         mode = emulator.device.mode
-        said = getattr(mode, "value", mode)
-        raise RefusedError(409, f"the camera is {said}", "it to be stopped or running")
+        state = getattr(mode, "value", mode)
+        raise RefusedError(409, f"the camera is {state}", "it to be stopped or running")
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
-    """Restart the camera, as by its power switch; without a body as the quirk says."""
+    """Restart the camera, as by its power switch; without a body, by the quirk's setting."""
     wanted: _RebootBody = call.body
     _operator(site, call, "reboot")(wanted.seconds)
     return {"camera": _state(site, call)}
@@ -309,7 +309,7 @@ def _faults(site: EmulatorSite, call: CallRequest) -> object:
     "POST", f"{_CAMERA}/faults", body=_FAULTS, sample='{"kind": "drop", "on": "ResultContainer"}'
 )
 def _inject(site: EmulatorSite, call: CallRequest) -> object:
-    """Inject a fault, or a list of them: all or, where one is wrong, none."""
+    """Inject a fault, or a list of them: all, or none if one is wrong."""
     _emulator(site, call).inject(*call.body)
     return _faults(site, call)
 
@@ -323,7 +323,7 @@ def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/commands/{{command}}")
 def _command(site: EmulatorSite, call: CallRequest) -> object:
-    """Let that row of the scenario's timeline happen."""
+    """Run that row of the scenario's timeline."""
     emulator, name = _emulator(site, call), call.path["command"]
     if name not in emulator.commands:
         known = ", ".join(emulator.commands) or "none: its scenario's timeline has no command"
@@ -370,7 +370,7 @@ def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/scene/reset")
 def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
-    """Put all parts back to where they lay at first."""
+    """Put all parts back to their first places."""
     pieces = _table(site, call).pieces
     pieces.clear()
     pieces.update(PIECES)

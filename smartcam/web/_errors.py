@@ -1,4 +1,4 @@
-"""Answer a call that cannot be done: JSON that says why."""
+"""Refuse a call with an answer in JSON that gives the reason."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 MAX_SHOWN_CHARACTERS = 200
-"""Largest number of characters of what a client sent that a refusal shows."""
+"""Largest number of characters of a client's value that a refusal shows."""
 
 
 @dataclass(eq=False)
 class RefusedError(Exception):
-    """A call cannot be done."""
+    """A call cannot be carried out."""
 
     status: int  # the HTTP status code
     came: str

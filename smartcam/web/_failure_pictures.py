@@ -1,4 +1,4 @@
-"""Fetch the pictures of a fleet's failures, whether anybody looks or not."""
+"""Fetch the pictures of a fleet's failures, with or without viewers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from smartcam.web._fleet_view import FleetView
 
 PERIOD: Final = 0.2
-"""Seconds between two looks at the rows that fail."""
+"""Seconds between two checks of the failing rows."""
 
 CAMERA_PERIOD: Final = 10.0
 """Seconds that must pass between two pictures of one camera."""
 
 SETTLING: Final = 0.2
-"""Seconds in which a newer result would arrive that the camera had when it sent the picture."""
+"""Seconds to wait for a newer result that the camera had when it sent the picture."""
 
 MAX_BYTES: Final = 1 << 28
 """Largest number of bytes that the pictures of all cameras may have together."""
@@ -31,11 +31,11 @@ MAX_PICTURES: Final = 10_000
 class FailurePictures:
     """Asks failing cameras for their pictures, one after the other.
 
-    A picture is kept only where no newer result has come when it is there: else it would show
+    A picture is kept only if no newer result has come when it arrives: otherwise it might show
     another part.
 
     Args:
-        view: view of the fleet, which says who fails.
+        view: view of the fleet, which has the failing rows.
     """
 
     def __init__(self, view: FleetView) -> None:
@@ -44,7 +44,7 @@ class FailurePictures:
         self._bytes = 0
 
     async def run(self) -> None:
-        """Fetch pictures until it is cancelled."""
+        """Fetch pictures until the task is cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(PERIOD)
@@ -63,7 +63,7 @@ class FailurePictures:
                 return
             data = await camera.read_image()
         except SmartCamError:
-            return  # the live page says what is wrong with the camera
+            return  # the live page shows the camera's error
         await asyncio.sleep(SETTLING)
         if row.failure != serial:
             return

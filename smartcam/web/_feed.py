@@ -1,4 +1,4 @@
-"""Finding out what is new with a camera, for one event stream: by asking the emulator's log."""
+"""Find news of a camera for one event stream, from the emulator's log."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
-"""Log entries in one event; at ten events per second it keeps up with 2000 messages per second."""
+"""Largest number of log entries in one event: 2000 messages per second at ten events a second."""
 
 MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks after which the clock is told: once a second. It shows a reader that is gone, too."""
+"""Looks between two reports of the clock: one a second. A report also detects a closed reader."""
 
 
 class Watcher:
     """The state of a camera as one reader knows it.
 
-    ``since`` is the serial of the first log entry that is wanted; None: what comes from now on.
+    ``since`` is the serial of the first log entry that is wanted; None: only new entries.
     """
 
     def __init__(self, name: str, emulator: WireCamera, since: int | None = None) -> None:
@@ -64,7 +64,7 @@ class Watcher:
     def _log(self) -> News | None:
         emulator = self._emulator
         part, entries = serialize.log_part(emulator, self._serial, MAX_LOG_NEWS)
-        self._serial = part["next"]  # a serial of another emulator's time may have been higher
+        self._serial = part["next"]  # an earlier emulator's serial may have been higher
         if not entries and not part["missed"]:
             return None
         return News("log", part, self._serial)

@@ -1,4 +1,4 @@
-"""The site of a fleet: all its cameras in one table, and each on a live page of its own."""
+"""The site of a fleet: a table of all its cameras, and a live page for each."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ if TYPE_CHECKING:
     from smartcam.web._routes import Action
 
 MAX_VIEWERS: Final = 32
-"""Pages of the table that may be open at one time."""
+"""Largest number of pages of the table open at one time."""
 
 MAX_CAMERAS: Final = 16
 """Largest number of cameras that may have a page of their own open at one time."""
 
 LINGER: Final = 30.0
-"""Seconds that a camera is followed for its own page after nobody looks at that any more."""
+"""Seconds that a camera is followed after its own page has no viewer any more."""
 
 KEEP_PERIOD: Final = 1.0
-"""Seconds between two looks at whether anybody does."""
+"""Seconds between two checks for viewers."""
 
 
 class FleetSite(Site):
-    """A page and HTTP calls that show the cameras of a fleet, and each on a page of its own.
+    """A page and HTTP calls that show the cameras of a fleet, and a page for each camera.
 
     ::
 
@@ -53,17 +53,17 @@ class FleetSite(Site):
     Args:
         fleet: an open fleet, which the caller closes.
         control: whether the pages may trigger, start, stop and switch cameras.
-        units: names of the units that the pages show instead of SI from their beginning, such as
-            ``("mm", "deg")``. None: they begin with SI, and their switch shows these two.
-        host: address to listen on; nothing but this.
+        units: names of units that the pages show at first instead of SI, such as
+            ``("mm", "deg")``. None: the pages begin with SI, and their switch offers these two.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry, as :class:`~smartcam.web.FramesSite` has it.
+        token: token that every call must carry, as for :class:`~smartcam.web.FramesSite`.
 
     Attributes:
         view: view of the fleet that the table shows.
-        control: control that was given.
+        control: whether the pages may command cameras.
         viewers: sockets of the pages that show the table.
-        outlets: what the agents tell of their outlets.
+        outlets: the agents' reports on their outlets.
 
     Raises:
         ConfigurationError: the token cannot be used, or a unit is unknown.
@@ -110,7 +110,7 @@ class FleetSite(Site):
         Raises:
             ConfigurationError: the site cannot listen there.
 
-        Cancellation: leaves it stopped.
+        Cancellation: leaves the site stopped.
         """
         try:
             await self.view.start()
@@ -123,7 +123,7 @@ class FleetSite(Site):
             raise
 
     async def stop(self) -> None:
-        """Close the port, and leave the fleet alone."""
+        """Close the port, and stop following the fleet."""
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
@@ -149,10 +149,10 @@ class FleetSite(Site):
     # ------------------------------------------------------------------ one camera
 
     def live(self, name: str) -> WatchedCamera:
-        """Return the follower of a camera for its own page; make one where there is none.
+        """Return the follower of a camera for its own page; make it if there is none.
 
         Raises:
-            RefusedError: 404, no camera is called so; 503, there are :data:`MAX_CAMERAS` already.
+            RefusedError: 404, no camera has this name; 503, there are :data:`MAX_CAMERAS` already.
         """
         known = self._live.get(name)
         if known is None:
@@ -177,7 +177,7 @@ class FleetSite(Site):
         return live
 
     async def _keep(self) -> None:
-        """Leave cameras that nobody looks at, and follow those that became another object."""
+        """Leave cameras without viewers, and follow new objects of the others."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(KEEP_PERIOD)
@@ -191,7 +191,7 @@ class FleetSite(Site):
                     await live.view.follow(now, live.view.loss)
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[FleetSite] = Calls()
 """All calls."""
@@ -205,7 +205,7 @@ def _calls(_site: FleetSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/fleet")
 def _fleet(site: FleetSite, _call: CallRequest) -> object:
-    """The fleet: how many cameras are how, and the outcomes of the last ten minutes."""
+    """The fleet: numbers of cameras by state, and the outcomes of the last ten minutes."""
     about = {"fleet": site.fleet.url, "control": site.control, "agents": sorted(site.view.agents)}
     return {**about, "totals": site.view.totals(), "bars": list(site.view.series)}
 
@@ -232,8 +232,8 @@ async def _cameras(site: FleetSite, call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/table",
-    about="A WebSocket: what changed of the rows in sight, five times a second at most, the next "
-    "after each `next`; it is told as JSON, as in `/api/cameras`, which rows are in sight.",
+    about="A WebSocket: the changes of the rows in sight, five times a second at most, the next "
+    "after each `next`; the page sends the query for the rows as JSON, as in `/api/cameras`.",
 )
 async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)
@@ -255,15 +255,15 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     "GET",
     f"{API}/stored",
     query=StoredRows,
-    about="What agents' stores of results have: the query may have `hours`, `failed` (errors, "
-    "gaps, what did not pass), `camera` (a pattern), `most`.",
+    about="The contents of agents' stores of results: the query may have `hours`, `failed` "
+    "(errors, gaps, failures), `camera` (a pattern), `most`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
     return {"stores": [one._asdict() for one in await site.outlets.stored(call.query)]}
 
 
 def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
-    """Return the handler that does it to the camera of the path."""
+    """Return a handler that acts on the camera in the path."""
 
     def handle(site: FleetSite, call: CallRequest) -> object:
         return handler(site.live(call.path["camera"]), call)
@@ -272,7 +272,7 @@ def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
 
 
 def _add_live_calls() -> None:
-    """Have the live page's calls for each camera."""
+    """Add the live page's calls for each camera."""
     for row in LIVE_CALLS:
         if row.path == API:
             continue

@@ -1,4 +1,4 @@
-"""Outlets on a fleet's page: agents are asked once for all who look."""
+"""Outlets on a fleet's page: agents are asked once for all viewers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from smartcam.fleet._inside import ToldOutlet, ToldStore
 
 ANSWER_AGE: Final = 2.0
-"""Seconds for which the answer for one page does for the others, too."""
+"""Seconds for which one answer is used for all pages."""
 
 MAX_STORE_QUESTIONS: Final = 4
-"""Questions to the stores that pages may have under way at a time."""
+"""Largest number of questions to the stores at a time."""
 
 
 class StoredRows(BaseModel):
-    """The results in stores that a page wants."""
+    """The query of a page for stored results."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
@@ -34,7 +34,7 @@ class StoredRows(BaseModel):
 
 
 class OutletsView:
-    """Asks agents of their outlets.
+    """Asks agents for their outlets.
 
     Args:
         fleet: an open fleet, which the caller closes.
@@ -48,7 +48,7 @@ class OutletsView:
         self._stores = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
     async def accounts(self) -> list[ToldOutlet]:
-        """Return the accounts of all outlets, of :data:`ANSWER_AGE` seconds before at most.
+        """Return the accounts of all outlets, at most :data:`ANSWER_AGE` seconds old.
 
         Raises:
             RefusedError: 503, the fleet is closed.
@@ -67,7 +67,7 @@ class OutletsView:
         """Return the answers of the stores.
 
         Raises:
-            RefusedError: 422, the pattern cannot be one; 503, the fleet is closed.
+            RefusedError: 422, the pattern is not valid; 503, the fleet is closed.
         """
         since = datetime.now(UTC) - timedelta(hours=wanted.hours)
         async with self._stores:

@@ -53,7 +53,7 @@ MODES: Final = ("error", "lost", "ended", "gone", "awaited", "stopped", "busy", 
 """States of a camera, the worst first.
 
 "ended": the camera was taken or given up; "gone": no agent shares it any more; "awaited": it was
-never there.
+never connected.
 """
 
 SI: Final = ShownUnits()
@@ -168,7 +168,7 @@ class FleetRow:
     # ------------------------------------------------------------------ updates
 
     async def take(self, now: float) -> collections.Counter[str]:
-        """Take the new results; return their outcomes. It does not wait."""
+        """Count the new results; return their outcomes. It does not wait."""
         outcomes: collections.Counter[str] = collections.Counter()
         stream, full = self._results, False
         while stream is not None and stream.waiting:
@@ -192,12 +192,12 @@ class FleetRow:
         return outcomes
 
     def account(self, outcomes: collections.Counter[str], now: float) -> None:
-        """Count results that did not come or were not taken; each has the outcome "other"."""
+        """Count lost and dropped results; each has the outcome "other"."""
         if self._results is None:
             return
-        said, before = self._results.statistics(), self._counted
-        self._counted = (said.missed, said.dropped)
-        missed, dropped = said.missed - before[0], said.dropped - before[1]
+        account, before = self._results.statistics(), self._counted
+        self._counted = (account.missed, account.dropped)
+        missed, dropped = account.missed - before[0], account.dropped - before[1]
         if missed:
             text = f"{missed} results did not come: cut off from the agent for too long"
             self._note(text, now)
@@ -246,8 +246,8 @@ class FleetRow:
         """Set the words that describe the state."""
         self.mode = self._word(state)
         self.flags = _flags(self.mode, state, bad=self.error_at is not None)
-        told = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
-        self.text = "\n".join(str(one) for one in told if one is not None).lower()
+        words = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
+        self.text = "\n".join(str(one) for one in words if one is not None).lower()
 
     def _word(self, state: RowState) -> str:
         if not state.agents or self.camera is None:
@@ -319,13 +319,13 @@ class FleetRow:
 
         ``text`` is in SI; ``practical`` is the same in the units of the page's switch.
         """
-        told: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "at": round(result.received_at.timestamp(), 2),
             "number": result.number,
             "outcome": judged(result.value),
         }
         if len(result.raw) > MAX_KEPT_BYTES:
-            return {**told, "text": f"{len(result.raw)} bytes"}
+            return {**fields, "text": f"{len(result.raw)} bytes"}
         value = shown_value(result.value, self._layout)
         if "parts" in value:
             parts = [
@@ -333,14 +333,14 @@ class FleetRow:
                 for one in value["parts"][:MAX_DRAWN]
                 if None not in (one["x"], one["y"], one["theta"])
             ]
-            return {**told, "parts": parts, "parts_count": value["count"]}
+            return {**fields, "parts": parts, "parts_count": value["count"]}
         if "cut" in value:
-            return {**told, "text": value["cut"][:MAX_TEXT_CHARACTERS]}
+            return {**fields, "text": value["cut"][:MAX_TEXT_CHARACTERS]}
         units = value["units"]
         lines = {"text": line_of(value["value"], units)}
         if units:
             lines["practical"] = line_of(value["value"], units, self._units)
-        return {**told, **{name: text[:MAX_TEXT_CHARACTERS] for name, text in lines.items()}}
+        return {**fields, **{name: text[:MAX_TEXT_CHARACTERS] for name, text in lines.items()}}
 
 
 def _why(camera: FleetCamera[Any]) -> str:

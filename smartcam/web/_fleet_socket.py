@@ -1,4 +1,4 @@
-"""A viewer of the fleet's page, who is told what changed of the rows in sight."""
+"""A viewer of the fleet's page, which gets the changes of the rows in sight."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ MAX_MESSAGE_BYTES: Final = 1024
 """Largest number of bytes of a message from a page."""
 
 ALIVE_INTERVAL: Final = 5.0
-"""Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
+"""Seconds after which a page gets a message even without changes, which shows a live link."""
 
 QUICK_INTERVAL: Final = 0.05
 """Seconds that must pass between two messages to a page that scrolls or searches."""
 
 AT_ONCE: Final = 10
-"""Rows that are made JSON before other tasks of the loop have a turn."""
+"""Rows that are converted to JSON before other tasks of the loop have a turn."""
 
 TOTALS_INTERVAL: Final = 1.0
 """Seconds between two messages with the totals of all cameras."""
@@ -59,7 +59,7 @@ class RowsInSight(BaseModel):
 
     @property
     def query(self) -> RowQuery:
-        """Query of the rows that are wanted, and their order."""
+        """Query of the rows in sight, with their order."""
         return RowQuery(self.search, self.filter, self.sort, self.down)
 
 
@@ -85,9 +85,9 @@ class FleetSocket(PageSocket):
         self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has
 
-    def _hear(self, said: str) -> bool:
+    def _receive(self, message: str) -> bool:
         try:
-            self._sight = RowsInSight.model_validate_json(said)
+            self._sight = RowsInSight.model_validate_json(message)
         except ValidationError:
             return False
         self._moved.set()
@@ -116,7 +116,7 @@ class FleetSocket(PageSocket):
             await self._socket.send_str(text)
             await self._shown.wait()
 
-    # ------------------------------------------------------------------ what is new
+    # ------------------------------------------------------------------ changes
 
     async def _news(self) -> str:
         """Return a message with the changes since the last one; "" if there are none."""
@@ -152,7 +152,7 @@ class FleetSocket(PageSocket):
         for name in names:
             row = view.rows.get(name)
             if row is None:
-                continue  # it was forgotten
+                continue  # the row was forgotten
             self._seen[name] = row.version
             if seen.get(name) != row.version:
                 changed.append(row.as_json())

@@ -1,7 +1,7 @@
-"""Keep the fleet's page up to date: follow a fleet once, however many look.
+"""Keep the fleet's page up to date: follow the fleet once for all viewers.
 
-One task looks five times per second at what rang, which costs nothing while nothing happens. Nobody
-who looks is waited for: they ask for rows in an order, and for what is newer than they know.
+One task checks the changed rows five times per second, which costs nothing without changes. It does
+not wait for viewers: they ask for rows in an order, and for changes newer than they know.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ PERIOD: Final = 0.2
 """Seconds between two looks, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Largest number of events of cameras between two looks; after more the whole fleet is read
-anew."""
+"""Largest number of events of cameras between two looks; after more, the whole fleet is read
+again."""
 
 MAX_GONE: Final = 10_000
-"""Largest number of cameras shown although nobody shares them any more; those gone longest are
+"""Largest number of cameras shown although no agent shares them any more; the oldest are
 forgotten."""
 
 AT_ONCE: Final = 50
@@ -48,10 +48,10 @@ SERIES: Final = 600
 """Seconds over which outcomes are kept."""
 
 ORDER_LASTING_TIME: Final = 1.0
-"""Seconds that an order stays while what it goes by changes: rows that jump cannot be read."""
+"""Seconds that an order stays although its key changes: jumping rows cannot be read."""
 
 MAX_ORDERS: Final = 64
-"""Orders that are kept for those who look."""
+"""Largest number of orders that are kept for viewers."""
 
 Filter: TypeAlias = Literal["all", "connected", "errors", "busy", "stopped"]
 Sort: TypeAlias = Literal["name", "state", "rate", "last", "errors"]
@@ -66,12 +66,12 @@ SORTS: Final[dict[str, Callable[[FleetRow], Any]]] = {
 
 
 class RowQuery(NamedTuple):
-    """A query of rows: which ones, and in which order."""
+    """The query of a page: a choice of rows and their order."""
 
-    search: str = ""  # words that all must be in a row
+    search: str = ""  # words that a row must all contain
     filter: Filter = "all"
     sort: Sort = "name"
-    down: bool = False  # the last one first
+    down: bool = False  # descending order
 
 
 class RowOrder(NamedTuple):
@@ -93,9 +93,9 @@ class FleetView:
         rows: cameras by name.
         version: version of all rows, which grows with each change.
         series: counts of the outcomes: start of a bar, seconds since 1970, and the number of
-            results that passed, failed, told neither, or were errors. Empty bars are left out.
+            results that passed, failed, were neither, or were errors. Empty bars are left out.
         failing: rows whose newest result is a failure without a picture.
-        ended: True once the view does not follow the fleet any more.
+        ended: True once the view no longer follows the fleet.
     """
 
     def __init__(self, fleet: Fleet, units: ShownUnits) -> None:
@@ -107,10 +107,10 @@ class FleetView:
         self.failing: dict[FleetRow, None] = {}
         self.ended: bool = True
         self.agents: set[str] = set()
-        self._names: list[str] = []  # sorted; empty: to be made anew
+        self._names: list[str] = []  # sorted; empty until it is made again
         self._rang: dict[FleetRow, None] = {}
-        self._aging: set[FleetRow] = set()  # whose rate or mark of an error changes by itself
-        self._gone: dict[str, None] = {}  # the one gone longest first
+        self._aging: set[FleetRow] = set()  # rows whose rate or error mark changes by itself
+        self._gone: dict[str, None] = {}  # the longest gone first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
@@ -123,7 +123,7 @@ class FleetView:
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Begin: all cameras that are there are known when it returns."""
+        """Begin; all cameras that exist are known when it returns."""
         if self._task is None:
             self.ended = False
             await self._begin()
@@ -135,7 +135,7 @@ class FleetView:
             self.ended = True
 
     async def stop(self) -> None:
-        """End; harmless when called twice."""
+        """End. Harmless when called twice."""
         task, self._task = self._task, None
         self.ended = True
         if task is not None:
@@ -152,7 +152,7 @@ class FleetView:
             while True:
                 await asyncio.sleep(PERIOD)
                 ticks += 1
-                await self._hear()
+                await self._receive_events()
                 await self._look()
                 if ticks * PERIOD >= 1.0:
                     ticks = 0
@@ -161,10 +161,10 @@ class FleetView:
             _log.exception("! the fleet's page follows no more: a fault of ours")
             raise
 
-    # ------------------------------------------------------------------ who is there
+    # ------------------------------------------------------------------ agents and cameras
 
     async def _begin(self) -> None:
-        """Learn which agents and cameras are there."""
+        """Find out which agents and cameras exist."""
         if self._events is not None:
             self._events.close()
         self._events = stream = self.fleet.events(max_queue=MAX_EVENTS)
@@ -178,8 +178,8 @@ class FleetView:
                 self.rows[name].stir()
         await self._look()
 
-    async def _hear(self) -> None:
-        """Note cameras that came or went."""
+    async def _receive_events(self) -> None:
+        """Note cameras that come or go."""
         stream = self._events
         if stream is None:
             return
@@ -226,15 +226,15 @@ class FleetView:
     def _ring(self, row: FleetRow) -> None:
         self._rang[row] = None
 
-    # ------------------------------------------------------------------ what they do
+    # ------------------------------------------------------------------ changes of rows
 
     async def _look(self) -> None:
-        """Look at the rows that rang."""
+        """Update the rows that have changed."""
         loop, done = asyncio.get_running_loop(), 0
         rang, self._rang = self._rang, {}
         for row in rang:
             if self.rows.get(row.name) is not row:
-                continue  # it was forgotten
+                continue  # the row was forgotten
             before, now = row.count, loop.time()
             outcomes = await row.take(now)
             if row.stirred:
@@ -250,7 +250,7 @@ class FleetView:
                 await asyncio.sleep(0)
 
     def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], came: int) -> int:
-        """Count what came of a camera; return how many."""
+        """Count a camera's outcomes; return their number."""
         if came:
             self._bar.update(outcomes)
             self._count += came
@@ -264,7 +264,7 @@ class FleetView:
         row.version = self.version
 
     def _refresh(self, row: FleetRow, now: float) -> None:
-        """Look how a camera is."""
+        """Update a camera's state."""
         flags = row.flags
         changed, lost = row.refresh(now)
         if lost:
@@ -275,7 +275,7 @@ class FleetView:
             self._flags.subtract(flags)
             self._flags.update(row.flags)
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
-            self._aging.add(row)  # why it is not connected changes without an event
+            self._aging.add(row)  # its reason may change without an event
         if row.agents:
             self._gone.pop(row.name, None)
         elif row.name not in self._gone:
@@ -294,12 +294,12 @@ class FleetView:
         self.version += 1
 
     async def _age(self) -> None:
-        """Count rates, once a second, and look at what changes by itself."""
+        """Count rates, once a second, and update values that change by themselves."""
         now, wall = asyncio.get_running_loop().time(), time.time()
         aging, self._aging = self._aging, set()
         for number, row in enumerate(aging):
             if self.rows.get(row.name) is not row:
-                continue  # it was forgotten
+                continue  # the row was forgotten
             before, rate = row.count, row.rate
             outcomes: collections.Counter[str] = collections.Counter()
             row.account(outcomes, now)
@@ -320,7 +320,7 @@ class FleetView:
                 self._bar.clear()
             self._bar_at = bar
 
-    # ------------------------------------------------------------------ for those who look
+    # ------------------------------------------------------------------ for viewers
 
     def totals(self) -> dict[str, Any]:
         """Return the totals of all cameras, as values for JSON."""
@@ -336,7 +336,7 @@ class FleetView:
         }
 
     async def ordered(self, query: RowQuery) -> RowOrder:
-        """Return the names of a query's rows; made once for all who ask the same.
+        """Return the names of a query's rows; made once for all equal queries.
 
         Cancellation: safe.
         """

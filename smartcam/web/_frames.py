@@ -1,4 +1,4 @@
-"""The site of pictures: the newest frame of up to a few sources, to whoever looks."""
+"""The site of pictures: the newest frames of a few sources, for any number of viewers."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ class FramesSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        sources: sources that the caller opens and closes; the page waits for one that is not open.
+        sources: sources that the caller opens and closes; the page waits for a source to open.
         quality: quality of the JPEGs that are made, 1 to 100. A JPEG from a camera stays as it is.
-        host: address to listen on; nothing but this.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         changes: whether viewers may set features of the devices, execute their commands and
-            trigger them; anybody who can open the page may then.
-        token: what every call must carry in ``Authorization: Bearer``, as
-            :class:`~smartcam.web.LiveSite` has it. A browser's WebSocket, which can carry none,
+            trigger them; then everyone who can open the page may.
+        token: token that every call must carry in ``Authorization: Bearer``, as for
+            :class:`~smartcam.web.LiveSite`. A browser's WebSocket, which has no such header,
             names it among its protocols: ``bearer.TOKEN``.
 
     Attributes:
-        sources: sources that were given.
-        changes: changes that were given.
-        failures: reason why a source is not open, by its place in ``sources``; set by whoever
-            opens the sources.
+        sources: the given sources.
+        changes: whether viewers may change the devices.
+        failures: reason why a source is not open, by its place in ``sources``; set by the program
+            that opens the sources.
 
     Raises:
         ConfigurationError: the token cannot be used, or the quality is not valid.
@@ -89,7 +89,7 @@ class FramesSite(Site):
         await super().start()
 
     async def stop(self) -> None:
-        """Close the port; nobody looks any longer."""
+        """Close the port, and end the viewers."""
         self.pictures.end_viewers()
         try:
             await super().stop()
@@ -97,7 +97,7 @@ class FramesSite(Site):
             await self.pictures.stop()
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[FramesSite] = Calls()
 """All calls."""
@@ -117,13 +117,13 @@ class _NameBody(CallBody):
 
 
 class _FeatureBody(_NameBody):
-    """A feature, and the value that it is to have."""
+    """A feature, and its new value."""
 
     value: bool | int | Annotated[float, Field(allow_inf_nan=False)] | str
 
 
 def _changing(site: FramesSite, call: CallRequest) -> int:
-    """Return the place of a source that may be changed here."""
+    """Return the place of a source that viewers may change."""
     if not site.changes:
         raise RefusedError(
             403, "a change of a device", "one that was started with --changes, or changes=True"
@@ -133,7 +133,7 @@ def _changing(site: FramesSite, call: CallRequest) -> int:
 
 @contextlib.contextmanager
 def _refused(site: FramesSite, place: int) -> Iterator[None]:
-    """Have the error of a device refuse a call."""
+    """Turn a device's error into a refusal of the call."""
     try:
         yield
     except LocalProtocolError as exc:
@@ -159,7 +159,7 @@ def _calls(_site: FramesSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/sources")
 def _sources(site: FramesSite, _call: CallRequest) -> object:
-    """The sources, how each is and what was counted."""
+    """The sources, with their states and counts."""
     return {"sources": [site.pictures.state(place) for place in range(len(site.sources))]}
 
 
@@ -183,7 +183,7 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
     sample='{"name": "Gain", "value": 6.0}',
 )
 async def _set_feature(site: FramesSite, call: CallRequest) -> object:
-    """Set a feature, where the page may; answers the value that the device has then."""
+    """Set a feature, if the page may; answers the device's new value."""
     place = _changing(site, call)
     with _refused(site, place):
         return {"value": await site.sources[place].features[call.body.name].set(call.body.value)}
@@ -193,7 +193,7 @@ async def _set_feature(site: FramesSite, call: CallRequest) -> object:
     "POST", f"{API}/sources/{{place}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
 )
 async def _command(site: FramesSite, call: CallRequest) -> object:
-    """Execute a command, where the page may; answers when the device has done it."""
+    """Execute a command, if the page may; answers when the device has done it."""
     place = _changing(site, call)
     with _refused(site, place):
         await site.sources[place].features[call.body.name].execute()
@@ -202,7 +202,7 @@ async def _command(site: FramesSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
 async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
-    """Trigger the device, where the page may; answers the picture that this caused, as a JPEG."""
+    """Trigger the device, if the page may; answers the triggered picture as a JPEG."""
     place = _changing(site, call)
     with _refused(site, place):
         return await _as_jpeg(site, place, await site.sources[place].trigger())
@@ -219,7 +219,7 @@ async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
 @CALLS.add(
     "GET",
     f"{API}/sources/{{place}}/pictures",
-    about="A WebSocket: the newest frame after each `next` that one says, as a JPEG behind JSON.",
+    about="A WebSocket: the newest frame after each `next`, as a JPEG after JSON.",
 )
 async def _pictures(site: FramesSite, call: CallRequest) -> web.StreamResponse:
     return await site.pictures.view(_place(site, call), call.request)

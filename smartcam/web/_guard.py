@@ -1,14 +1,14 @@
 """Guard a site: checks of Host, Origin and token, and the headers of every answer.
 
 A page of another web site runs in the same browser and can send requests to this machine. It must
-neither read nor change anything here, whatever name it gives this machine:
+neither read nor change anything here, whatever name it uses for this machine:
 
-- *Host* must name this machine where no token is required; where it listens on loopback alone, a
-  name of that. A name that was made to point here (DNS rebinding) is another one.
-- *Origin*, which a browser sends with whatever changes something, must be the site itself;
-  *Sec-Fetch-Site* must not tell of another.
+- *Host* must name this machine if no token is required; if the site listens on loopback only, by a
+  name of loopback. A foreign name that resolves to this machine (DNS rebinding) is refused.
+- *Origin*, which a browser sends with each change, must be the site itself; *Sec-Fetch-Site* must
+  not name another.
 - With a token, each call carries it in ``Authorization``; a WebSocket, for which a browser's page
-  can set no header, among its protocols. A page elsewhere does not know it.
+  can set no header, among its protocols. Pages of other sites do not know it.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 MIN_TOKEN_CHARACTERS = 16
-"""Least number of characters of a token, so that nobody guesses it; made ones have 32."""
+"""Least number of characters of a token, which must be hard to guess; made tokens have 32."""
 
 BEARER = "bearer."
-"""Begins the protocol of a WebSocket that is a token."""
+"""Beginning of a WebSocket protocol that carries the token."""
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -46,19 +46,19 @@ HEADERS: Mapping[str, str] = {
     "Cache-Control": "no-store",
     "Server": "smartcam",
 }
-"""Headers of every answer: load nothing from elsewhere, allow no framing, keep nothing."""
+"""Headers of every answer: load nothing from other sites, allow no framing, store nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guard:
     """The checks of one site."""
 
-    token: str | None  # token that calls must carry; None: none, and the site listens on loopback
+    token: str | None  # token that calls must carry; None: none, on loopback only
 
     def check(self, request: web.Request, *, is_call: bool) -> None:
         """Refuse a request that does not come from the site's own pages.
 
-        The page's own files, which are no calls, hold no secret.
+        The files of the page need no token, since they hold no secret.
 
         Raises:
             RefusedError: 403 for another site's, 401 for a missing or wrong token.
@@ -94,12 +94,12 @@ def _authorization(request: web.Request) -> str | None:
 
 
 def check_host(given: str, names: Collection[str] | None = None) -> None:
-    """Refuse a request that names another machine: a page whose name was made to point here does.
+    """Refuse a request that names another machine, as DNS rebinding does.
 
     Args:
-        given: what the request has in its head.
-        names: names of this machine, in lower case, that are allowed beside loopback and any
-            address; None: only names and addresses of loopback are.
+        given: the request's ``Host``.
+        names: names of this machine, in lower case, that are allowed beside loopback and all
+            addresses; None: only names and addresses of loopback are allowed.
 
     Raises:
         RefusedError: 403.
@@ -139,11 +139,11 @@ def new_token() -> str:
 
 
 def checked_token(token: str) -> str:
-    """Return a token that was given.
+    """Return the given token.
 
     Raises:
-        ConfigurationError: the token is too short, or has signs that a header or a URL cannot
-            carry.
+        ConfigurationError: the token is too short, or has characters that a header or a URL
+            cannot carry.
     """
     signs = token.replace("-", "").replace("_", "")
     if len(token) < MIN_TOKEN_CHARACTERS or not (signs.isascii() and signs.isalnum()):

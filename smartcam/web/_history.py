@@ -17,16 +17,16 @@ SHIFT_SECONDS: Final = 36_000
 """Seconds for which outcomes are kept."""
 
 BAR_SECONDS: Final = 300
-"""Seconds of results that a bar of the trend has."""
+"""Seconds of results in a bar of the trend."""
 
 MAX_BARS: Final = SHIFT_SECONDS // BAR_SECONDS
-"""Bars that are kept at most."""
+"""Largest number of bars that are kept."""
 
 SLOT_SECONDS: Final = 1800
-"""Seconds of results that a place of the short trend has."""
+"""Seconds of results in a place of the short trend."""
 
 MAX_FAILURES: Final = 50
-"""Failures that are kept; equal ones in a row are one."""
+"""Largest number of failures that are kept; equal ones in a row are one."""
 
 MAX_PICTURES: Final = 12
 """Largest number of pictures of failures that are kept."""
@@ -35,7 +35,7 @@ MAX_PICTURE_BYTES: Final = 1 << 25
 """Largest number of bytes that the pictures of failures may have together."""
 
 MAX_TEXT_CHARACTERS: Final = 300
-"""Largest number of characters that say what failed."""
+"""Largest number of characters of the text of a failure."""
 
 KINDS: Final = ("passed", "failed", "other", "errors")
 """Outcomes of a result, in the order of a bar's numbers."""
@@ -43,15 +43,15 @@ KINDS: Final = ("passed", "failed", "other", "errors")
 
 @dataclass(slots=True)
 class Failure:
-    """Results in a row that failed alike, or could not be read, or the loss of a connection.
+    """Equal failures in a row: bad results, unreadable ones, or a lost connection.
 
     Attributes:
         serial: number of the failure, from 1.
         at: time of the first one, seconds since 1970.
         until: time of the last one.
-        number: number of the first result; None if there is no result.
-        what: what failed, in words.
-        count: how many there were.
+        number: number of the first result; None without a result.
+        what: text of the failure.
+        count: number of failures.
     """
 
     serial: int
@@ -67,9 +67,9 @@ class ShiftHistory:
 
     Attributes:
         version: number of changes.
-        failed_since: when the first failure after the last pass came, seconds since 1970; None if
-            the last one that tells has passed.
-        in_a_row: number of results that failed since then.
+        failed_since: time of the first failure after the last pass, seconds since 1970; None if
+            the last result with a verdict has passed.
+        in_a_row: number of failed results since then.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
 
@@ -81,13 +81,13 @@ class ShiftHistory:
         self._bars: collections.deque[list[int]] = collections.deque()
         self._failures: collections.deque[Failure] = collections.deque(maxlen=MAX_FAILURES)
         self._pictures: collections.OrderedDict[int, bytes] = collections.OrderedDict()
-        self._serial = 0  # of the last failure
+        self._serial = 0  # serial of the last failure
         self._newest = 0  # serial of the newest result if it is a failure, else 0
         self._failed = 0
-        self._passed = False  # since the last failure
+        self._passed = False  # whether a result has passed since the last failure
 
     def add(self, result: Result[Any]) -> Outcome:
-        """Count a result; return how it turned out."""
+        """Count a result; return its outcome."""
         outcome = judged(result.value)
         at = result.received_at.timestamp()
         self._count_up(outcome, at)
@@ -105,16 +105,16 @@ class ShiftHistory:
         self._fail(at, None, f"not readable: {text}")
 
     def add_missed(self, count: int, text: str) -> None:
-        """Count results that did not come; ``text`` says so."""
+        """Count results that did not come, with a text."""
         at = time.time()
         self._count_up("errors", at, count)
         self._newest = 0
-        self._tell(at, None, text)
+        self._note(at, None, text)
 
     def add_loss(self, reason: str) -> None:
         """Note that the connection was lost."""
         self._newest = 0
-        self._tell(time.time(), None, f"connection lost: {reason}")
+        self._note(time.time(), None, f"connection lost: {reason}")
 
     def _count_up(self, outcome: Outcome, at: float, count: int = 1) -> None:
         self.version += 1
@@ -132,10 +132,10 @@ class ShiftHistory:
         self.in_a_row += 1
         if self.failed_since is None:
             self.failed_since = at
-        self._tell(at, number, what)
+        self._note(at, number, what)
         self._newest = self._serial
 
-    def _tell(self, at: float, number: int | None, what: str) -> None:
+    def _note(self, at: float, number: int | None, what: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
         if last is not None and last.what == what[:MAX_TEXT_CHARACTERS] and not self._passed:
@@ -154,7 +154,7 @@ class ShiftHistory:
         return self._newest > 0 and self._newest not in self._pictures
 
     def attach(self, serial: int, picture: bytes) -> None:
-        """Keep the first picture of a failure; the oldest failures' make room."""
+        """Keep the first picture of a failure; pictures of the oldest failures make room."""
         if not serial or serial in self._pictures or len(picture) > MAX_PICTURE_BYTES:
             return
         self._pictures[serial] = picture
@@ -166,23 +166,23 @@ class ShiftHistory:
         self.version += 1
 
     def drop_picture(self, serial: int) -> None:
-        """Keep the picture of a failure no more."""
+        """Drop the picture of a failure."""
         if self._pictures.pop(serial, None) is not None:
             self.version += 1
 
     @property
     def last_failure(self) -> int:
-        """Number of the failure that the newest result is; 0 where that is no failure."""
+        """Serial of the failure that is the newest result; 0 if that is no failure."""
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
-        """Return the picture of a failure, None if none is kept."""
+        """Return the picture of a failure, None without one."""
         return self._pictures.get(serial)
 
     # ------------------------------------------------------------------ for the page
 
     def as_json(self) -> dict[str, Any]:
-        """Return the history as the page takes it: bars, and the failures, the oldest first."""
+        """Return the history for the page: bars, and the failures, the oldest first."""
         failures = [
             {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
         ]
@@ -197,9 +197,9 @@ class ShiftHistory:
     def trend(self) -> dict[str, Any]:
         """Return the short trend, for a row of a table.
 
-        ``end`` is the end of its last place, seconds since 1970. Each place has
-        :data:`SLOT_SECONDS`, and is a character: how many of ten results with a verdict were bad,
-        rounded up (X: all); ``-`` where none had a verdict, a space where none came.
+        ``end`` is the end of its last place, seconds since 1970. Each place covers
+        :data:`SLOT_SECONDS` and is one character: the number of bad results in ten with a verdict,
+        rounded up (X: all bad); ``-`` if none had a verdict, a space without results.
         """
         if not self._bars:
             return {"end": 0, "places": ""}
@@ -218,7 +218,7 @@ class ShiftHistory:
 def _place(outcomes: list[int]) -> str:
     """Return the character of a place of the short trend."""
     passed, failed, other, errors = outcomes
-    bad, told = failed + errors, passed + failed + errors
-    if told:
-        return "0123456789X"[-(-10 * bad // told)]
+    bad, judged = failed + errors, passed + failed + errors
+    if judged:
+        return "0123456789X"[-(-10 * bad // judged)]
     return "-" if other else " "

@@ -1,4 +1,4 @@
-"""A frame as people look at it: its colours, at 8 bits, as a JPEG."""
+"""A frame for viewers: its colours, at 8 bits, as a JPEG."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 START: Final = b"\xff\xd8"
 TABLES: Final = b"\xff\xc4"
-"""Marker of a JPEG's Huffman tables; many a webcam leaves them out, and few programs read that."""
+"""Marker of a JPEG's Huffman tables; many webcams leave them out, which few programs can read."""
 
 HEAD: Final = 4096
-"""Bytes in which the tables are looked for: they stand in front of the picture."""
+"""Number of first bytes that are searched for the tables, which precede the picture."""
 
 READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that become a JPEG without being made another one first; those of Y, U and V do, too."""
+"""Formats that become a JPEG without a conversion; those of Y, U and V do, too."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:
-    """Return a frame as a JPEG; a frame that is a whole JPEG is returned as it came.
+    """Return a frame as a JPEG; a frame that is a whole JPEG is returned unchanged.
 
     Pixels of more than 8 bits are scaled, so that the brightest one becomes white. This takes
     milliseconds: call it in a thread.
@@ -37,8 +37,8 @@ def jpeg(frame: Frame, quality: int) -> bytes:
         quality: 1 to 100.
 
     Raises:
-        FrameFormatError: its bytes are wrong, or the size is too large for a JPEG.
-        MissingExtraError: what reads or makes it is not installed.
+        FrameFormatError: its bytes are wrong, or its size is too large for a JPEG.
+        MissingExtraError: a package that reads or makes it is not installed.
     """
     if is_whole_jpeg(frame):
         return bytes(frame.data)
@@ -51,14 +51,14 @@ def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
     """Return pixels of a frame, (H, W) or (H, W, 3) with red first, as a JPEG.
 
     Raises:
-        FrameFormatError: a JPEG cannot be so large.
+        FrameFormatError: the size is too large for a JPEG.
         MissingExtraError: the extra ``frames`` is not installed.
     """
     return _jpeg(with_pixels(frame, pixels, "Mono8" if pixels.ndim == 2 else "RGB8"), quality)
 
 
 def require_encoder() -> None:
-    """See that JPEGs can be made.
+    """Check that JPEGs can be made.
 
     Raises:
         MissingExtraError: the extra ``frames`` is not installed.
@@ -76,8 +76,8 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     """Return the pixels to show: (H, W, 3), red first; (H, W) for a frame without colours.
 
     Raises:
-        FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` asks for.
-        MissingExtraError: a compressed format or a Bayer pattern, and its codec is not installed.
+        FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` needs.
+        MissingExtraError: a codec of a compressed format or a Bayer pattern is not installed.
     """
     if frame.format.name in {"PNG", "JPEGXL"}:
         frame = decoded(frame, "")
@@ -87,7 +87,7 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
 
 
 def stretched(levels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return levels of 8 bits; of more the brightest becomes 255."""
+    """Return levels of 8 bits; with more bits, the brightest becomes 255."""
     if levels.dtype == np.uint8:
         return levels
     top = max(1, int(levels.max()))

@@ -1,4 +1,4 @@
-"""The live page's site: what a camera sends, and calls that trigger it where allowed."""
+"""The live page's site: a camera's results, and calls that command it if allowed."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from smartcam.web._live_camera import ShowsCamera
 
 MAX_NEWS = 20
-"""Largest number of results in one event: at ten a second the page sees 200 a second, and is told
-what it missed."""
+"""Largest number of results in one event: at ten a second the page gets 200 a second, and the
+number of results that it missed."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks after which clock and account are told: once a second."""
+"""Looks between two reports of clock and account: one a second."""
 
 
 class LiveSite(Site):
-    """A page and HTTP calls that show what a camera sends.
+    """A page and HTTP calls that show a camera's results.
 
     ::
 
@@ -42,20 +42,20 @@ class LiveSite(Site):
 
     Args:
         camera: camera that the caller opens and closes. A page made before the camera is opened
-            sees all.
-        control: whether the page may trigger, start, stop and switch. Without it nothing that a
-            reader does reaches the camera, but that it is asked for its picture where it has one.
-        units: names of the units that the page shows instead of SI from its beginning, such as
-            ``("mm", "deg")``. None: it begins with SI, and its switch shows these two.
-        host: address to listen on; nothing but this.
+            shows all results.
+        control: whether the page may trigger, start, stop and switch. Without it, the page's
+            readers cannot affect the camera, except that its picture is fetched, if it has one.
+        units: names of units that the page shows at first instead of SI, such as
+            ``("mm", "deg")``. None: it begins with SI, and its switch offers these two.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
-            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+        token: token that every call must carry in ``Authorization: Bearer``: at least 16 letters,
+            digits, ``-`` and ``_``. None: no token on a loopback address; else one is made.
 
     Attributes:
         view: view of the camera that the page shows.
-        frames: frames of the camera, where it has some.
-        control: control that was given.
+        frames: frames of the camera, if it has any.
+        control: whether the page may command the camera.
 
     Raises:
         ConfigurationError: the token cannot be used, or a unit is unknown.
@@ -84,7 +84,7 @@ class LiveSite(Site):
         self.frames.start()
 
     async def stop(self) -> None:
-        """Close the port, and leave the camera alone."""
+        """Close the port, and stop following the camera."""
         await self.frames.stop()
         await self.view.stop()
         await super().stop()
@@ -104,7 +104,7 @@ class LiveReader:
         self._serial = oldest if since is None else since
         self._known: dict[str, Any] = {}
         self._looks = 0
-        self._history = -1  # version of the history that was told
+        self._history = -1  # version of the history that was sent
 
     def look(self) -> Iterator[News]:
         """Yield the changes since the last look; the first look yields everything."""
@@ -124,7 +124,7 @@ class LiveReader:
 
     def _results(self) -> Iterator[News]:
         view = self._view
-        if self._serial > view.serial:  # of another process' time
+        if self._serial > view.serial:  # from an earlier process
             self._serial = 0
         new = [one for one in view.entries if one.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial
@@ -141,7 +141,7 @@ class LiveReader:
             yield News(kind, value)
 
 
-# ---------------------------------------------------------------------- what calls take
+# ---------------------------------------------------------------------- arguments of calls
 
 
 class _TriggerBody(CallBody):
@@ -153,14 +153,14 @@ class _SwitchBody(CallBody):
     application: int = Field(ge=0, le=0xFFFFFFFF)
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[ShowsCamera] = Calls()
 """All calls."""
 
 
 async def _commanded(site: ShowsCamera, do: Callable[[], Awaitable[Any]]) -> Any:
-    """Do something to the camera, where that is allowed."""
+    """Command the camera, if that is allowed."""
     if not site.control:
         raise RefusedError(403, "a command to the camera", "looking only: no --control was given")
     try:
@@ -217,7 +217,7 @@ def _picture(site: ShowsCamera, _call: CallRequest) -> web.Response:
 
 _UNKNOWN = "application/octet-stream"
 _KINDS = ((b"BM", "image/bmp"), (b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg"))
-"""First bytes of the files that a camera sends a picture as, and their types."""
+"""First bytes of the picture files that cameras send, and their types."""
 
 
 def _image(data: bytes) -> web.Response:
@@ -227,7 +227,7 @@ def _image(data: bytes) -> web.Response:
 
 @CALLS.add("POST", f"{API}/picture")
 def _want_picture(site: ShowsCamera, _call: CallRequest) -> object:
-    """Ask the camera for its picture anew, once a second at most; the events tell of it."""
+    """Ask the camera for its picture anew, once a second at most; an event reports it."""
     site.view.want_picture()
     return site.view.state()
 
@@ -257,7 +257,7 @@ def _events(site: ShowsCamera, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
 async def _trigger(site: ShowsCamera, call: CallRequest) -> object:
-    """Trigger; answers when the result is there, which the events tell."""
+    """Trigger; answers after the result, which an event reports."""
     body: _TriggerBody = call.body
     camera = site.view.camera
     result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
@@ -273,7 +273,7 @@ async def _switch(site: ShowsCamera, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/take_back")
 async def _take_back(site: ShowsCamera, _call: CallRequest) -> object:
-    """Have a fleet's agent take the camera back from another client."""
+    """Make a fleet's agent take the camera back from another client."""
     camera = site.view.camera
     take_back = getattr(camera, "take_back", None)
     if take_back is None:

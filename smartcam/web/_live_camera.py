@@ -1,4 +1,4 @@
-"""Show one camera on the live page, on whichever site that page is."""
+"""One camera on the live page, on any site with that page."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class ShowsCamera(Protocol):
 
 
 class WatchedCamera:
-    """One camera of a site of many, while somebody looks at it.
+    """One camera of a site with many, while it has viewers.
 
     Args:
         camera: camera that the caller opens and closes.
         control: whether the page may command the camera.
         units: units that the page can show instead of SI.
-        row: row of the camera in the fleet's table; None: the page writes a history of its own.
+        row: row of the camera in the fleet's table; None: the page keeps a history of its own.
 
     Attributes:
         used_at: time of the last call, on the loop's clock.
@@ -61,7 +61,7 @@ class WatchedCamera:
 
     @property
     def watched(self) -> bool:
-        """True while anybody looks."""
+        """True while there are viewers."""
         pictures = self.frames.pictures
         return bool(len(self.streams)) or (pictures is not None and bool(pictures.viewers))
 
@@ -71,7 +71,7 @@ class WatchedCamera:
         self.frames.start()
 
     async def stop(self) -> None:
-        """Leave the camera alone; whoever looks is told that it ends."""
+        """Stop following the camera; viewers get a last event."""
         self.streams.close()
         await self.frames.stop()
         await self.view.stop()

@@ -1,4 +1,4 @@
-"""The newest frame of the live page's camera, where that has frames: one of a fleet may."""
+"""The newest frame of the live page's camera, if that has frames."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 JPEG_QUALITY: Final = 80
-"""Quality, 1 to 100, of the JPEGs that the agent makes, so that little crosses the bus."""
+"""Quality, 1 to 100, of the JPEGs that the agent makes; low, to save traffic on the bus."""
 
 LOOK_INTERVAL: Final = 0.1
-"""Seconds between two looks at which camera the page shows, and whether it has frames."""
+"""Seconds between two checks of which camera the page shows, and whether it has frames."""
 
 
 @runtime_checkable
 class HasFrames(Protocol):
-    """A camera that may have frames, as one of a fleet."""
+    """A camera that may have frames, such as a camera of a fleet."""
 
     @property
     def has_frames(self) -> bool:
@@ -37,15 +37,15 @@ class HasFrames(Protocol):
 
 
 class LiveFrames:
-    """Follows the page's camera, and has its frames for whoever looks.
+    """Follows the page's camera, and gives its frames to viewers.
 
-    Nothing is asked of a camera without frames, and one with frames streams while somebody looks.
+    A camera without frames is not asked for any; a camera with frames streams while it has viewers.
 
     Args:
         camera: function that returns the camera that the page shows now.
 
     Attributes:
-        pictures: pictures of its frames; None if it has none.
+        pictures: pictures of its frames; None without frames.
     """
 
     def __init__(self, camera: Callable[[], object]) -> None:
@@ -58,7 +58,7 @@ class LiveFrames:
         self._task = asyncio.create_task(self._follow(), name="smartcam.live.frames")
 
     async def stop(self) -> None:
-        """End; harmless when called twice."""
+        """End. Harmless when called twice."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()

@@ -1,4 +1,4 @@
-"""Keep the live page's data: the last results, how fast they come, the last picture."""
+"""Keep the live page's data: the last results, their rate, the last picture."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from smartcam.layout import Layout
 
 MAX_RESULTS = 100
-"""Largest number of results that the page can show: those before are on it no more."""
+"""Largest number of results on the page; older ones are dropped."""
 
 MAX_VALUE_CHARACTERS = 20_000
 """Largest number of characters of JSON that a value may have on the page; a larger one is cut."""
 
 MAX_PARTS = 500
-"""Localizations of a result that the page draws."""
+"""Largest number of localizations of a result that the page draws."""
 
 MAX_SHOWN_RAW_BYTES = 64
 """Largest number of bytes of a container that the page shows."""
@@ -38,12 +38,12 @@ SERIES = 300
 """Seconds of rate and latency that the page draws."""
 
 IMAGE_PERIOD = 1.0
-"""Seconds between two pictures that are fetched for the page, at least."""
+"""Least number of seconds between two pictures that are fetched for the page."""
 
 
 @runtime_checkable
 class DrawsPictures(Protocol):
-    """A camera that draws what its programs saw into the last picture."""
+    """A camera that draws its programs' findings into the last picture."""
 
     async def read_drawn_image(self) -> bytes:
         """Return the picture as a file's bytes."""
@@ -51,15 +51,15 @@ class DrawsPictures(Protocol):
 
 
 class ShownResult(NamedTuple):
-    """A result, or why there is none."""
+    """A result, or an error in its place."""
 
     serial: int  # counted from 0
     result: Result[Any] | None
-    error: str  # why a container could not be read, "" if it could
+    error: str  # reason why a container could not be read, or ""
     layout: Layout | None = None  # layout of tables, which have no units themselves
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result as the page takes it."""
+        """Return the result for the page, as values for JSON."""
         if self.result is None:
             return {"serial": self.serial, "error": self.error}
         result = self.result
@@ -84,13 +84,12 @@ class Picture(NamedTuple):
 
 
 class LiveView:
-    """Follows a camera and keeps what its page shows.
+    """Follows a camera and keeps the data of its page.
 
     Args:
         camera: camera that the caller opens and closes.
-        is_watched: function that returns True while some page is open, so that pictures are
-            fetched.
-        history: history that somebody else writes; None: the view has one of its own.
+        is_watched: function that returns True while a page is open, so that pictures are fetched.
+        history: history that is kept elsewhere; None: the view has its own.
 
     Attributes:
         history: outcomes and failures of the last hours.
@@ -109,10 +108,10 @@ class LiveView:
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
         self.picture_error: str = ""
-        self.changed_at: float = time.time()  # time at which it was last connected or lost
-        self.changed_seen: bool = False  # False: that was before it was followed
-        self.loss: str = ""  # why it is not connected, "" if it is
-        self._end: SmartCamError | None = None  # why it will never be again
+        self.changed_at: float = time.time()  # time of the last connection or loss
+        self.changed_seen: bool = False  # False: that was before the view began
+        self.loss: str = ""  # reason why it is not connected, or ""
+        self._end: SmartCamError | None = None  # reason why it will never be connected again
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
@@ -136,7 +135,7 @@ class LiveView:
         self._tasks = [asyncio.create_task(job, name="smartcam.live") for job in jobs]
 
     async def stop(self) -> None:
-        """End; harmless when called twice."""
+        """End. Harmless when called twice."""
         tasks, self._tasks = self._tasks, []
         self._results.close()
         self._events.close()
@@ -145,9 +144,9 @@ class LiveView:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def follow(self, camera: Camera[Any], loss: str) -> None:
-        """Show this camera instead, which is not opened yet; ``loss``: why the one before is not.
+        """Show this unopened camera instead; ``loss``: reason why the one before is not connected.
 
-        Cancellation: leaves it stopped.
+        Cancellation: leaves the view stopped.
         """
         await self.stop()
         self._end, self.loss = None, loss
@@ -156,11 +155,11 @@ class LiveView:
         self.start()
 
     def show(self, result: Result[Any]) -> None:
-        """Show a result of before it was followed."""
+        """Show a result from before the view began."""
         self._add(result)
 
     def want_picture(self) -> None:
-        """Have the camera's picture fetched when its time has come, while anybody looks."""
+        """Fetch the camera's picture as soon as it is due, while there are viewers."""
         self._picture_wanted = True
 
     def state(self) -> dict[str, Any]:
@@ -206,7 +205,7 @@ class LiveView:
         return {name: getattr(counted, name) for name in names} | {"not_shown": self._not_shown()}
 
     def _not_shown(self) -> int:
-        """Return the number of results dropped since they came faster than the page takes them."""
+        """Return the number of results dropped because the page was too slow for them."""
         return self._results.statistics().dropped
 
     # ------------------------------------------------------------------ tasks
@@ -277,7 +276,7 @@ class LiveView:
             await asyncio.sleep(IMAGE_PERIOD / 10)
 
     async def _fetch_picture(self) -> None:
-        """Fetch the camera's last picture; what went wrong is told in the state."""
+        """Fetch the camera's last picture; the state reports an error."""
         failure = self.history.last_failure
         try:
             camera: object = self.camera
@@ -289,20 +288,20 @@ class LiveView:
             self.picture_error = str(exc)
         else:
             self.picture_error = ""
-            # nothing came meanwhile
+            # no newer result came meanwhile
             if self._writes and failure == self.history.last_failure and not self._results.waiting:
                 self.history.attach(failure, data)
             self.picture = Picture(1 + (self.picture.serial if self.picture else 0), data)
 
 
 def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
-    """Return the layout by which a camera's result was read; None if it has none."""
+    """Return the layout by which a camera's result was read; None without one."""
     interpreter = own_interpreter(camera, result.application)
     return None if interpreter is None else interpreter.layout
 
 
 def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
-    """Return a value as the page shows it: parts that it draws, or JSON, cut where it is long.
+    """Return a value for the page: parts to draw, or JSON, which is cut if it is long.
 
     ``units`` are those of its fields, and of the fields of its lists. ``layout``: that of a table.
     """
@@ -333,7 +332,7 @@ def _units_of_lists(value: Any) -> dict[str, Mapping[str, str]]:
 
 
 def _as_text(value: Any) -> Any:
-    """Return bytes that are a printable text as that, such as the cells of an In-Sight in JSON."""
+    """Return bytes as text if they are printable, such as the cells of an In-Sight in JSON."""
     if not isinstance(value, bytes):
         return value
     try:
@@ -344,7 +343,7 @@ def _as_text(value: Any) -> Any:
 
 
 def _part(one: Localization) -> dict[str, Any]:
-    """Return a part as it lies on the plane: metres, and radians about z."""
+    """Return a part's place on the plane: metres, and radians about z."""
     (x, y, z), (i, j, k, w) = one.pose.position, one.pose.orientation
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
     part = {"name": one.feature_id, "quality": one.quality, "x": x, "y": y, "z": z, "theta": theta}

@@ -32,11 +32,11 @@ _log = logging.getLogger("smartcam.web")
 _Handler: TypeAlias = "Callable[[web.Request], Awaitable[web.StreamResponse]]"
 
 MAX_CAMERAS_LISTED = 100
-"""Largest number of cameras that an answer names as not connected."""
+"""Largest number of unconnected cameras that an answer names."""
 
 
 class OperationsSite(Server):
-    """A site that answers those who watch an agent; nothing can be changed, and nobody logs in.
+    """A site for programs that monitor an agent; read-only, without a login.
 
     ::
 
@@ -46,12 +46,12 @@ class OperationsSite(Server):
 
     Args:
         server: the agent; may be started later.
-        listen: ``HOST:PORT``; None: as its file says, or where that says nothing
-            ``127.0.0.1:9464``. Port 0 takes a free one.
+        listen: ``HOST:PORT``; None: as in the agent's file, by default ``127.0.0.1:9464``.
+            Port 0 takes a free one.
 
     Raises:
         MissingExtraError: the extra ``operations`` is not installed.
-        ConfigurationError: the address is no place, or the file says to listen nowhere.
+        ConfigurationError: the address is not valid, or the file switches the site off.
     """
 
     def __init__(self, server: FleetServer, *, listen: str | None = None) -> None:
@@ -73,16 +73,16 @@ class OperationsSite(Server):
 
     @property
     def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
+        """The port that the site listens on; the given one until it is started."""
         return self._port
 
     async def start(self) -> None:
-        """Open the port; does nothing if it is open.
+        """Open the port; do nothing if it is open.
 
         Raises:
             ConfigurationError: the site cannot listen there.
 
-        Cancellation: leaves it stopped.
+        Cancellation: leaves the site stopped.
         """
         if self._open is not None:
             return
@@ -100,7 +100,7 @@ class OperationsSite(Server):
         self._port, self._open = opened.port, opened
 
     async def stop(self) -> None:
-        """Close the port and every connection; does nothing if stopped. Bounded."""
+        """Close the port and every connection; do nothing if stopped. Bounded."""
         opened, self._open = self._open, None
         if opened is None:
             return
@@ -112,13 +112,13 @@ class OperationsSite(Server):
                 making.cancel()
                 await asyncio.wait({making})
 
-    # ------------------------------------------------------------------ what is asked
+    # ------------------------------------------------------------------ answers
 
     def _pages(self) -> dict[str, Callable[[web.Request], Awaitable[web.Response]]]:
         return {"/healthz": self._health, "/readyz": self._ready, "/metrics": self._metrics}
 
     async def _health(self, _request: web.Request) -> web.Response:
-        """Answer: that there is an answer says that the event loop runs."""
+        """Answer; any answer shows that the event loop runs."""
         return web.Response(text="ok\n")
 
     async def _ready(self, _request: web.Request) -> web.Response:
@@ -132,7 +132,7 @@ class OperationsSite(Server):
     def readiness(self) -> dict[str, Any]:
         """Return the readiness: the agent is on the bus and has tried each camera once; for JSON.
 
-        A camera that is not connected, or that a reload brings later, changes nothing about it.
+        A camera that is lost, or added by a reload, does not change it.
         """
         server = self._server
         hosts = server.hosts.values()
@@ -159,7 +159,7 @@ class OperationsSite(Server):
         }
 
     async def _metrics(self, _request: web.Request) -> web.Response:
-        """Answer with the numbers of now; requests at the same time get the same answer."""
+        """Answer with the current numbers; requests at the same time get the same answer."""
         if self._making is None or self._making.done():
             self._making = asyncio.get_running_loop().create_task(
                 self._made(), name="smartcam.metrics"
@@ -197,7 +197,7 @@ def _guarded(names: Collection[str] | None) -> Any:
 async def _answered(
     request: web.Request, handler: _Handler, names: Collection[str] | None
 ) -> web.StreamResponse:
-    """Return the answer to a request; nothing of a fault goes out."""
+    """Return the answer to a request; it shows no details of an internal error."""
     try:
         check_host(request.host, names)
         return await handler(request)

@@ -1,4 +1,4 @@
-"""The pages of the sites: each is put together of what all have in common and of its own file."""
+"""The pages of the sites: a common frame with the contents of each page's file."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ class Page(NamedTuple):
     """The contents of a page's head.
 
     Attributes:
-        title: what the page shows.
-        printed: the command that prints the page's address, as HTML; empty for a page whose own
-            file has a top of its own.
-        styles: names of the style sheets in front of its own.
-        beside: what stands beside the title, as HTML.
-        does: what the page does by calls.
+        title: title of the page.
+        printed: the command that prints the page's address, as HTML; empty for a page with a top of
+            its own.
+        styles: names of the style sheets before its own.
+        beside: contents beside the title, as HTML.
+        does: verb for the page's calls: it ``does`` or ``shows`` things by them.
     """
 
     title: str
@@ -54,7 +54,7 @@ def read_file(name: str) -> bytes:
 
 
 def page_html(name: str) -> str:
-    """Return a page: head and top are the same for all, what follows is its own."""
+    """Return a page: the common head and top, and the page's own contents."""
     page = PAGES[name]
     sheets = [f'  <link rel="stylesheet" href="/{one}.css">' for one in (*page.styles, name)]
     own = page._asdict() | {"styles": "\n".join(sheets), "script": name}

@@ -1,9 +1,9 @@
-"""The newest frames of some sources, to whoever looks: what pages of pictures have in common.
+"""The newest frames of some sources, for viewers: the common part of pages with pictures.
 
 Each viewer of a source has a reader of it and a WebSocket, with one picture on the way at a
-time: the next one, the newest then, goes when the page says that it has shown the last. So a viewer
-who is slow skips, and delays neither the device nor anybody else. With nobody there is no reader,
-and the device does not stream.
+time: when the page reports that it has shown the last picture, the newest one is sent. So a slow
+viewer skips pictures, and delays neither the device nor other viewers. Without viewers there is no
+reader, and the device does not stream.
 """
 
 from __future__ import annotations
@@ -39,41 +39,41 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 FILES: Final = ("pictures.css", "pictures.js")
-"""Files that pages with pictures have beside their own."""
+"""Files of pages with pictures, beside their own."""
 
 MAX_VIEWERS: Final = 32
-"""WebSockets at a time: eight people before four cameras."""
+"""Largest number of WebSockets at a time: eight people before four cameras."""
 
 PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
 
 MAX_PICTURE_BYTES: Final = 1 << 24
-"""Largest number of bytes of a picture that is sent; what a camera sends as a JPEG may be of any
+"""Largest number of bytes of a picture that is sent; a camera's own JPEGs may be of any
 size."""
 
 ACCOUNT_PERIOD: Final = 1.0
-"""Seconds without a frame after which the page is told the account all the same."""
+"""Seconds without a frame after which the page gets the account anyway."""
 
 THREADS: Final = 2
 """Threads that make JPEGs; more threads would wait for the processor."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=5.0)
-"""Seconds before a source that ended with an error is read again."""
+"""Delays before a source that ended with an error is read again."""
 
 
-def _heard(_error: SmartCamError | None) -> None:
-    """Hear of a try."""
+def _ignore(_error: SmartCamError | None) -> None:
+    """Ignore the outcome of a try."""
 
 
 class SitePictures:
     """The sources of a site, and their viewers.
 
     Args:
-        sources: sources that the caller opens and closes; the site waits for one that is not open.
+        sources: sources that the caller opens and closes; the site waits for a source to open.
         quality: quality of the JPEGs that are made. A frame that comes as a JPEG stays as it is.
 
     Attributes:
-        sources: sources that were given.
+        sources: the given sources.
         failures: reason why a source is not open, by its place in ``sources``.
         viewers: sockets of the pages that show a source.
     """
@@ -89,18 +89,18 @@ class SitePictures:
         self._threads: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
-        """Have what makes pictures; does nothing if it exists."""
+        """Start the threads that make pictures; do nothing if they run."""
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.jpeg")
             self._presses = [Press(self._threads, self._quality) for _ in self.sources]
 
     def end_viewers(self) -> None:
-        """Have everybody told that it ends."""
+        """Tell all viewers that the site ends."""
         for one in self.viewers:
             one.end()
 
     async def stop(self) -> None:
-        """End the threads, once nobody looks any longer.
+        """End the threads, once all viewers have left.
 
         Cancellation: takes effect at once; the threads end by themselves.
         """
@@ -140,13 +140,13 @@ class SitePictures:
         return self.failures.get(place, f"{self.sources[place].name} is not open")
 
     async def keep_open(
-        self, place: int, tried: Callable[[SmartCamError | None], None] = _heard
+        self, place: int, tried: Callable[[SmartCamError | None], None] = _ignore
     ) -> None:
-        """Have a source open until this is cancelled, and try again where it cannot be opened.
+        """Keep a source open until the task is cancelled; try again if it cannot be opened.
 
         Args:
             place: place of the source.
-            tried: function that is told each time what went wrong, None for nothing.
+            tried: function that gets the error of each try, None for success.
         """
         for delay in Backoff().delays():
             try:
@@ -170,7 +170,7 @@ class SitePictures:
 
 
 class Press:
-    """Makes JPEGs of a source in threads, each frame once however many look at it."""
+    """Makes JPEGs of a source in threads, each frame once for all viewers."""
 
     def __init__(self, threads: ThreadPoolExecutor, quality: int) -> None:
         self._threads = threads
@@ -185,7 +185,7 @@ class Press:
             FrameFormatError: its bytes are wrong, or too many.
             MissingExtraError: a codec is not installed.
 
-        Cancellation: safe; others who wait for it get it.
+        Cancellation: safe; other callers that wait for the JPEG get it.
         """
         if self._made is None or self._frame is not frame:
             loop = asyncio.get_running_loop()
@@ -195,7 +195,7 @@ class Press:
         return await asyncio.shield(self._made)
 
     def forget(self) -> None:
-        """Keep no picture."""
+        """Drop the kept pictures."""
         self._frame = self._made = None
 
 
@@ -213,7 +213,7 @@ def _pressed(frame: Frame, quality: int) -> bytes:
 
 def _seen(made: asyncio.Future[bytes]) -> None:
     if not made.cancelled():
-        made.exception()  # the asker may be gone, and then nobody else asks
+        made.exception()  # marks the error as handled if all callers are gone
 
 
 class Viewer(PageSocket):
@@ -222,7 +222,7 @@ class Viewer(PageSocket):
     Attributes:
         place: place of the source.
         address: address of the viewer.
-        gone: event that is set when that is over.
+        gone: event that is set when the viewer has left.
     """
 
     def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:
@@ -235,7 +235,7 @@ class Viewer(PageSocket):
         self._sent = 0
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show frames, as any page is shown something."""
+        """Show frames until the page goes."""
         self._pictures.viewers.add(self)
         try:
             return await super().serve()
@@ -246,9 +246,9 @@ class Viewer(PageSocket):
                 self._pictures.press(self.place).forget()
 
     async def _show(self) -> None:
-        """Show frames, and read the source again where it ended.
+        """Show frames, and read the source again after it ended.
 
-        One that is lost stays so for the page until a picture of it comes.
+        A lost source stays lost for the page until a picture of it comes.
         """
         delays, lost = AGAIN.delays(), False
         while True:
@@ -256,19 +256,19 @@ class Viewer(PageSocket):
             try:
                 async with self._source.reader(timeout=ACCOUNT_PERIOD) as reader:
                     if not lost:
-                        await self._tell({"state": "waiting", **self._pictures.state(self.place)})
+                        await self._send({"state": "waiting", **self._pictures.state(self.place)})
                     await self._show_frames(reader)
             except LocalProtocolError:
-                await self._tell(
+                await self._send(
                     {"state": "awaited", "text": self._pictures.state(self.place)["failure"]}
                 )
                 lost = False
             except (FrameSourceError, ConfigurationError) as exc:
-                await self._tell({"state": "lost", "text": str(exc)})
+                await self._send({"state": "lost", "text": str(exc)})
                 lost = True
             else:
-                await self._tell({"state": "ended", "text": f"{self._source.name} has ended."})
-                await asyncio.Event().wait()  # a page that hears it twice would play it again
+                await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
+                await asyncio.Event().wait()  # a second message would make the page play it again
             if self._sent > before:
                 delays = AGAIN.delays()
             await asyncio.sleep(next(delays))
@@ -280,7 +280,7 @@ class Viewer(PageSocket):
             try:
                 frame = await anext(reader)
             except FrameTimeoutError:
-                await self._tell({"account": _account(reader, bad)})
+                await self._send({"account": _account(reader, bad)})
                 continue
             except StopAsyncIteration:
                 return
@@ -288,22 +288,22 @@ class Viewer(PageSocket):
                 picture = await self._pictures.press(self.place).jpeg(frame)
             except FrameFormatError as exc:
                 bad += 1
-                await self._tell({"account": _account(reader, bad), "bad": str(exc)})
+                await self._send({"account": _account(reader, bad), "bad": str(exc)})
                 continue
             await self._send_picture(_about(frame), _account(reader, bad), picture)
 
     async def _send_picture(
         self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
     ) -> None:
-        """Send a picture behind its JSON, and wait until it is shown; TimeoutError: it is not."""
-        said = json.dumps({"frame": frame, "account": account}).encode()
+        """Send a picture after its JSON, and wait until it is shown; TimeoutError: too late."""
+        head = json.dumps({"frame": frame, "account": account}).encode()
         self._shown.clear()
         async with asyncio.timeout(SLOW):
-            await self._socket.send_bytes(len(said).to_bytes(4, "little") + said + picture)
+            await self._socket.send_bytes(len(head).to_bytes(4, "little") + head + picture)
             self._sent += 1
             await self._shown.wait()
 
-    async def _tell(self, value: dict[str, Any]) -> None:
+    async def _send(self, value: dict[str, Any]) -> None:
         async with asyncio.timeout(SLOW):
             await self._socket.send_str(json.dumps(value))
 

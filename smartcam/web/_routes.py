@@ -1,7 +1,7 @@
-"""HTTP calls as a table: method, path, what it takes, what it does.
+"""HTTP calls as a table: method, path, arguments, handler.
 
-A call is asked with a JSON body or a query, which pydantic checks, and answers JSON. Handlers are
-plain functions: what they do to an emulator is done when they return.
+A call gets a JSON body or a query, which pydantic checks, and answers JSON. Handlers are plain
+functions: their effect on an emulator is complete when they return.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _Model = type[BaseModel] | TypeAdapter[Any]
 
 
 class CallBody(BaseModel):
-    """A call's body: nothing else, and no other types, than its fields say."""
+    """A call's body: only its fields, with exactly their types."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -68,7 +68,7 @@ class _Call(Generic[C]):
     method: _Method  # HTTP method
     path: str  # path with variable parts in braces
     about: str  # purpose and answer, for people
-    # does it, given the site and what was asked; returns the answer, or raises RefusedError. An
+    # handler: gets the site and the request; returns the answer, or raises RefusedError. An
     # event stream returns a coroutine.
     handler: Action[C]
     query: type[BaseModel] | None = None  # the query's model; None: it takes none
@@ -167,9 +167,9 @@ class Calls(Generic[C]):
     def add(
         self, method: _Method, path: str, *, about: str = "", **takes: Any
     ) -> Callable[[Action[C]], Action[C]]:
-        """Make the function below a call's handler; its docstring says what the call is about.
+        """Make the decorated function a call's handler; its docstring describes the call.
 
-        ``about`` says it where the docstring has no room for it; ``takes`` are ``query``, ``body``,
+        ``about`` describes a call that needs more room; ``takes`` are ``query``, ``body``,
         ``optional`` and ``sample`` of the call.
         """
 
@@ -182,7 +182,7 @@ class Calls(Generic[C]):
         return declare
 
     def adopt(self, row: _Call[Any], path: str, handler: Action[C]) -> None:
-        """Have another table's call, at a path of this one's, done by this handler."""
+        """Add another table's call, at a path of this table, with another handler."""
         self._rows.append(dataclasses.replace(row, path=path, handler=handler))
 
     def as_json(self) -> list[dict[str, Any]]:
@@ -194,7 +194,7 @@ class Calls(Generic[C]):
 
 
 def routes(calls: Calls[C], site: C) -> list[web.RouteDef]:
-    """Return the calls as what aiohttp's router takes."""
+    """Return the calls for aiohttp's router."""
 
     def handler(call: _Call[C]) -> _Handler:
         async def answer(request: web.Request) -> web.StreamResponse:
@@ -243,7 +243,7 @@ def middleware(guard: Guard, prefix: str) -> Any:
 
 
 def _fault(request: web.Request) -> RefusedError:
-    """Log the exception that is being handled, and return what the client is told of it."""
+    """Log the exception that is being handled, and return the refusal for the client."""
     _log.exception("! %s %s: a fault of ours", request.method, request.path)
     return RefusedError(500, "a fault of ours", "this to be reported, with the log")
 

@@ -1,4 +1,4 @@
-"""An emulated camera as JSON: what calls and events tell of it."""
+"""An emulated camera as JSON, for calls and events."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SENSOR = (1280, 1024)
 """Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
 
 MAX_HEX_BYTES = 512
-"""Largest number of bytes of a payload that a list of log entries shows; the entry alone has
+"""Largest number of bytes of a payload that a list of log entries shows; a single entry has
 all."""
 
 MAX_VALUES_BYTES = 2048
-"""Largest number of bytes of a result that a list of log entries shows decoded; the entry alone
-shows any."""
+"""Largest number of bytes of a result that a list of log entries shows decoded; a single entry has
+no bound."""
 
 MAX_TOLD_BYTES = 1 << 18
 """Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
@@ -41,7 +41,7 @@ MAX_LISTED = 1000
 """Largest number of faults that a list shows."""
 
 LOOKING = {"tangram": False, "tangram_pixels": True}
-"""Generators that look at the table, and whether they tell pixels."""
+"""Generators that use the table, and whether they report pixels."""
 
 
 # ---------------------------------------------------------------------- the camera
@@ -56,11 +56,11 @@ OPERATOR = (
     "set_endian",
     "reboot",
 )
-"""Actions that an operator may be able to do, as devices name them."""
+"""Actions that an operator may have, by the devices' names for them."""
 
 
 def abilities(emulator: WireCamera) -> list[str]:
-    """Return the names of what an operator can do, with ``scene`` and ``clock`` if present."""
+    """Return the names of an operator's actions, with ``scene`` and ``clock`` if present."""
     able = [one for one in OPERATOR if hasattr(emulator.device, one)]
     has = {"scene": emulator.table, "clock": emulator.clock_time}
     return able + [name for name, one in has.items() if one is not None]
@@ -81,7 +81,7 @@ def _row(name: str, emulator: WireCamera, shown: dict[str, Any]) -> dict[str, An
 
 
 def camera_state(name: str, emulator: WireCamera) -> dict[str, Any]:
-    """Return all there is to know of a camera but scene, faults and log."""
+    """Return the whole state of a camera, except scene, faults and log."""
     shown = emulator.shown()
     return {
         **_row(name, emulator, shown),
@@ -100,8 +100,8 @@ def camera_state(name: str, emulator: WireCamera) -> dict[str, Any]:
 
 
 def times(emulator: WireCamera) -> dict[str, Any]:
-    """Return the time of the log, seconds, and what the camera's own clock shows."""
-    with emulator.step():  # which brings the device's time up
+    """Return the time of the log, seconds, and the time of the camera's own clock."""
+    with emulator.step():  # advances the device's time
         return {"time": emulator.clock.now, "clock_time": emulator.clock_time}
 
 
@@ -109,12 +109,12 @@ def times(emulator: WireCamera) -> dict[str, Any]:
 
 
 def log_count(emulator: WireCamera) -> int:
-    """Return the number of entries that the log has had: the serial behind the last one."""
+    """Return the number of all entries so far: the serial after the last one."""
     return emulator.log.since(sys.maxsize, 0)[1]
 
 
 def log_range(emulator: WireCamera) -> dict[str, int]:
-    """Return the serials of the log: ``first`` that is there, ``next`` that will be."""
+    """Return the serials of the log: ``first`` is the oldest entry, ``next`` the next one."""
     count = log_count(emulator)
     return {"first": count - len(emulator.log), "next": count}
 
@@ -122,28 +122,28 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
     """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_TOLD_BYTES.
 
-    ``next`` is the serial to go on with, ``missed`` how many are gone.
+    ``next`` is the serial to go on with, ``missed`` the number of dropped entries.
     """
     entries, count = emulator.log.since(since, limit)
     first = min(max(since, count - len(emulator.log)), count)
-    told: list[dict[str, Any]] = []
+    listed: list[dict[str, Any]] = []
     room = MAX_TOLD_BYTES
     for serial, entry in enumerate(entries, first):
-        told.append(camera_entry(serial, entry, emulator))
-        room -= min(told[-1]["size"], MAX_VALUES_BYTES)
+        listed.append(camera_entry(serial, entry, emulator))
+        room -= min(listed[-1]["size"], MAX_VALUES_BYTES)
         if room <= 0:
             break
-    part = {"entries": told, "next": first + len(told), "missed": max(0, first - since)}
-    return part, entries[: len(told)]
+    part = {"entries": listed, "next": first + len(listed), "missed": max(0, first - since)}
+    return part, entries[: len(listed)]
 
 
 def camera_entry(
     serial: int, entry: LogEntry, emulator: WireCamera, *, whole: bool = False
 ) -> dict[str, Any]:
-    """Return an entry of the log; ``serial`` is its place among all that there have been, from 0.
+    """Return an entry of the log; ``serial`` is its number among all entries so far, from 0.
 
-    What is left out of a long payload, unless ``whole``, is told by ``size`` and ``wire_size``,
-    and by null in place of ``values``.
+    Unless ``whole``, a long payload is cut; ``size`` and ``wire_size`` give its length, and
+    ``values`` is null.
     """
     shown = None if whole else MAX_HEX_BYTES * 3 - 1
     message, wire = entry.message, entry.wire
@@ -169,7 +169,7 @@ def camera_entry(
 
 
 def _search(data: str) -> str | None:
-    """Return the dialect in which a client greeted that searches for the camera's, or None."""
+    """Return the dialect of a greeting by a client that searches for the camera's, or None."""
     return next((name for hello, name in _greetings() if data.startswith(hello)), None)
 
 
@@ -188,7 +188,7 @@ def _size(text: str) -> int:
 
 
 def _fields(message: m.Message, dialect: WireCodec) -> dict[str, Any]:
-    """Return the fields that the dialect has on the wire; bytes stand in the payload's hex."""
+    """Return the fields on the dialect's wire, without bytes, which are in the payload's hex."""
     names = _field_names(dialect).get(type(message), ())
     return {name: getattr(message, name) for name in names}
 
@@ -202,7 +202,7 @@ def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]
 
 
 def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
-    """Return a result's values as its application's layout has them, None if there is none."""
+    """Return a result's values by its application's layout, None without one."""
     if not isinstance(message, m.ResultContainer):
         return None
     if message.cells is not None:
@@ -257,7 +257,7 @@ def _fired(one: FiredFault) -> dict[str, Any]:
 
 
 def kinds() -> list[dict[str, Any]]:
-    """Return every kind of fault with what it does and the JSON Schema of its fields."""
+    """Return every kind of fault with its description and the JSON Schema of its fields."""
     return [
         {
             "kind": kind,
@@ -273,10 +273,10 @@ def kinds() -> list[dict[str, Any]]:
 
 
 def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
-    """Return the table: parts at their true poses, what the camera sees of it and reported last.
+    """Return the table: true poses of the parts, the camera's view, and the last reported poses.
 
     Lengths are metres on the table, angles radians. ``lookers`` are the ids of the applications
-    that look at it.
+    that use it.
     """
     applications = emulator.device.applications.values()
     return {
@@ -318,7 +318,7 @@ def _part(scene: TableScene, name: str, pose: TablePose) -> dict[str, Any]:
 
 
 def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
-    """Return the poses that the last run reported, whether or not a client heard it, or None."""
+    """Return the poses that the last run reported, even if no client received it, or None."""
     last = emulator.last_report
     application = None if last is None else emulator.application_of(last.result)
     layout = None if application is None else application.result_layout
@@ -331,7 +331,7 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
 
 
 def _looks(application: Application) -> bool:
-    """Return True if an application looks at the table and reports the places of the parts."""
+    """Return True if an application sees the table and reports the places of the parts."""
     layout = application.result_layout
     fields = set[str]() if layout is None else {field.name for field in layout.fields}
     return str(application.generator) in LOOKING and {"x", "y", "theta"} <= fields

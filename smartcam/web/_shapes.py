@@ -1,7 +1,7 @@
 """The shapes of the tangram pieces, to draw them.
 
-A tangram is a square cut into seven; here one of 0.1 m, so that the pieces lie apart where the
-scene puts them (derived: :data:`~smartcam.emulator._scene.PIECES` promises it). The pose of a piece
+A tangram is a square cut into seven pieces; this one has sides of 0.1 m, so that the pieces do not
+touch in the scene (derived from :data:`~smartcam.emulator._scene.PIECES`). The pose of a piece
 is that of its centroid; a triangle's longest side, and the longer side of the parallelogram, lie
 along its x axis.
 """
@@ -49,4 +49,4 @@ OUTLINES: Mapping[str, Outline] = {
     "square": _parallelogram(_EDGE, _EDGE, 0.0),
     "parallelogram": _parallelogram(SIDE / 2, SIDE / 4, SIDE / 4),
 }
-"""The outline of each piece, by the name it has in a scene."""
+"""The outline of each piece, by its name in a scene."""

@@ -29,7 +29,7 @@ API = "/api"
 """Prefix of the paths of all calls."""
 
 FAREWELL = 0.2
-"""Seconds that an answer under way gets when the site stops, twice."""
+"""Seconds that an unfinished answer gets when the site stops, twice."""
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 _ANY = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  names, nothing is bound here
@@ -41,13 +41,13 @@ class Site(Server):
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css, and
             of its row in ``PAGES``. Pages may use ``base.css`` and ``base.js``, too.
-        host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
-        files: files of other pages that this page uses as well.
-        pages: other pages of the site, by their path, as aiohttp's router takes it.
+        host, port, token: as for :class:`~smartcam.web.EmulatorSite`.
+        files: files of other pages that this page uses, too.
+        pages: other pages of the site, by their path in the form of aiohttp's router.
 
     Attributes:
-        host: host that was given.
-        token: what calls must carry, None for nothing.
+        host: the given host.
+        token: token that calls must carry, None without one.
         streams: the event streams.
 
     Raises:
@@ -81,30 +81,30 @@ class Site(Server):
 
     @property
     def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
+        """The port that the site listens on; the given one until it is started."""
         return self._port
 
     @property
     def api(self) -> str:
-        """Address in front of the calls' paths, ``http://HOST:PORT``.
+        """Address before the calls' paths, ``http://HOST:PORT``.
 
-        It has this machine's name where the site listens on all addresses.
+        It has this machine's name if the site listens on all addresses.
         """
         name = socket.gethostname() if self.host in _ANY else self.host
         return f"http://{f'[{name}]' if ':' in name else name}:{self._port}"
 
     @property
     def url(self) -> str:
-        """Address of the page; the token stands behind ``#``, which browsers send to nobody."""
+        """Address of the page; the token follows ``#``, a part that browsers do not send."""
         return f"{self.api}/" + ("" if self.token is None else f"#token={self.token}")
 
     async def start(self) -> None:
-        """Open the port; does nothing if it is started already.
+        """Open the port; do nothing if it is started already.
 
         Raises:
             ConfigurationError: the server cannot listen there.
 
-        Cancellation: leaves it stopped.
+        Cancellation: leaves the site stopped.
         """
         if self._open is not None:
             return
@@ -118,9 +118,9 @@ class Site(Server):
         self._port, self._open = opened.port, opened
 
     async def stop(self) -> None:
-        """Close the port, every stream and every connection; does nothing if stopped.
+        """Close the port, every stream and every connection; do nothing if stopped.
 
-        Cancellation: takes effect when all is closed, which two :data:`FAREWELL` take at most.
+        Cancellation: takes effect when all is closed, after two :data:`FAREWELL` at most.
         """
         opened, self._open = self._open, None
         if opened is None:
@@ -145,8 +145,8 @@ class Site(Server):
 class OpenPort:
     """A site's port while it is open.
 
-    Not aiohttp's: that takes as many connections as come, and ``asyncio.Server`` fills the log
-    where there are too many.
+    Not aiohttp's own, since that accepts any number of connections, and ``asyncio.Server`` fills
+    the log if there are too many.
     """
 
     def __init__(self, runner: web.AppRunner, listener: socket.socket) -> None:
@@ -169,7 +169,7 @@ class OpenPort:
 
 
 class _Calm(logging.LoggerAdapter[logging.Logger]):
-    """Takes what aiohttp logs. It is about what clients send wrong: no errors with tracebacks."""
+    """Takes aiohttp's log, which is about bad requests: no errors with tracebacks."""
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
         """Log a message at INFO at most."""
@@ -186,7 +186,7 @@ async def _add_headers(_request: web.Request, response: web.StreamResponse) -> N
 
 
 def _served(body: bytes, name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
-    """Return a handler that serves a file whose name ends like ``name``."""
+    """Return a handler that serves a file; the end of ``name`` gives its type."""
     content_type = _TYPES[name.rpartition(".")[2]]
 
     async def serve(_request: web.Request) -> web.Response:
@@ -201,7 +201,7 @@ async def open_port(
     """Return the port on which an application is served from now on.
 
     Raises:
-        OSError, ValueError, OverflowError: the address cannot be had, or it is not ``local``.
+        OSError, ValueError, OverflowError: the address is not available, or is not ``local``.
 
     Cancellation: leaves nothing open.
     """

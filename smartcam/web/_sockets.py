@@ -1,4 +1,4 @@
-"""A WebSocket with one thing on its way: the next one goes when the page has shown the last."""
+"""A WebSocket with one message on its way: the next is sent when the page has shown the last."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_WORD_BYTES: Final = 64
-"""Largest number of bytes of what a page may say: that it wants the next one."""
+"""Largest number of bytes of a page's message, which asks for the next one."""
 
 
 def check_websocket(request: web.Request, protocol: str, viewers: int, most: int) -> None:
-    """See that a request asks for a WebSocket of ``protocol``, and that there is room for it.
+    """Check that a request asks for a WebSocket of ``protocol``, and that there is room for it.
 
     Raises:
-        RefusedError: 400, it does not; 503, ``most`` look already.
+        RefusedError: 400, it asks for another; 503, there are ``most`` viewers already.
     """
     headers = request.headers
     offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", protocol).split(",")]
@@ -43,9 +43,9 @@ class PageSocket(ABC):
     Args:
         request: request that asks for the WebSocket.
         protocol: subprotocol of the WebSocket.
-        what: word for what is shown, for the log.
+        what: word for the shown messages, for the log.
         heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
-        longest: bytes of a message from the page at most.
+        longest: largest number of bytes of a message from the page.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class PageSocket(ABC):
             compress=False,
             heartbeat=heartbeat,
         )
-        self._shown = asyncio.Event()  # the page has shown the last one
+        self._shown = asyncio.Event()  # the page has shown the last message
         self._ending = asyncio.Event()
 
     def end(self) -> None:
@@ -74,9 +74,9 @@ class PageSocket(ABC):
         self._ending.set()
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show what there is until the page goes, is too slow, or :meth:`end` is called.
+        """Show messages until the page goes, is too slow, or :meth:`end` is called.
 
-        Cancellation: ends it.
+        Cancellation: ends the socket.
         """
         try:
             await self._socket.prepare(self._request)
@@ -97,26 +97,26 @@ class PageSocket(ABC):
 
     @abstractmethod
     async def _show(self) -> None:
-        """Send one after the other; TimeoutError: the page does not take or show one."""
+        """Send messages one by one; TimeoutError: the page does not accept or show one."""
 
     async def _listen(self) -> None:
-        """Hear that something was shown, until the page goes or says something else."""
+        """Receive that messages were shown, until the page goes or sends another message."""
         while True:
             message = await self._socket.receive()
             if message.type is not WSMsgType.TEXT:
                 return
             if message.data == "next":
                 self._shown.set()
-            elif not self._hear(message.data):
+            elif not self._receive(message.data):
                 return
 
-    def _hear(self, _said: str) -> bool:
-        """Hear something else; False where it means nothing, which ends it."""
+    def _receive(self, _message: str) -> bool:
+        """Handle another message; return False if it has no meaning, which ends the socket."""
         return False
 
 
 async def _first(*jobs: Coroutine[object, object, object]) -> None:
-    """Run jobs until one is over, and raise what it raised."""
+    """Run jobs until one ends, and raise its error."""
     tasks = [asyncio.create_task(job) for job in jobs]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -1,7 +1,7 @@
-"""Event streams: what happens, told to whoever listens, as server-sent events.
+"""Event streams: news as server-sent events, for any number of readers.
 
-A stream looks for news ten times per second and writes them. Nothing waits for it: while its reader
-is slow it does not look, and a reader that takes nothing at all is disconnected.
+A stream looks for news ten times per second and writes them. Nothing waits for it: it does not look
+while its reader is slow, and a reader that accepts nothing is disconnected.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_STREAMS = 16
-"""Event streams at one time; each looks for news on its own."""
+"""Largest number of event streams at one time; each looks for news by itself."""
 
 PERIOD = 0.1
 """Seconds between two looks for news."""
 
 SLOW = 10.0
-"""Seconds that a reader may take for what was written; then its stream ends."""
+"""Seconds that a reader has to accept written events; then its stream ends."""
 
 
 class News(NamedTuple):
@@ -38,10 +38,10 @@ class News(NamedTuple):
 
     kind: str  # the event's name
     data: Any  # event, sent as JSON
-    serial: int | None = None  # sent as the event's id; None for none
+    serial: int | None = None  # id of the event; None without one
 
     def as_text(self) -> str:
-        """Return the event as it stands in the stream."""
+        """Return the event in the stream's format."""
         mark = "" if self.serial is None else f"id: {self.serial}\n"
         return f"event: {self.kind}\n{mark}data: {json.dumps(jsonable(self.data))}\n\n"
 
@@ -61,7 +61,7 @@ class Streams:
     ) -> web.StreamResponse:
         """Write news until the reader goes, is too slow, or :meth:`close` is called.
 
-        ``look`` is called every :data:`PERIOD` and returns what is new.
+        ``look`` is called every :data:`PERIOD` and returns the news.
 
         Raises:
             RefusedError: 503, there are :data:`MAX_STREAMS` already.
@@ -92,11 +92,11 @@ class Streams:
         return response
 
     def close(self) -> None:
-        """End all streams, and those that come."""
+        """End all streams, and refuse new ones."""
         self._closing.set()
 
     async def pause(self, seconds: float) -> bool:
-        """Wait for some time; True at once where all streams are to end."""
+        """Wait for some time; return True at once if all streams have to end."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._closing.wait()

@@ -1,4 +1,4 @@
-"""The site on which an application is taught: pictures, regions, tools, what they find at once."""
+"""The site on which an application is taught: pictures, regions, tools, and their results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.inspection import Drawing, Inspection, Teaching
 
 MAX_PICTURES: Final = 200
-"""Largest number of pictures on the page; of a source the oldest one makes room."""
+"""Largest number of pictures on the page; the oldest picture of a source makes room."""
 
 MAX_TOOLS: Final = 32
 """Largest number of tools that the page may try at once."""
@@ -39,7 +39,7 @@ MAX_POINTS: Final = 200
 """Largest number of points of a mark that the page draws."""
 
 SHOT_TIMEOUT: Final = 5.0
-"""Seconds that a picture of the camera is waited for."""
+"""Seconds to wait for a picture of the camera."""
 
 T = TypeVar("T")
 
@@ -50,7 +50,7 @@ class NamedPicture:
     Args:
         name: name of the picture for people.
         picture: pixels of the picture.
-        file: path of its file as the cell file can name it; "": it is in none.
+        file: path of its file for the cell file; "" without a file.
     """
 
     def __init__(self, name: str, picture: Picture, file: str = "") -> None:
@@ -65,11 +65,11 @@ class TeachSite(ThreadedSite):
     Args:
         teaching: the application and its file.
         files: files with pictures.
-        source: open source of the camera's frames, for pictures of now; None: files only.
-        host: address to listen on; nothing but this.
+        source: open source of the camera's frames, for new pictures; None: files only.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``, as
-            :class:`~smartcam.web.LiveSite` has it.
+        token: token that every call must carry in ``Authorization: Bearer``, as for
+            :class:`~smartcam.web.LiveSite`.
 
     Raises:
         ConfigurationError: the token cannot be used, or there are too many files.
@@ -100,16 +100,16 @@ class TeachSite(ThreadedSite):
         made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
-        # results by picture, of the tools that were tried last
+        # results of the last tools that were tried, by picture
         self._tried: dict[int, Inspection] = {}
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
-        """Have the thread do something.
+        """Run a function in the thread.
 
         Raises:
-            RefusedError: the call cannot be done, or the site is stopped.
+            RefusedError: the call cannot be carried out, or the site is stopped.
 
-        Cancellation: safe; a thread that has begun goes on to the end.
+        Cancellation: safe; a function that has begun runs to its end.
         """
         try:
             return await self.in_thread(what, *args)
@@ -147,9 +147,9 @@ class TeachSite(ThreadedSite):
         return found
 
     def try_tools(self, given: dict[str, dict[str, str]]) -> dict[str, Any]:
-        """Return the verdicts and values of every picture; it belongs into a thread.
+        """Return the verdicts and values of every picture; call it in a thread.
 
-        Besides, what the tools were taught.
+        Also return the tools' templates.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
@@ -178,7 +178,7 @@ class TeachSite(ThreadedSite):
         return {"found": found, "remarks": remarks}
 
     def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
-        """Return the tools' settings, as texts, by which the good pictures are good; and why.
+        """Return settings, as texts, for which the good pictures pass, and their reasons.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
@@ -195,7 +195,7 @@ class TeachSite(ThreadedSite):
         return {"tools": texts_of(lesson.tools), "learned": lesson.remarks}
 
     def state(self) -> dict[str, Any]:
-        """Return the beginning of the page, as values for JSON."""
+        """Return the first state of the page, as values for JSON."""
         teaching = self.teaching
         return {
             "file": str(teaching.path),
@@ -244,7 +244,7 @@ def _png(picture: Picture) -> bytes:
     return bytes(data)
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 CALLS: Calls[TeachSite] = Calls()
 """All calls."""
@@ -292,7 +292,7 @@ async def _shoot(site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/try", body=ToolsBody, sample=_SAMPLE)
 async def _try(site: TeachSite, call: CallRequest) -> object:
-    """Verdicts and values of the tools for every picture, and what the tools were taught."""
+    """Verdicts and values of the tools for every picture, and the tools' settings."""
     return await site.work(site.try_tools, call.body.tools)
 
 
@@ -300,7 +300,7 @@ async def _try(site: TeachSite, call: CallRequest) -> object:
     "POST", f"{API}/learn", body=LearnBody, sample=_SAMPLE.replace("}}}", '}}, "good": [1]}')
 )
 async def _learn(site: TeachSite, call: CallRequest) -> object:
-    """The tools with tolerances by which the good pictures are good, and what they follow from."""
+    """The tools with tolerances that all good pictures pass, and their reasons."""
     return await site.work(site.learn, call.body.tools, call.body.good)
 
 

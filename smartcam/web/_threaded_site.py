@@ -1,4 +1,4 @@
-"""A web site that has work done in threads of its own."""
+"""A web site with threads of its own for long work."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ThreadedSite(Site):
         await super().start()
 
     async def stop(self) -> None:
-        """Close the port, and end the threads; work that waits for one of them is not begun."""
+        """Close the port, and end the threads; waiting work is not begun."""
         try:
             await super().stop()
         finally:
@@ -44,7 +44,7 @@ class ThreadedSite(Site):
         Raises:
             RefusedError: the site is stopped.
 
-        Cancellation: safe; a thread that has begun goes on to the end.
+        Cancellation: safe; a function that has begun runs to its end.
         """
         if self._threads is None:
             raise RefusedError(503, "a site that ends", "one that runs")

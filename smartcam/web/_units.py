@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PRACTICAL_UNITS = ("mm", "deg")
-"""Names of the units that a page's switch shows where nobody has chosen others."""
+"""Names of the units that a page's switch shows by default."""
 
 
 class PageUnits:
@@ -33,7 +33,7 @@ class PageUnits:
         self.first: bool = names is not None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the units for the page: name and factor by the SI unit whose place each takes."""
+        """Return the units for the page: name and factor, by the SI unit that each replaces."""
         units = {symbol: self.shown.of(symbol) for symbol in SI_SYMBOLS.values()}
         return {
             "first": self.first,

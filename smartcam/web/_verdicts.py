@@ -1,4 +1,4 @@
-"""Pass and fail: what the names of truth values tell of a result."""
+"""Pass and fail: judge a result by the names of its truth values."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
-"""Largest number of records of a result that are looked at for pass or fail."""
+"""Largest number of records of a result that are judged."""
 
 Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
-"""Outcome of a result; one that tells neither good nor bad is "other"."""
+"""Outcome of a result; a result without a verdict is "other"."""
 
 
 def verdicts(value: Any) -> list[dict[str, Any]]:
     """Return a value's truth values: ``name``, ``true``, ``of`` and ``verdict``.
 
-    Of a list of records: how many of them are true, and of how many.
+    For a list of records, the number of true ones, and of all.
     """
     rows: list[Any] = value if isinstance(value, list) else [value]
     if not (rows and all(isinstance(one, dict) for one in rows)):
@@ -54,7 +54,7 @@ def judged(value: Any) -> Outcome:
 
 
 def failing(value: Any) -> str:
-    """Return the truth values that are not as they should be, in words; "" if none is."""
+    """Return the truth values that are wrong, in words; "" without any."""
     bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
     texts = []
     for one in bad:

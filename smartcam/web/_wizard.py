@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class WizardSite(Site):
     """A page and HTTP calls that drive the wizards of calibrations.
 
-    It runs in the event loop that the service's actions run in. Whoever uses it at the same time
-    uses one sequence: a token tells which step a call meant.
+    It runs in the event loop of the service's actions. Users at the same time share one
+    sequence: a token names the step of a call.
 
     ::
 
@@ -37,13 +37,13 @@ class WizardSite(Site):
 
     Args:
         service: the calibrations' folder and their wizards; closed by its maker.
-        host: address to listen on; nothing but this.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
-            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+        token: token that every call must carry in ``Authorization: Bearer``: at least 16 letters,
+            digits, ``-`` and ``_``. None: no token on a loopback address; else one is made.
 
     Attributes:
-        service: service that was given.
+        service: the given service.
 
     Raises:
         ConfigurationError: the token cannot be used.
@@ -61,7 +61,7 @@ class WizardSite(Site):
         self.service: CalibrationService = service
 
 
-# ---------------------------------------------------------------------- what calls take
+# ---------------------------------------------------------------------- arguments of calls
 
 
 class _StartBody(CallBody):
@@ -97,7 +97,7 @@ class _CameraPose(CallBody):
     frame: str | None = None
 
 
-# ---------------------------------------------------------------------- what calls do
+# ---------------------------------------------------------------------- calls
 
 _STATUS = {
     Code.NOT_FOUND: 404,
@@ -108,7 +108,7 @@ _STATUS = {
     Code.IN_USE: 409,
     Code.NOT_WRITTEN: 500,
 }
-"""HTTP status by what a call is refused for; 422 for the rest."""
+"""HTTP status by the code of a refusal; 422 for all others."""
 
 
 def _refused(error: CalibrationError) -> RefusedError:
@@ -125,10 +125,10 @@ CALLS: Calls[WizardSite] = Calls()
 def _call(
     method: Literal["GET", "POST"], path: str, *, writes: str = "folder", **takes: Any
 ) -> Callable[[Handler], Handler]:
-    """Make a call of the function below, which does it to the service, given the body.
+    """Make the decorated function a call's handler, which gets the service and the body.
 
-    ``path`` stands behind that of all calls, ``writes`` is what it writes to; what it takes, see
-    :meth:`~smartcam.web._routes.Calls.add`.
+    ``path`` follows the prefix of all calls; ``writes`` names the file or folder written to; for
+    ``takes`` see :meth:`~smartcam.web._routes.Calls.add`.
     """
 
     def declare(handler: Handler) -> Handler:
@@ -156,22 +156,22 @@ def _calls(_site: WizardSite, _ask: CallRequest) -> object:
 
 @_call("GET", "/calibrations")
 def _state(service: CalibrationService, _body: object) -> object:
-    """Names of the calibrations and of the wizards, and the one that is under way."""
+    """Names of the calibrations and of the wizards, and of the running wizard."""
     return {"calibrations": service.names, "wizards": service.wizards, "name": service.name}
 
 
 @_call("GET", "/listing")
 async def _listing(service: CalibrationService, _body: object) -> object:
-    """A row for each calibration: of when it is, its error, its last check."""
+    """A row for each calibration: its date, its error, its last check."""
     return {"listing": await asyncio.to_thread(lambda: service.listing)}
 
 
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')
 def _start(service: CalibrationService, body: _StartBody) -> object:
-    """Start a wizard under a name, or go on with the one that was broken off; answers its step.
+    """Start a wizard under a name, or continue an interrupted one; answers its step.
 
     `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which look at
-    pictures. With `fresh` begin anew in any case. `resumed` says since when there is one, and its
+    pictures. `fresh` begins anew in any case. `resumed` has the date of a continued wizard, and its
     answers.
     """
     view = service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
@@ -180,13 +180,13 @@ def _start(service: CalibrationService, body: _StartBody) -> object:
 
 @_call("GET", "/step")
 def _step(service: CalibrationService, _body: object) -> object:
-    """The current step: what to show, and the JSON Schema of what is asked for."""
+    """The current step: the texts to show, and the JSON Schema of the answers."""
     return {**service.session.current, "resumed": service.session.resumed}
 
 
 @_call("POST", "/step", writes="journal", body=_Answers, sample='{"token": "...", "answers": {}}')
 def _submit(service: CalibrationService, body: _Answers) -> object:
-    """Answer the step of that token; answers the next one, or the same with `errors`.
+    """Answer the step of that token; returns the next step, or the same with `errors`.
 
     May be made again if its answer was lost.
     """
@@ -207,7 +207,7 @@ def _repeat(service: CalibrationService, body: _StepToken) -> object:
 
 @_call("POST", "/abort", writes="journal", body=_StepToken, sample='{"token": "..."}')
 def _abort(service: CalibrationService, body: _StepToken) -> object:
-    """End the wizard without a result; what was measured stays in the journal."""
+    """End the wizard without a result; the measurements stay in the journal."""
     return service.session.abort(body.token)
 
 

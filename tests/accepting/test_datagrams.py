@@ -24,7 +24,7 @@ SAID = (b"", b"\0", wire.QUERY, bytes(1400), b"\x80\x60" + bytes(30))
 
 @asynccontextmanager
 async def flooded(port: int) -> AsyncIterator[None]:
-    """Have strangers say something, each from a port of its own."""
+    """Send something from strangers, each with its own port."""
     socks = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(STRANGERS)]
     try:
         for one in socks:

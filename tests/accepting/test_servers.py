@@ -1,4 +1,4 @@
-"""Strangers at every server that accepts connections: they lock nobody out, and cost little."""
+"""Strangers at every server that accepts connections: they lock out no client, and cost little."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Stranger:
         self.speak()
 
     def speak(self) -> None:
-        """Say the next of it, and see whether the server has ended the connection."""
+        """Send the next bytes, and check whether the server has ended the connection."""
         if self.ended:
             return
         words = self._words
@@ -100,7 +100,7 @@ class Stranger:
 async def strangers(
     kind: str, row: Row, stage: Stage, *, host: str = "127.0.0.1", count: int = 0
 ) -> AsyncIterator[list[Stranger]]:
-    """Have strangers at a server; those that it turns away give their sockets back."""
+    """Connect strangers to a server; refused ones give their sockets back."""
     there: list[Stranger] = []
     try:
         for _ in range(count or (MANY if kind == "thousand" else 2 * stage.places.most)):
@@ -119,7 +119,7 @@ async def strangers(
 
 
 async def turns(count: int = 20) -> None:
-    """Let the loop go round."""
+    """Let the loop make a turn."""
     for _ in range(count):
         await asyncio.sleep(0)
 
@@ -132,7 +132,7 @@ async def emptied(stage: Stage, left: int = 0) -> None:
 
 
 def descriptors() -> int:
-    """Return how many files and sockets the process has open."""
+    """Return the number of open files and sockets of the process."""
     return len(list(Path("/proc/self/fd").iterdir())) if sys.platform == "linux" else 0
 
 
@@ -191,7 +191,7 @@ async def test_what_strangers_say_takes_little_memory(name: str) -> None:
 
 @pytest.fixture
 def everybody_is_remote(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Have the addresses of loopback count as those of other machines."""
+    """Make the addresses of loopback count as those of other machines."""
     with monkeypatch.context() as patch:
         patch.setattr(_accepting, "is_loopback", lambda _host: False)
         yield

@@ -47,7 +47,7 @@ def process(url: str, folder: Path, *options: str) -> Process:
 
 
 def touch(name: str) -> tuple[float, float, float]:
-    """Return where the robot touches a piece, metres."""
+    """Return the robot's position when it touches a piece, metres."""
     x, y, _ = PIECES[name]
     return (
         OFFSET[0] + x * math.cos(YAW) - y * math.sin(YAW),
@@ -219,7 +219,7 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
     first = calibrating(url, tmp_path, lines[:5], "--json")
     first_lines, last = first.lines, first.lines[-1]
     assert first.code == 2
-    assert "the same command goes on with it" in first.err
+    assert "the same command continues with them" in first.err
     second = calibrating(url, tmp_path, lines[5:], "--json").done()
     (going_on, *_) = second.lines
     resumed = going_on.pop("resumed")
@@ -276,7 +276,7 @@ def test_calibrate_aborted_has_its_exit_code_and_no_file(url: str, tmp_path: Pat
     done = calibrating(url, tmp_path, [":repeat", ":abort"])
     assert (done.code, done.err) == (130, "")
     assert "! :repeat: expected one of :abort" in done.out
-    assert done.out.endswith("aborted; what was measured stands in the journal\n")
+    assert done.out.endswith("aborted; the measurements stay in the journal\n")
     assert [one.name for one in tmp_path.iterdir()] == ["plane.journal"]
 
 
@@ -305,7 +305,7 @@ def test_calibrate_with_wrong_usage_says_what_is_wrong(
     calibrating("bvs://127.0.0.1:9", tmp_path, lines, *options).failed(2, text)
 
 
-def test_calibrate_with_results_that_are_no_localizations_says_so(url: str, tmp_path: Path) -> None:
+def test_calibrate_with_results_that_are_no_localizations_fails(url: str, tmp_path: Path) -> None:
     lines = [*as_lines(ABOUT, {}), '{"do": "abort"}']
     done = calibrating(url, tmp_path, lines, "--json", "--interpret-as", "raw")
     assert done.lines[2]["errors"] == {

@@ -36,7 +36,7 @@ NOTHING = np.full((240, 320), 128, np.uint8)
 
 @functools.cache
 def images() -> list[Any]:
-    """Return what is seen from five sides."""
+    """Return pictures from five sides."""
     random = np.random.default_rng(7)
     return [
         render(BOARD, LENS, pose.inverse(), noise=1.0, random=random)
@@ -110,7 +110,7 @@ def test_lens_of_files_has_its_views_in_json(tmp_path: Path, target: str) -> Non
         (("synthetic://?size=5x5", "-o", "x.yaml"), "room for the stamp"),
     ],
 )
-def test_lens_with_wrong_use_is_told(
+def test_lens_with_wrong_use_is_reported(
     target: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -136,7 +136,7 @@ def test_lens_of_too_few_views_is_refused(tmp_path: Path, target: str) -> None:
 
 
 class Table(ShowingDriver):
-    """Shows images one after the other, each for a while, as somebody holds a sheet."""
+    """Shows images one after the other, each for a while, like a person with a sheet."""
 
     images: tuple[Any, ...] = ()
     ends: Any = "not"
@@ -156,7 +156,7 @@ class Table(ShowingDriver):
 
 @pytest.fixture
 def table(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Have ``table://``; gives what puts images there."""
+    """Register ``table://``; yield the function that puts images there."""
     monkeypatch.setattr(FRAMES, "_registered", {"table": Table})
     monkeypatch.setattr(FRAMES, "_loaded", {})
 
@@ -196,7 +196,7 @@ def test_lens_of_a_source_ends_with_its_seconds_and_says_what_lacks(
         ({}, 4, "expected the next frame, got none in time"),
     ],
 )
-def test_lens_of_a_source_that_dies_or_is_silent_says_so(
+def test_lens_of_a_source_that_dies_or_is_silent_reports_it(
     tmp_path: Path, target: str, table: Any, other: dict[str, Any], code: int, text: str
 ) -> None:
     table(**other)

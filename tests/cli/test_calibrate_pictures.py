@@ -135,7 +135,7 @@ def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) ->
         run("trigger", url, *options, "--y-down").failed(3)
 
 
-def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
+def test_calibrate_by_a_folder_if_nothing_comes_keeps_the_step(
     tmp_path: Path, files: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
@@ -165,7 +165,7 @@ def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(
     assert set(done.lines[3]["errors"]) == {"y", "z", "a", "b", "c"}
 
 
-def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
+def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_reports_it(
     tmp_path: Path, files: list[str]
 ) -> None:
     lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
@@ -195,7 +195,7 @@ class Sheet(ShowingDriver):
 
 @pytest.fixture
 def sheet_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have ``sheet://``."""
+    """Register ``sheet://``."""
     monkeypatch.setattr(FRAMES, "_registered", {"sheet": Sheet})
     monkeypatch.setattr(FRAMES, "_loaded", {})
 
@@ -249,7 +249,7 @@ async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
         (["v4l2:///dev/video0", "--wizard", "sheet"], "--pictures v4l2:///dev/video0 with"),
     ],
 )
-def test_calibrate_with_options_that_contradict_says_so(
+def test_calibrate_with_options_that_contradict_reports_it(
     tmp_path: Path, options: list[str], text: str
 ) -> None:
     done = calibrating(tmp_path, [], *options)
@@ -265,7 +265,7 @@ def test_calibrate_with_options_that_contradict_says_so(
         (["bvs://x", "--lens", "nowhere"], "--lens nowhere: No such file"),
     ],
 )
-def test_calibrate_with_options_that_cannot_work_says_so(
+def test_calibrate_with_options_that_cannot_work_reports_it(
     tmp_path: Path, options: list[str], text: str
 ) -> None:
     calibrating(tmp_path, [], *options).failed(2, text)
@@ -275,7 +275,7 @@ def test_calibrate_with_options_that_cannot_work_says_so(
     ("content", "text"),
     [("{", "not valid JSON"), ("[]", "expected what smartcam sheet"), ("{}", "expected a kind of")],
 )
-def test_calibrate_with_a_target_that_is_none_says_so(
+def test_calibrate_with_a_target_that_is_none_reports_it(
     tmp_path: Path, content: str, text: str
 ) -> None:
     (tmp_path / "target.json").write_text(content)
@@ -283,7 +283,7 @@ def test_calibrate_with_a_target_that_is_none_says_so(
     calibrating(tmp_path, [], *options).failed(2, "target.json: ", text)
 
 
-def test_calibrate_with_a_lens_that_is_none_says_so(tmp_path: Path) -> None:
+def test_calibrate_with_a_lens_that_is_none_reports_it(tmp_path: Path) -> None:
     (tmp_path / "lens.yaml").write_text("no: lens\n")
     calibrating(tmp_path, [], "bvs://x", "--lens", str(tmp_path / "lens.yaml")).failed(2, "--lens:")
 

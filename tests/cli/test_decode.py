@@ -162,7 +162,7 @@ def test_decode_cut_second_frame_shows_the_first_and_exits_3() -> None:
     assert [line["message"] for line in outcome.lines] == ["Connect"]
 
 
-def test_decode_garbage_behind_a_frame_exits_3() -> None:
+def test_decode_garbage_after_a_frame_exits_3() -> None:
     run("decode", (CONNECT + b"garbage").hex()).failed(3, "wrong magic number")
 
 

@@ -99,7 +99,7 @@ async def test_pick_warns_of_marks_that_lie_in_no_plane(
     assert "point 5 is the furthest" in out
 
 
-async def test_pick_with_a_picture_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+async def test_pick_with_a_picture_that_cannot_be_written_reports_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"--picture .*: No such file"):
         await pick(Options(as_json=True), str(tmp_path / "no" / "pick.svg"), 1)
 
@@ -187,7 +187,7 @@ def test_demo_with_plain_is_a_command(tmp_path: Path) -> None:
         (["--pick", "--plain", "--pallet", "three"], "got 'three'"),
     ],
 )
-def test_options_that_cannot_work_are_told(arguments: list[str], text: str) -> None:
+def test_options_that_cannot_work_are_reported(arguments: list[str], text: str) -> None:
     done = run("demo", *arguments)
     assert (done.code, text in done.err) == (2, True)
 

@@ -52,7 +52,7 @@ async def test_block_is_found_picked_and_put_on_top(capsys: pytest.CaptureFixtur
     assert told[-1]["within"]
 
 
-async def test_too_coarse_is_told_and_the_exit_code_says_so(
+async def test_too_coarse_is_reported_and_the_exit_code_shows_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(demo_tower, "TOLERANCE", (1e-9, 1.0, 1e-3))
@@ -74,7 +74,7 @@ async def test_wrong_colour_finds_no_block_and_says_what_there_is(
     assert [line for line in lines(capsys) if "compared" in line] == []
 
 
-async def test_missing_block_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+async def test_missing_block_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     table = laid(2, 1)
     table.blocks = [one for one in table.blocks if one.colour != "black" or one.size != BLOCK]
     with pytest.raises(FrameFormatError, match=r"got [12] regions of it") as caught:
@@ -86,7 +86,7 @@ async def test_missing_block_is_said(capsys: pytest.CaptureFixture[str]) -> None
     assert [line for line in lines(capsys) if "compared" in line] == []
 
 
-async def test_missing_tower_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+async def test_missing_tower_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     table = laid(2, 1)
     table.remove()
     with pytest.raises(FrameFormatError, match="expected a tower, got nothing that is higher"):

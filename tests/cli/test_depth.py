@@ -19,7 +19,7 @@ pytest.importorskip("scipy", reason="needs the extra depth")
 
 @pytest.fixture
 def ply(tmp_path: Path) -> str:
-    """Return a file: a square of 30 x 30 points at 1 m, 1 cm apart, and three far behind it."""
+    """Return a file: a square of 30 x 30 points at 1 m, 1 cm apart, and three far beyond it."""
     steps = 0.01 * np.arange(30)
     points = np.stack([*np.meshgrid(steps, steps), np.ones((30, 30))], axis=-1).reshape(-1, 3)
     points = np.concatenate([points, [[0, 0, 3], [0.2, 0, 4], [0, 0.2, 5]]])
@@ -72,7 +72,7 @@ def test_convert_filters(ply: str, tmp_path: Path, options: list[str], points: i
         (["show", "{ply}", "--up", "w"], 2, "--up"),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_what_cannot_be_done_is_reported(
     ply: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -49,7 +49,7 @@ RUNNING = bytes.fromhex("50535642 08000000 12000000 80000000 00000000")
 
 @pytest.fixture(autouse=True)
 def _slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have as much asked on a slow machine, and nothing said of that."""
+    """Ask as often on a slow machine, without a remark on it."""
     be_patient(monkeypatch)
 
 

@@ -193,7 +193,7 @@ def test_trigger_no_result_exits_4() -> None:
     outcome.failed(4, "no result within ", "WAITING_FOR_TRIGGER")
 
 
-def test_trigger_free_running_exits_4_and_says_so(url: str) -> None:
+def test_trigger_free_running_exits_4_and_reports_it(url: str) -> None:
     outcome = run_as_far_as("runs free", "trigger", url, "--application", "5")
     outcome.failed(4, "runs free")
 
@@ -429,7 +429,7 @@ def test_trigger_narrow_encoding_escapes_what_it_lacks() -> None:
         (("calibrate", "show", "file.json"), "No such command 'show'; commands are compare"),
     ],
 )
-def test_wrong_use_is_told_in_words(arguments: tuple[str, ...], text: str) -> None:
+def test_wrong_use_is_reported_in_words(arguments: tuple[str, ...], text: str) -> None:
     outcome = run(*arguments)
     assert outcome.code == 2
     assert text in " ".join(outcome.err.split())
@@ -475,7 +475,7 @@ def test_mistake_in_a_file_says_what_came(tmp_path: Path, text: str, told: str) 
     run("serve", str(path)).failed(2, told)
 
 
-def test_layout_in_a_file_is_told_without_the_mark_below_it(tmp_path: Path) -> None:
+def test_layout_in_a_file_is_reported_without_the_mark_below_it(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     entry = '{url: "bvs://HOST", interpret_as: "x: real32 mmm"}'
     path.write_text(f"cameras:\n  a: {entry}\n", encoding="utf-8")
@@ -483,7 +483,7 @@ def test_layout_in_a_file_is_told_without_the_mark_below_it(tmp_path: Path) -> N
     assert failed.err.endswith("at character 10\n")
 
 
-def test_hex_that_is_none_is_told_without_pythons_words() -> None:
+def test_hex_that_is_none_is_reported_without_pythons_words() -> None:
     failed = run("decode", "zz", "--interpret-as", "x: real32").failed(2, "two of 0-9 and a-f")
     assert "fromhex" not in failed.err
 

@@ -1,4 +1,4 @@
-"""Commands at a host whose protocol nobody has said."""
+"""Commands at a host whose protocol is not given."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def port() -> int:
 
 @contextlib.contextmanager
 def silent(port: int, *hosts: int) -> Iterator[list[socket.socket]]:
-    """Have addresses that take connections and say nothing."""
+    """Listen at addresses that accept connections and send nothing."""
     with contextlib.ExitStack() as stack:
         yield [
             stack.enter_context(socket.create_server((f"{NETWORK}{host}", port))) for host in hosts
@@ -46,7 +46,7 @@ def silent(port: int, *hosts: int) -> Iterator[list[socket.socket]]:
 
 
 def search(*args: str) -> Outcome:
-    """Search, and see that it went well and said nothing on stderr but how it went."""
+    """Search, and check the success, with only the progress on stderr."""
     known = () if "--protocol" in args else ("--protocol", "bvs", "--protocol", "insight")
     outcome = run("find", *args, *known)
     assert outcome.code == 0, outcome
@@ -57,7 +57,7 @@ def search(*args: str) -> Outcome:
 
 
 def opened(server: socket.socket) -> bool:
-    """Tell whether somebody has opened a connection."""
+    """Return whether a connection was opened."""
     server.setblocking(False)
     try:
         server.accept()[0].close()

@@ -341,7 +341,7 @@ def test_serve_port_in_use_exits_3(tmp_path: Path) -> None:
         run("serve", str(path)).failed(3, f"cannot listen on {endpoint}: Address already in use")
 
 
-def test_without_the_extra_everything_says_so(
+def test_without_the_extra_everything_reports_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_zenoh, "engine", _zenoh.engine.__wrapped__)
@@ -412,7 +412,7 @@ def test_fleet_trigger_gives_one_outcome_each(fleet: str) -> None:
     run("fleet", "trigger", f"{fleet}/line1/text").failed(2, "is a camera's")
 
 
-def test_what_is_not_there_is_told_with_what_is(fleet: str) -> None:
+def test_what_is_not_there_is_reported_with_what_is(fleet: str) -> None:
     meant = "did you mean 'line1/text'?"
     absent = run_as_far_as(meant, "trigger", f"{fleet}/line1/tekst")
     absent.failed(3, "no agent there has a camera line1/tekst", meant)

@@ -24,7 +24,7 @@ cameras: {line1/cam3: {emulated: {}, application: 7}}
 """
 
 
-def test_certificates_are_told(tmp_path: Path) -> None:
+def test_certificates_are_reported(tmp_path: Path) -> None:
     folder = str(tmp_path / "keys")
     lines = (
         run("fleet", "certificates", folder, *NAMES, "--host", "plant-server")

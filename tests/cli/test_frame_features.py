@@ -83,7 +83,7 @@ async def test_a_triggered_picture_is_written(tmp_path: Path) -> None:
 def test_an_address_is_not_forced_without_consent() -> None:
     outcome = run("frames", "force-address", "02:00:00:00:00:01", "10.0.0.5/24")
     assert outcome.code == 2
-    assert "say --yes" in outcome.err
+    assert "confirm with --yes" in outcome.err
     outcome = run("frames", "force-address", "02:00:00:00:00", "10.0.0.5/24", "--yes")
     assert outcome.code == 2
     assert "mac: expected a hardware address" in outcome.err

@@ -88,7 +88,7 @@ Puts = Callable[..., None]
 
 @pytest.fixture
 def shelf(monkeypatch: pytest.MonkeyPatch) -> Puts:
-    """Have ``shelf://``; gives what puts frames there."""
+    """Register ``shelf://``; yield the function that puts frames there."""
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})
 
@@ -131,13 +131,13 @@ def test_list_of_nothing_says_what_was_looked_for(shelf: Puts) -> None:
     assert run("frames", "list", "--scheme", "shelf", "--json").done().out == ""
 
 
-def test_list_of_what_is_not_looked_for_says_so() -> None:
+def test_list_of_what_is_not_looked_for_reports_it() -> None:
     done = run("frames", "list", "--scheme", "synthetic").done()
     assert done.out == "synthetic:// is not looked for: its sources are opened by their URLs\n"
     assert "synthetic" not in run("frames", "list").done().out
 
 
-def test_list_goes_on_behind_a_driver_that_fails(shelf: Puts) -> None:
+def test_list_goes_on_after_a_driver_that_fails(shelf: Puts) -> None:
     shelf(fails=RuntimeError("broken"))
     done = run("frames", "list").done()
     assert "shelf: cannot be looked for: RuntimeError('broken')\n" in done.out
@@ -277,7 +277,7 @@ def test_grab_of_what_cannot_be_opened_says_why(
     assert (told["error"], told["exit_code"]) == (type(fails).__name__, code)
 
 
-def test_grab_where_no_frame_comes_ends(shelf: Puts, tmp_path: Path) -> None:
+def test_grab_if_no_frame_comes_ends(shelf: Puts, tmp_path: Path) -> None:
     shelf()
     done = grab("-o", str(tmp_path / "x.png"), "--timeout", "0.05")
     assert done.code in {3, 4}  # none in time, or stuck: which is noticed first is as it comes
@@ -297,7 +297,7 @@ def test_grab_where_no_frame_comes_ends(shelf: Puts, tmp_path: Path) -> None:
         (("synthetic://?fps=many", "-o", "x.png"), "expected a number from"),
     ],
 )
-def test_grab_with_wrong_use_is_told(
+def test_grab_with_wrong_use_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], text: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -307,7 +307,7 @@ def test_grab_with_wrong_use_is_told(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_grab_of_what_cannot_be_written_says_so(shelf: Puts, tmp_path: Path) -> None:
+def test_grab_of_what_cannot_be_written_reports_it(shelf: Puts, tmp_path: Path) -> None:
     shelf(*[shot(DEEP, "Mono16")] * 60)
     (tmp_path / "x-0002.png").mkdir()
     done = grab("-o", str(tmp_path / "x.png"), "--count", "2", "--force")
@@ -382,12 +382,12 @@ def test_measure_of_one_frame_says_what_is_not_known(shelf: Puts) -> None:
         (FrameSourceError("shelf: it was unplugged"), "shelf: it was unplugged"),
     ],
 )
-def test_measure_of_a_source_that_ends_at_once_says_so(shelf: Puts, ends: Any, text: str) -> None:
+def test_measure_of_a_source_that_ends_at_once_fails(shelf: Puts, ends: Any, text: str) -> None:
     shelf(ends=ends)
     run("frames", "measure", "shelf://").failed(3, text)
 
 
-def test_measure_of_a_source_that_dies_says_so(shelf: Puts) -> None:
+def test_measure_of_a_source_that_dies_reports_it(shelf: Puts) -> None:
     shelf(shot(DEEP, "Mono16"), ends=FrameSourceError("shelf: it was unplugged"))
     run("frames", "measure", "shelf://").failed(3, "shelf: it was unplugged")
 
@@ -442,13 +442,13 @@ def test_show_of_a_format_that_is_not_there_ends(shelf: Puts) -> None:
         (("synthetic://", "--quality", "0"), "0 is not in the range"),
     ],
 )
-def test_show_with_wrong_use_is_told(arguments: tuple[str, ...], text: str) -> None:
+def test_show_with_wrong_use_is_reported(arguments: tuple[str, ...], text: str) -> None:
     done = run("frames", "show", *arguments)
     assert done.code == 2
     assert text in done.err
     assert done.out == ""
 
 
-def test_wrong_use_is_told_as_json() -> None:
+def test_wrong_use_is_reported_as_json() -> None:
     done = run("frames", "grab", "synthetic://", "--json")
     assert json.loads(io.StringIO(done.err).read())["exit_code"] == 2

@@ -69,7 +69,7 @@ def test_frames_record_into_a_folder_begins_new_files(tmp_path: Path) -> None:
         ([], "Missing option '-o'"),
     ],
 )
-def test_frames_record_wrong_usage_is_told(
+def test_frames_record_wrong_usage_is_reported(
     arguments: list[str], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

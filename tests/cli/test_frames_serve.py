@@ -54,7 +54,7 @@ class Shelf(ScriptedDriver):
 
 @pytest.fixture
 def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, BaseException]:
-    """Have ``shelf://NAME``; what is put here by a name is why that cannot be opened."""
+    """Register ``shelf://NAME``; yield the reasons, by name, why sources cannot be opened."""
     reasons: dict[str, BaseException] = {}
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})
@@ -68,7 +68,7 @@ def get(url: str) -> Any:
 
 
 def described(url: str) -> str:
-    """Return what an RTSP server answers to DESCRIBE, without a password."""
+    """Return an RTSP server's answer to DESCRIBE, without a password."""
     match = re.fullmatch(r"rtsp://(?:[^@]+@)?([^:/]+):(\d+)/.+", url)
     assert match is not None, url
     with socket.create_connection((match[1], int(match[2])), PATIENCE) as peer:
@@ -180,7 +180,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
         ((LEFT,) * 5, "expected 4 URLs at most, got 5"),
         ((LEFT, "nothing://"), "unknown scheme 'nothing'"),
         ((LEFT, "--rtsp", "8554"), "'8554': expected HOST:PORT"),
-        ((LEFT, "--rtp", "127.0.0.1:0"), "expected the port of who receives it"),
+        ((LEFT, "--rtp", "127.0.0.1:0"), "expected the receiver's port"),
         ((LEFT, RIGHT, "--rtp", "127.0.0.1:5004"), "--rtp sends one source"),
         ((LEFT, "--sdp", "x.sdp"), "--sdp needs --rtp"),
         ((LEFT, "--rtp", "127.0.0.1:9", "--sdp", "nowhere/x.sdp"), "--sdp nowhere/x.sdp: No such"),
@@ -188,7 +188,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
         ((LEFT, "--rtsp", "192.0.2.1:0"), "RTSP: cannot listen on 192.0.2.1"),
     ],
 )
-def test_wrong_use_is_told(
+def test_wrong_use_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], text: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -63,7 +63,7 @@ def test_camera_that_is_not_there_is_awaited() -> None:
     assert "nothing listens" in ended.err
 
 
-def test_what_cannot_work_is_told() -> None:
+def test_what_cannot_work_is_reported() -> None:
     for given, told in (
         ((), "expected a camera's URL, a YAML file, or --demo"),
         (("--demo", "bvs://127.0.0.1"), "expected a camera's URL, a YAML file, or --demo"),

@@ -44,7 +44,7 @@ def test_calibrate_lists_its_parts_and_hides_what_it_does_itself() -> None:
 
 
 def test_timeout_of_probe_says_what_it_does() -> None:
-    assert "Bound of all tries together" in run("probe", "--help").done().out
+    assert "Longest time of all tries together" in run("probe", "--help").done().out
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("shell", "file"),
     [("", ".zshrc"), ("bash", ".bashrc"), ("fish", ".config/fish/conf.d/smartcam.fish")],
 )
-def test_completion_is_written_once_behind_what_is_there(home: Path, shell: str, file: str) -> None:
+def test_completion_is_written_once_after_what_is_there(home: Path, shell: str, file: str) -> None:
     path = home / file
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("# mine")

@@ -111,14 +111,14 @@ def test_image_is_written_as_the_camera_sends_it(online: str, tmp_path: Path) ->
     run("image", online, "-o", str(tmp_path / "none" / "seen.bmp")).failed(2, "none")
 
 
-def test_image_of_a_camera_that_has_none_says_so(tmp_path: Path) -> None:
+def test_image_of_a_camera_that_has_none_reports_it(tmp_path: Path) -> None:
     with emulators(tmp_path, ()) as (bvs,):
         run("image", bvs, "-o", str(tmp_path / "seen.bmp")).failed(5, "has no ReadImage")
     assert not (tmp_path / "seen.bmp").exists()
 
 
 @pytest.mark.long
-def test_trigger_without_cells_says_so(online: str) -> None:
+def test_trigger_without_cells_reports_it(online: str) -> None:
     said = "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
     empty = run("trigger", online)
     assert (empty.code, empty.err) == (0, f"note: {said}\n")
@@ -200,7 +200,7 @@ def test_switch_to_a_number_that_is_no_id_is_wrong_usage(url: str, job: str) -> 
     assert "Invalid value for 'ID|FILE'" in outcome.err
 
 
-def test_switch_to_a_file_is_unsupported_where_there_are_none() -> None:
+def test_switch_to_a_file_is_unsupported_if_there_are_none() -> None:
     with Process("smartcam-emulator") as emulator:
         url = emulator.read_until(b"\n").strip()
         run("switch", url, "7bolts.job").failed(

@@ -1,4 +1,4 @@
-"""Commands that need no camera: lists, help, the demo, and what is said without the extra."""
+"""Commands that need no camera: lists, help, the demo, and errors without the extra."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_interpreters_lists_the_built_in_ones() -> None:
     assert all(line["about"] for line in lines if line["name"] in names)
     out = run("interpreters").done().out
     assert {line.split()[0] for line in out.splitlines()} >= names
-    assert "Parts that were found, a Localization each" in out
+    assert "Found parts, a Localization each" in out
 
 
 def test_help_lists_every_command_by_topic() -> None:
@@ -101,7 +101,7 @@ def test_dialects_of_options_are_those_of_the_protocol() -> None:
 
 
 def imported_for(python: str) -> set[str]:
-    """Return what lines of Python import, run by themselves; ``main`` runs without an end."""
+    """Return the imports of lines of Python in a new process; ``main`` runs without an end."""
     run_main = "def main(run):\n    try: run()\n    except SystemExit: pass\n"
     told = "print('imported:', *sorted(sys.modules))"
     shown = printed_by(f"import sys, smartcam._cli as cli\n{run_main}{python}\n{told}")
@@ -239,7 +239,7 @@ def test_help_names_every_command_and_exit_code() -> None:
     assert "Usage: smartcam-emulator " in run_emulator("--help").done().out
 
 
-def test_version_is_told() -> None:
+def test_version_is_reported() -> None:
     assert run("--version").done().out == f"smartcam, version {smartcam.__version__}\n"
     assert smartcam.__version__ in run_emulator("--version").done().out
 

@@ -111,7 +111,7 @@ def test_live_seconds_end_it(url: str) -> None:
         (("live", "--calibration", "missing.yaml"), "No such file"),
     ],
 )
-def test_wrong_use_is_told(args: tuple[str, ...], text: str) -> None:
+def test_wrong_use_is_reported(args: tuple[str, ...], text: str) -> None:
     name, *options = args
     ended = run(name, "bvs://127.0.0.1", *options)
     assert ended.code == 2

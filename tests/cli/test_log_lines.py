@@ -1,4 +1,4 @@
-"""A log as lines of JSON: its fields, from any thread, and where nobody reads."""
+"""A log as lines of JSON: its fields, from any thread, and without a reader."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_probe_pinned_wrong_finds_the_right_one(url: str) -> None:
     assert (found["url"], found["application"], found["also"]) == (url, 2, [])
 
 
-def test_probe_all_goes_on_behind_the_first_answer(url: str) -> None:
+def test_probe_all_goes_on_after_the_first_answer(url: str) -> None:
     one = run_as_far_as('"url": ', "probe", url, "--json").done().lines
     *tries, found = run_as_far_as('"url": ', "probe", url, "--all", "--json").done().lines
     assert len(one) == 2
@@ -178,7 +178,7 @@ def test_probe_trace_has_the_end_of_the_session_too(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_no_answer_is_told_once_with_what_to_do() -> None:
+def test_no_answer_is_reported_once_with_what_to_do() -> None:
     with closed_port() as place:
         failed = run("probe", place).failed(3, f"no session with {place}", "Look at the port")
     assert failed.err.count("Connection refused") == 1

@@ -31,7 +31,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def read_by_the_library(path: Path) -> int:
-    """Return how many messages the mcap library reads of a file without an end."""
+    """Return the number of messages that the mcap library reads of a file without an end."""
     count = 0
     with path.open("rb") as stream:
         try:
@@ -225,11 +225,11 @@ def test_replay_is_a_camera_with_the_recorded_results(url: str, tmp_path: Path) 
         ([__file__], 2, "this is no MCAP file: it begins with 22 22 22"),
     ],
 )
-def test_replay_of_no_recording_is_told(options: list[str], code: int, text: str) -> None:
+def test_replay_of_no_recording_is_reported(options: list[str], code: int, text: str) -> None:
     run("replay", *options).failed(code, text)
 
 
-def test_replay_wrong_camera_and_speed_are_told(url: str, tmp_path: Path) -> None:
+def test_replay_wrong_camera_and_speed_are_reported(url: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run("record", url, "-o", str(path), "--seconds", "0.1", "--name", "left").done()
     run("replay", str(path), "--camera", "x").failed(2, "no camera 'x' is in it; there are: left")

@@ -91,7 +91,7 @@ async def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.real_time
-def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None:
+def test_damage_is_reported_and_skipped_and_the_rest_is_played(folder: Path) -> None:
     paths = files(folder.parent)
     whole = [runs(load_recording(path)) for path in paths]
     damaged = bytearray(paths[1].read_bytes())

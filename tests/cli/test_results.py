@@ -64,7 +64,7 @@ def url(urls: dict[tuple[str, str], str]) -> str:
 
 
 def state(url: str) -> dict[str, Any]:
-    """Return what ``smartcam status`` says."""
+    """Return the output of ``smartcam status``."""
     (line,) = run("status", url, "--json").done().lines
     assert isinstance(line, dict)
     return line
@@ -299,7 +299,7 @@ def probed(outcome: str) -> list[tuple[str, str]]:
 
 
 def tries(way: tuple[str, str]) -> list[tuple[str, str]]:
-    """Return what is tried until a camera answers, the try that it answers included."""
+    """Return the tries up to the first one that a camera answers."""
     groups = [(transport, group) for transport in TRIED for group in TRIED[transport]]
     last = next(
         i for i, (where, group) in enumerate(groups) if way == (where, way[1]) and way[1] in group

@@ -136,7 +136,7 @@ def test_a_fleet_is_reloaded_by_a_command(tmp_path: Path, unit: Unit) -> None:
     assert "not reloaded, all stays as it was: fleet " in ended.err
 
 
-def test_a_wrong_file_is_told_as_json(tmp_path: Path) -> None:
+def test_a_wrong_file_is_reported_as_json(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text("operations: {listen: here}\ncameras: {a: {emulated: {}}}", "utf-8")
     with Process("smartcam", "serve", str(path), "--log", "json") as process:

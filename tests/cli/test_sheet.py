@@ -135,7 +135,7 @@ def test_sheet_that_cannot_be_made_is_one_line(arguments: tuple[str, ...], text:
         (("--describe", "a.json", "--square", "nan"), "nan"),
     ],
 )
-def test_sheet_with_wrong_usage_says_so(arguments: tuple[str, ...], text: str) -> None:
+def test_sheet_with_wrong_usage_reports_it(arguments: tuple[str, ...], text: str) -> None:
     outcome = run(*BOARD, *arguments)
     assert outcome.code == 2
     assert text in outcome.err

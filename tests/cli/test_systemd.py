@@ -80,7 +80,7 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
     notifier.close()
 
 
-def test_nobody_is_told_where_nobody_wants_to_know(caplog: pytest.LogCaptureFixture) -> None:
+def test_nobody_is_told_if_nobody_wants_to_know(caplog: pytest.LogCaptureFixture) -> None:
     for given in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}):
         notifier = Notifier(given)
         assert not notifier.wanted

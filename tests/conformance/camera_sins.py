@@ -42,7 +42,7 @@ def says(change: Callable[[Any, m.Message], Iterator[m.Message]]) -> Callable[[E
 
 
 def replaced(kind: type[m.Message], **fields: Any) -> Callable[[Emulator], None]:
-    """Say other values in messages of a kind."""
+    """Send other values in messages of a kind."""
 
     def change(_: Any, message: m.Message) -> Iterator[m.Message]:
         yield dataclasses.replace(message, **fields) if isinstance(message, kind) else message
@@ -61,7 +61,7 @@ def dropped(*kinds: type[m.Message]) -> Callable[[Emulator], None]:
 
 
 def doubled(kind: type[m.Message]) -> Callable[[Emulator], None]:
-    """Say messages of a kind twice."""
+    """Send messages of a kind twice."""
 
     def change(_: Any, message: m.Message) -> Iterator[m.Message]:
         yield message
@@ -83,7 +83,7 @@ def without(bits: Status) -> Callable[[Emulator], None]:
 
 
 def hears(change: Callable[[Emulator, Any, m.Message], bool]) -> Callable[[Emulator], None]:
-    """Look at each message of a client first; true where the camera shall not hear it."""
+    """Check each message of a client first; true if the camera must not receive it."""
 
     def do(emulator: Emulator) -> None:
         received = emulator.received
@@ -103,7 +103,7 @@ def deaf(*kinds: type[m.Message]) -> Callable[[Emulator], None]:
 
 
 def write(emulator: Emulator, link: Any, *messages: m.Message) -> None:
-    """Say something on a link, whatever the session is."""
+    """Send something on a link, with or without a session."""
     link._write_frames([emulator.spoken.encode(message) for message in messages])
 
 
@@ -131,7 +131,7 @@ _take = ClientLink._take
 
 
 def open_to_bytes(self: Any, data: bytes) -> None:
-    """Take bytes as a link does, after what :func:`takes` makes of them."""
+    """Receive bytes as a link does, after :func:`takes` has changed them."""
     change = getattr(self._owner, "taken", None)
     _take(self, data if change is None else change(self._owner, self, data))
 

@@ -1,6 +1,6 @@
-"""A small client of somebody else: blocking sockets, the dialect handbook, bytes by hand.
+"""A small foreign client: blocking sockets, the dialect handbook, bytes by hand.
 
-It uses nothing of smartcam. It does its tasks well, unless it is told to sin::
+It uses nothing of smartcam. It does its tasks well, unless an option makes it sin::
 
     python plain_client.py HOST PORT SINS trigger [N] | switch ID | watch N
 """

@@ -252,7 +252,7 @@ def _serve_everybody(emulator: Any) -> None:
 
 
 def _stuck(_: Any, link: Any, data: bytes) -> bytes:
-    """Hear nothing more after a wrong magic number."""
+    """Receive nothing more after a wrong magic number."""
     link.stuck = getattr(link, "stuck", False) or data.startswith(b"\xaf")
     return b"" if link.stuck else data
 
@@ -267,7 +267,7 @@ UNDESCRIBED = [
 
 @pytest.mark.parametrize(("name", "sin", "dialect", "came"), UNDESCRIBED)
 @at_any_pace
-def test_judge_answer_that_no_setting_describes_is_told(
+def test_judge_answer_that_no_setting_describes_is_reported(
     name: str, sin: Any, dialect: str, came: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ClientLink, "_take", camera_sins.open_to_bytes)
@@ -457,7 +457,7 @@ def test_judge_switch_needs_another_application(
 
 
 @at_any_pace
-def test_judge_application_that_is_not_there_is_told(thread: LoopThread) -> None:
+def test_judge_application_that_is_not_there_is_reported(thread: LoopThread) -> None:
     with emulated(thread) as emulator:
         report = judge(short_options(emulator.url, application=99), ["trigger-gives-one-result"])
     assert report["trigger-gives-one-result"].text.startswith(

@@ -32,7 +32,7 @@ BY_NAME = {check.name: check for check in CHECKS}
 async def findings(
     client: Client, dialect: str = "handbook", transport: str = "tcp", *, room: asyncio.Semaphore
 ) -> list[str]:
-    """Return what all checks find."""
+    """Return the findings of all checks."""
     checks = [check for check in CHECKS if check.applies(dialect, transport)]
 
     async def one(name: str) -> ClientRun:
@@ -114,7 +114,7 @@ SINS: dict[str, tuple[str, str]] = {
     "waits_for_the_switch": ("starts at once", "Start came 0.0"),
     "waits_for_a_late_switch_answer": ("starts at once", "before its answer"),
     "switches_with_a_late_answer": ("next is the answer", "it failed: TaskError: 0x12 came"),
-    "waits_until_busy_falls": ("ignores busy", "s after BUSY was told"),
+    "waits_until_busy_falls": ("ignores busy", "s after BUSY was sent"),
     "switches_with_busy_after_it": ("ignores busy", "it failed: TimeoutError"),
     "fails_where_a_switch_is_refused": ("believes", "all is well, and gave 1 result"),
     "reads_byte_by_byte": ("a message is what comes", "it failed: IndexError"),
@@ -140,7 +140,7 @@ SINS: dict[str, tuple[str, str]] = {
     "fails_where_garbage_comes": ("waits for ever", HANGS),
     "fails_where_a_length_is_impossible": ("waits for ever", HANGS),
 }
-"""For each check a client that fails it: its sin, and what is said of it."""
+"""For each check a client that fails it: its sin, and the text of the finding."""
 
 
 class Convictions:
@@ -194,9 +194,7 @@ def test_finding_shows_the_wire_the_source_and_what_the_client_said(
     assert lines[0] == (
         "passes_over_unknown_messages (should; handbook, tcp): it failed: TaskError: message 0x77"
     )
-    assert lines[1] == (
-        "  task: trigger; camera: messages with an id that nobody knows come in between"
-    )
+    assert lines[1] == ("  task: trigger; camera: messages with an unknown id come in between")
     assert "  source: inferred (docs/sources.md)" in lines
     assert any(line.endswith("> Connect()  50 53 56 42 00 00 00 00 01 00 00 00") for line in lines)
     assert any(" < ?  50 53 56 42 14 00 00 00 77" in line for line in lines)

@@ -55,7 +55,7 @@ class Ended(NamedTuple):
     out: str
 
     def outcome(self, test: str) -> str:
-        """Return what became of a test."""
+        """Return the outcome of a test."""
         found = re.search(rf"{re.escape(test)}\] (\w+)", self.out)
         assert found is not None, self.out
         return found[1]

@@ -76,7 +76,7 @@ def test_lines_are_hex_or_json() -> None:
 
 
 @pytest.mark.parametrize("line", [b"ok", b"{}", b'{"data": 7}', b"{", b'"', b"0", b"\xff"])
-def test_line_that_is_no_result_is_told(line: bytes) -> None:
+def test_line_that_is_no_result_is_reported(line: bytes) -> None:
     with pytest.raises(ValueError, match="line 2 of its output is no result: ") as caught:
         read_results(b"00\n" + line)
     assert 'expected hex, or a JSON object with "data" or "raw"' in str(caught.value)

@@ -25,7 +25,7 @@ WATCH = 0.05
 
 
 def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have as much asked on a slow machine, and nothing said of that."""
+    """Ask as often on a slow machine, without a remark on it."""
     monkeypatch.setattr(_state_checks, "QUERIES_WITHIN", PATIENCE)
     monkeypatch.setattr(_state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE)
 

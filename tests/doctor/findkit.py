@@ -22,7 +22,7 @@ NETWORK = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250 + 1}."
 
 
 def free_port() -> int:
-    """Return a port that nobody has; on the network's addresses nobody else looks for one."""
+    """Return a free port; no other test takes ports on the network's addresses."""
     with socket.socket() as sock:
         try:
             sock.bind((f"{NETWORK}1", 0))
@@ -70,7 +70,7 @@ class Listening:
 async def listening(
     host: str, port: int, greeting: bytes = b"", *, hangs_up: bool = False, slowly: float = 0.0
 ) -> AsyncIterator[Listening]:
-    """Have a server of its kind at an address."""
+    """Run a server of its kind at an address."""
     made = Listening(greeting, hangs_up=hangs_up, slowly=slowly)
     async with await asyncio.start_server(made.serve, host, port):
         yield made
@@ -78,7 +78,7 @@ async def listening(
 
 @contextlib.contextmanager
 def filtered(host: str, port: int) -> Iterator[None]:
-    """Have an address that answers nothing: its queue of connections is full, nobody takes one."""
+    """Listen at an address that answers nothing: its queue of connections is full."""
     with contextlib.ExitStack() as stack:
         sock = stack.enter_context(socket.create_server((host, port), backlog=0))
         for _ in range(4):

@@ -43,7 +43,7 @@ def camera(active: int = 2, **options: Any) -> EmulatedCamera:
 
 
 def sent(emulator: EmulatedCamera) -> set[type[m.Message]]:
-    """Return what clients said."""
+    """Return the messages of clients."""
     return {type(e.message) for e in emulator.log if e.direction == "in" and e.message is not None}
 
 
@@ -180,7 +180,7 @@ async def test_wrong_options_are_refused_before_anything(
         ("overheat", "warning", Exit.DONE, "too hot"),
     ],
 )
-async def test_condition_of_the_camera_is_told(
+async def test_condition_of_the_camera_is_reported(
     condition: Any, severity: str, code: Exit, text: str
 ) -> None:
     async with camera(faults=[faults.Condition(condition=condition)]) as emulator:
@@ -198,7 +198,7 @@ async def test_condition_of_the_camera_is_told(
         (0x380, "hint", "has just dropped a trigger"),
     ],
 )
-async def test_bit_of_the_status_is_told(word: int, severity: str, text: str) -> None:
+async def test_bit_of_the_status_is_reported(word: int, severity: str, text: str) -> None:
     status = faults.Insert(
         on="StatusReport",
         message="StatusReport",
@@ -217,7 +217,7 @@ async def test_bit_of_the_status_is_told(word: int, severity: str, text: str) ->
 # ---------------------------------------------------------------------- application
 
 
-async def test_application_that_is_active_is_told() -> None:
+async def test_application_that_is_active_is_reported() -> None:
     async with camera() as emulator:
         found = of(await examined(emulator.url, application=2), "application")
     assert (found.severity, found.text) == ("ok", "application 2 is active")
@@ -298,7 +298,7 @@ async def test_camera_busy_for_long_is_an_error() -> None:
     assert of(findings, "run state").text == f"the camera is BUSY, all {WATCH:g} s long"
 
 
-async def test_waiting_camera_is_told() -> None:
+async def test_waiting_camera_is_reported() -> None:
     async with camera() as emulator:
         found = of(await examined(emulator.url), "run state")
     assert (found.severity, found.text) == ("ok", "application 2 runs and waits for triggers")
@@ -316,7 +316,7 @@ async def test_waiting_camera_that_a_sensor_triggers_has_a_rate() -> None:
     assert found.details["results"] >= 1
 
 
-async def test_free_running_camera_is_told_with_its_rate() -> None:
+async def test_free_running_camera_is_reported_with_its_rate() -> None:
     async with camera(5) as emulator:
         findings = await examined(emulator.url, seconds=0.3)
     found = of(findings, "run state")
@@ -357,7 +357,7 @@ async def test_triggers_have_figures_and_a_rate() -> None:
     assert 1 < found.details["results_per_second"] < 1000
 
 
-async def test_application_without_send_results_is_told() -> None:
+async def test_application_without_send_results_is_reported() -> None:
     async with camera(4) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
         assert [e.message for e in emulator.log].count(m.Trigger()) == 1
@@ -368,14 +368,14 @@ async def test_application_without_send_results_is_told() -> None:
     assert found.details["inspected"] is True
 
 
-async def test_inspection_that_takes_too_long_is_told() -> None:
+async def test_inspection_that_takes_too_long_is_reported() -> None:
     async with camera(faults=[faults.LateResult(on="Trigger", seconds=60)]) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
     assert errors(findings) == [("trigger", Exit.RAN_OUT)]
     assert of(findings, "trigger").text == "the inspection of trigger 1 was not done within 0.2 s"
 
 
-async def test_trigger_that_is_not_taken_is_told() -> None:
+async def test_trigger_that_is_not_taken_is_reported() -> None:
     async with camera(faults=[faults.Drop(on="Trigger", times=None)]) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
     found = of(findings, "trigger")
@@ -383,7 +383,7 @@ async def test_trigger_that_is_not_taken_is_told() -> None:
     assert "another trigger source" in found.cure
 
 
-async def test_trigger_without_result_where_the_status_is_asked_for_is_told() -> None:
+async def test_trigger_without_result_where_the_status_is_asked_for_is_reported() -> None:
     async with camera(10, dialect="bid") as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
     assert errors(findings) == [("trigger", Exit.RAN_OUT)]
@@ -399,7 +399,7 @@ async def test_trigger_without_result_where_the_status_is_asked_for_is_told() ->
         (faults.Overtrigger(), "OvertriggeredError"),
     ],
 )
-async def test_trigger_that_fails_is_told_with_its_error(fault: BaseFault, error: str) -> None:
+async def test_trigger_that_fails_is_reported_with_its_error(fault: BaseFault, error: str) -> None:
     slow = Application(id=8, layout="n: int32", constant={"n": 1}, processing_time=0.2, load_time=0)
     async with EmulatedCamera([slow], running=True, faults=[fault]) as emulator:
         findings = await examined(emulator.url, trigger=True)
@@ -491,7 +491,7 @@ async def test_check_that_never_ends_is_ended(monkeypatch: pytest.MonkeyPatch) -
     assert of(findings, "never").text == "this check did not end within 0.05 s"
 
 
-async def test_session_lost_where_nobody_waits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_session_lost_if_nobody_waits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     async with camera() as emulator:
 
         async def lose(exam: Examination) -> None:

@@ -1,4 +1,4 @@
-"""Asking an address in every registered protocol: what is tried, in which order, what is told."""
+"""Asking an address in every registered protocol: the tries, their order, and the report."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ async def test_camera_of_a_plug_in_is_found_at_another_port(
         )
 
 
-async def test_bvs_camera_is_found_behind_the_address_of_another_protocol() -> None:
+async def test_bvs_camera_is_found_at_the_address_of_another_protocol() -> None:
     async with EmulatedCamera(host=HOST) as emulator:
         (*_, last) = await tried(f"insight://{HOST}:{emulator.port}")
     assert last.answer is not None

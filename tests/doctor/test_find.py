@@ -1,4 +1,4 @@
-"""Finding cameras: what listens where, how gently it is looked for, and whom that harms: nobody."""
+"""Finding cameras: the ports that listen, a gentle search, and no harm to clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WELCOME = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 
 
 async def found_on(port: int, *networks: str, **options: Any) -> list[FoundPort]:
-    """Return what listens at a port of this process' network, of the first two protocols."""
+    """Return the found port of this process' network, by the first two protocols."""
     known = ("bvs", "insight")
     options = {"ports": [port], "protocols": known, "may_disturb": True, **options}
     return await smartcam.find(*(networks or (f"{NETWORK}0/28",)), **options)
@@ -43,7 +43,7 @@ def told(found: list[FoundPort]) -> dict[str, tuple[tuple[str, ...], str]]:
 
 @contextlib.asynccontextmanager
 async def at_work(camera: Any, url: str) -> AsyncIterator[tuple[smartcam.Camera, list[int]]]:
-    """Have a client that triggers without a pause; gives it, and the numbers of the results."""
+    """Run a client that triggers without a pause; yield it, and the numbers of the results."""
     results: list[int] = []
     async with smartcam.connect(url, reconnect=None) as client:
 
@@ -243,7 +243,7 @@ async def test_asking_speaks_to_what_may_be_a_camera() -> None:
 
 
 def opened_at(monkeypatch: pytest.MonkeyPatch, lasts: float) -> tuple[list[float], list[int]]:
-    """Have openings that last so long and touch nothing; gives times, and how many at once."""
+    """Make openings last so long and touch nothing; yield times, and their number at once."""
     times: list[float] = []
     at_once = [0, 0]
 
@@ -396,7 +396,7 @@ async def test_few_file_descriptors_are_enough() -> None:
     assert len(found) == 12
 
 
-async def test_no_file_descriptor_at_all_is_told() -> None:
+async def test_no_file_descriptor_at_all_is_reported() -> None:
     resource = pytest.importorskip("resource", reason="this system has no such limit")
     with socket.socket() as last:
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)

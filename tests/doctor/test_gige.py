@@ -98,7 +98,7 @@ MODE, MODE_TRIGGER, TRIGGER_SOURCE, LINK_SPEED = 0x12000, 0x12004, 0x12008, 0x12
 
 
 def described(*features: str) -> bytes:
-    """Return a description that has further features, where it has not got them."""
+    """Return a description with further features, if they are missing."""
     missing = [one for one in features if one.split('"')[1] not in DESCRIPTION]
     return DESCRIPTION.replace(
         '<Port Name="Device"/>', f'{"".join(missing)}<Port Name="Device"/>'
@@ -190,7 +190,7 @@ async def test_camera_of_another_application_says_whose_it_is_and_is_left_alone(
 
 
 @asked("no device is found")
-async def test_camera_that_no_search_finds_is_told_with_what_there_is() -> None:
+async def test_camera_that_no_search_finds_is_reported_with_what_there_is() -> None:
     findings = [one async for one in examine("gige://?serial=NOBODY", seconds=0.5)]
     (found,) = findings
     assert (found.check, found.severity, found.exit_code) == ("address", "error", 3)
@@ -207,7 +207,7 @@ async def test_address_at_which_nobody_answers_is_told() -> None:
     assert "UDP port 3956" in found.cure
 
 
-async def test_host_that_is_no_camera_is_told() -> None:
+async def test_host_that_is_no_camera_is_reported() -> None:
     async with camera() as device:
         port = device.port
     found = [one async for one in examine(f"gige://127.0.0.1:{port}", seconds=0.5)][-1]
@@ -216,7 +216,7 @@ async def test_host_that_is_no_camera_is_told() -> None:
 
 
 @asked("one picture, and no more")
-async def test_camera_that_is_set_to_a_single_picture_is_told() -> None:
+async def test_camera_that_is_set_to_a_single_picture_is_reported() -> None:
     modes = choice("AcquisitionMode", MODE, "Continuous", "SingleFrame")
     async with camera(description=described(modes)) as device:
         device.words[MODE] = 1
@@ -229,7 +229,7 @@ async def test_camera_that_is_set_to_a_single_picture_is_told() -> None:
 
 
 @asked("timeouts at a low frame rate")
-async def test_slow_camera_is_told_by_how_much_the_wait_is_too_short() -> None:
+async def test_slow_camera_is_reported_by_how_much_the_wait_is_too_short() -> None:
     async with camera() as device:
         findings = await examined(device, "fps=0.125")
     found = findings[-1]
@@ -239,7 +239,7 @@ async def test_slow_camera_is_told_by_how_much_the_wait_is_too_short() -> None:
 
 
 @asked("several cameras, or a fast one, on a thin link")
-async def test_stream_that_does_not_fit_the_link_is_told_with_the_rate_that_fits() -> None:
+async def test_stream_that_does_not_fit_the_link_is_reported_with_the_rate_that_fits() -> None:
     speed = word("DeviceLinkSpeed", LINK_SPEED)
     async with camera(description=described(speed), test_packets=0) as device:
         device.words[LINK_SPEED] = 100_000  # bytes a second; 64x48 at 100/s want 307,200
@@ -282,7 +282,7 @@ def namespace() -> list[str]:
 
 
 def there(namespace: list[str], situation: str) -> list[dict[str, Any]]:
-    """Return what is found of Aravis' fake camera in a situation, worst last."""
+    """Return the findings about Aravis' fake camera in a situation, worst last."""
     done = subprocess.run(  # noqa: S603
         [*namespace, sys.executable, "-m", "tests.doctor.gige_in_namespace", situation],
         capture_output=True,
@@ -304,7 +304,7 @@ def last(findings: list[dict[str, Any]], check: str) -> dict[str, Any]:
 def test_camera_of_others_is_examined(namespace: list[str]) -> None:
     findings = there(namespace, "well")
     assert [one for one in findings if one["severity"] in ("warning", "error")] == []
-    assert "nobody controlled it" in last(findings, "control")["text"]
+    assert "no program controlled it" in last(findings, "control")["text"]
 
 
 @pytest.mark.long
@@ -317,7 +317,7 @@ def test_camera_of_others_waits_for_a_trigger(namespace: list[str]) -> None:
 
 @pytest.mark.long
 @asked("small pictures come, large ones do not")
-def test_packets_above_the_mtu_are_told(namespace: list[str]) -> None:
+def test_packets_above_the_mtu_are_reported(namespace: list[str]) -> None:
     found = last(there(namespace, "mtu"), "packet size")
     assert found["severity"] in ("warning", "error")
     assert "packets of 8000 bytes" in found["text"]
@@ -327,7 +327,7 @@ def test_packets_above_the_mtu_are_told(namespace: list[str]) -> None:
 
 @pytest.mark.long
 @asked("another subnet")
-def test_camera_of_another_subnet_is_told(namespace: list[str]) -> None:
+def test_camera_of_another_subnet_is_reported(namespace: list[str]) -> None:
     findings = there(namespace, "subnet")
     found = last(findings, "subnet")
     assert found["severity"] == "warning"
@@ -339,7 +339,7 @@ def test_camera_of_another_subnet_is_told(namespace: list[str]) -> None:
 
 @pytest.mark.long
 @asked("another subnet")
-def test_two_networks_alike_are_told(namespace: list[str]) -> None:
+def test_two_networks_alike_are_reported(namespace: list[str]) -> None:
     found = last(there(namespace, "twice"), "subnet")
     assert found["severity"] == "warning"
     assert "is of 2 networks of this machine" in found["text"]

@@ -1,4 +1,4 @@
-"""Asking an address how it speaks: the order, what is kept of a try, what is left behind."""
+"""Asking an address for its language: the order, the record of a try, and no leftovers."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ async def test_camera_is_found_whatever_it_speaks(dialect: str, transport: Any) 
     assert all(trial.answer is None and trial.error is not None for trial in failed)
 
 
-async def test_session_is_over_before_its_try_is_told() -> None:
+async def test_session_is_over_before_its_try_is_reported() -> None:
     seen: list[TraceEntry] = []
     async with EmulatedCamera() as emulator:
         async for trial in trials(parse_address(emulator.url), timeout=1.0, trace=seen.append):
@@ -136,7 +136,7 @@ async def test_camera_that_hangs_up_at_disconnect_is_asked_without() -> None:
 # ---------------------------------------------------------------------- what came instead
 
 
-async def test_nothing_listens_each_way_says_so() -> None:
+async def test_nothing_listens_each_way_reports_it() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         found = await tried(f"bvs://{HOST}:{port}")
     assert {trial.outcome for trial in found} == {"Connection refused"}
@@ -144,7 +144,7 @@ async def test_nothing_listens_each_way_says_so() -> None:
     assert len(found) == len(names("bvs://h"))
 
 
-async def test_silence_is_told_and_bounded() -> None:
+async def test_silence_is_reported_and_bounded() -> None:
     loop = asyncio.get_running_loop()
     begin = loop.time()
     async with listening() as listener:
@@ -181,7 +181,7 @@ async def test_bytes_that_make_no_whole_frame_are_shown(dialect: str) -> None:
     assert broken(found[0]) == [(text, half.hex())]
 
 
-async def test_bytes_behind_whole_frames_are_shown_without_them() -> None:
+async def test_bytes_after_whole_frames_are_shown_without_them() -> None:
     async def cut_short(peer: Peer, number: int) -> None:
         await peer.read(len(OPENING))
         peer.write(CONNECT_ANSWER + STATUS[:5])
@@ -251,7 +251,7 @@ async def test_half_a_datagram_is_shown() -> None:
     assert data == CONNECT_ANSWER[:14].hex()
 
 
-async def test_hanging_up_in_order_is_told() -> None:
+async def test_hanging_up_in_order_is_reported() -> None:
     async def closes(peer: Peer, number: int) -> None:
         await peer.read(1)
         peer.close()

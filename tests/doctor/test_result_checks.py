@@ -18,7 +18,7 @@ from tests.doctor.inside import Exit
 
 
 async def read(layout: str, values: Any, interpret_as: str | None, **more: Any) -> list[Finding]:
-    """Return what is found about a camera that sends ``values`` in ``layout``."""
+    """Return the findings about a camera that sends ``values`` in ``layout``."""
     application = Application(
         id=2, layout=layout, constant=values, load_time=0, processing_time=0.001
     )
@@ -35,7 +35,7 @@ async def test_layout_that_fits_is_well() -> None:
     assert (found.severity, found.text) == ("ok", "2 results fit the layout 'n: int32'")
 
 
-async def test_layout_that_differs_is_told_with_sizes_and_bytes_beside_its_fields() -> None:
+async def test_layout_that_differs_is_reported_with_sizes_and_bytes_beside_its_fields() -> None:
     text = "passed: bool, n: int32, x: real32 mm"
     findings = await read("n: int32, text: string[3]", {"n": 5, "text": "abc"}, text)
     assert errors(findings) == [("layout", Exit.UNREADABLE)]
@@ -58,13 +58,13 @@ async def test_layout_that_differs_is_told_with_sizes_and_bytes_beside_its_field
         ("n: uint8, (x: uint8, y: uint32)*", "1 bytes and whole records of 5 bytes"),
     ],
 )
-async def test_size_that_a_layout_expects_is_told(layout: str, expected: str) -> None:
+async def test_size_that_a_layout_expects_is_reported(layout: str, expected: str) -> None:
     findings = await read("text: string[7]", {"text": "abc"}, layout)
     found = of(findings, "layout")
     assert (found.details["expected"], found.details["received"]) == (expected, 7)
 
 
-async def test_layout_of_the_right_size_with_a_wrong_type_is_told() -> None:
+async def test_layout_of_the_right_size_with_a_wrong_type_is_reported() -> None:
     findings = await read("n: int32", {"n": 5}, "a: bool, b: string[3]")
     assert errors(findings) == [("layout", Exit.UNREADABLE)]
     found = of(findings, "layout")
@@ -135,7 +135,7 @@ def test_aligned_names_what_is_too_many() -> None:
     ]
 
 
-def test_aligned_numbers_records_behind_the_head() -> None:
+def test_aligned_numbers_records_after_the_head() -> None:
     layout = Layout("n: uint8, (x: uint8, name: string[2])*")
     assert aligned(layout, b"\x02\x07ab\x08c") == [
         DumpRow(0, "n: uint8", "02", 2),
@@ -248,7 +248,7 @@ async def test_value_of_shifted_bytes_gets_a_hint() -> None:
     found = of(findings, "values")
     assert found.details["value"] == tiny
     assert "which nothing measures" in found.text
-    assert "all behind it are shifted" in found.cure
+    assert "all after it are shifted" in found.cure
 
 
 def test_limits_say_why() -> None:
@@ -266,7 +266,7 @@ def test_limits_say_why() -> None:
         ("(a: real64 deg)*", [{"a": 0.01}, {"a": -0.02}], "a: no more than 1.146 deg"),
     ],
 )
-async def test_si_that_a_layout_takes_for_a_unit_is_told(
+async def test_si_that_a_layout_takes_for_a_unit_is_reported(
     layout: str, values: Any, text: str
 ) -> None:
     found = of(await read(layout, values, layout), "values")

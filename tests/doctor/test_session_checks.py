@@ -49,7 +49,7 @@ async def test_name_that_does_not_resolve_is_an_error(host: str) -> None:
     assert "IP address" in found.cure
 
 
-async def test_name_that_resolves_is_told_with_its_addresses() -> None:
+async def test_name_that_resolves_is_reported_with_its_addresses() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         findings = await examined(f"bvs://localhost:{port}", timeout=SHORT)
     found = of(findings, "name")
@@ -70,7 +70,7 @@ async def test_connecting_is_announced_before_anything_is_sent() -> None:
         await findings.aclose()
 
 
-async def test_nothing_listens_is_told_with_every_way_that_was_tried() -> None:
+async def test_nothing_listens_is_reported_with_every_way_that_was_tried() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         findings = await examined(f"bvs://{HOST}:{port}", timeout=SHORT)
     assert errors(findings) == NO_SESSION
@@ -83,7 +83,7 @@ async def test_nothing_listens_is_told_with_every_way_that_was_tried() -> None:
     assert findings[-1] is found
 
 
-async def test_nothing_listens_at_any_address_of_a_name_is_told() -> None:
+async def test_nothing_listens_at_any_address_of_a_name_is_reported() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         loop = asyncio.get_running_loop()
         several = [
@@ -96,7 +96,7 @@ async def test_nothing_listens_at_any_address_of_a_name_is_told() -> None:
     assert of(findings, "session").text.startswith(f"nothing listens at several:{port} (TCP): ")
 
 
-async def test_nothing_listens_on_udp_is_told() -> None:
+async def test_nothing_listens_on_udp_is_reported() -> None:
     with refusing(socket.SOCK_DGRAM) as port:
         findings = await examined(f"bvs+udp://{HOST}:{port}", timeout=SHORT)
     assert of(findings, "session").text.startswith(f"nothing listens at {HOST}:{port} (UDP)")
@@ -111,7 +111,7 @@ async def test_host_without_a_route_is_unreachable() -> None:
 
 
 @linux
-async def test_connection_that_never_opens_is_told() -> None:
+async def test_connection_that_never_opens_is_reported() -> None:
     with socket.socket() as full:
         full.bind((HOST, 0))
         full.listen(0)
@@ -128,7 +128,7 @@ async def test_connection_that_never_opens_is_told() -> None:
     assert "firewall" in found.cure
 
 
-async def test_silent_peer_is_told_with_the_questions_to_ask() -> None:
+async def test_silent_peer_is_reported_with_the_questions_to_ask() -> None:
     async with listening() as listener:
         findings = await examined(f"bvs://{HOST}:{listener.port}", timeout=SHORT)
     assert errors(findings) == NO_SESSION
@@ -140,7 +140,7 @@ async def test_silent_peer_is_told_with_the_questions_to_ask() -> None:
     assert found.details["answers_at"] is None
 
 
-async def test_silent_udp_peer_is_told() -> None:
+async def test_silent_udp_peer_is_reported() -> None:
     async with datagrams() as peer:
         findings = await examined(f"bvs+udp://{HOST}:{peer.port}", timeout=SHORT)
     found = of(findings, "session")
@@ -192,7 +192,7 @@ async def test_camera_that_refuses_newcomers_hangs_up() -> None:
     assert "serve another client and refuse newcomers" in found.cure
 
 
-async def test_garbage_is_told_with_its_bytes() -> None:
+async def test_garbage_is_reported_with_its_bytes() -> None:
     async def web_server(peer: Peer, number: int) -> None:
         peer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
         await peer.rest()
@@ -207,7 +207,7 @@ async def test_garbage_is_told_with_its_bytes() -> None:
     assert b"HTTP/1.1 400".hex() in broken[0]
 
 
-async def test_half_an_answer_is_told() -> None:
+async def test_half_an_answer_is_reported() -> None:
     async def half(peer: Peer, number: int) -> None:
         await peer.read(len(OPENING))
         peer.write(CONNECT_ANSWER[:14])
@@ -291,7 +291,7 @@ async def test_session_taken_by_another_client_is_told() -> None:
     assert "soon after its Connect, and still takes connections: another client" in text
 
 
-async def test_session_taken_while_watching_is_told() -> None:
+async def test_session_taken_while_watching_is_reported() -> None:
     async with EmulatedCamera(running=True) as emulator:
         async with asyncio.TaskGroup() as group:
             watching = group.create_task(examined(emulator.url, seconds=5.0))
@@ -301,14 +301,14 @@ async def test_session_taken_while_watching_is_told() -> None:
     assert findings[-1].check == "taken"
 
 
-async def test_camera_that_dies_in_the_middle_is_told() -> None:
+async def test_camera_that_dies_in_the_middle_is_reported() -> None:
     check, text, code = await lost(faults.PowerCycle(on="Query", nth=LATER))
     assert (check, code) == ("lost", Exit.NO_SESSION)
     assert "the session broke after" in text
     assert "the camera takes no connection now" in text
 
 
-async def test_garbage_in_the_session_is_told() -> None:
+async def test_garbage_in_the_session_is_reported() -> None:
     garbage = faults.Insert(on="QueryAnswer", nth=LATER, data=b"garbage")
     check, text, code = await lost(garbage)
     assert (check, code) == ("lost", Exit.NO_SESSION)
@@ -316,7 +316,7 @@ async def test_garbage_in_the_session_is_told() -> None:
     assert "67 61 72 62" in text
 
 
-async def test_camera_that_falls_silent_is_told() -> None:
+async def test_camera_that_falls_silent_is_reported() -> None:
     check, text, code = await lost(faults.HalfOpen(on="Query", nth=LATER), timeout=0.1)
     assert (check, code) == ("lost", Exit.RAN_OUT)
     assert "the camera fell silent after" in text

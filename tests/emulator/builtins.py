@@ -1,4 +1,4 @@
-"""The applications of an emulated camera that is told none."""
+"""The applications of an emulated camera without given ones."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class RawClient:
         self.socket.send(b"".join(frames))
 
     async def receive(self, limit: int = 1 << 16) -> bytes:
-        """Return what one call of recv gives."""
+        """Return the bytes of one call of recv."""
         async with asyncio.timeout(TIMEOUT):
             return await asyncio.get_running_loop().sock_recv(self.socket, limit)
 
@@ -202,7 +202,7 @@ def word(status: Status) -> str:
 
 
 def heard(device: Device) -> list[str]:
-    """Take what the device said, one word a message."""
+    """Return the device's messages, one word each."""
     return [_short(message) for message in device.take_output()]
 
 

@@ -38,12 +38,12 @@ def insight(jobs: Sequence[Mapping[str, Any]]) -> tuple[InSightDevice, InSightCo
 
 
 def pass_time(device: InSightDevice, seconds: float) -> None:
-    """Let a device's time go on."""
+    """Advance a device's time."""
     device.advance_to(device.now + round(seconds * NANOSECONDS))
 
 
 def course(scenario: Scenario) -> list[tuple[float, str]]:
-    """Return what happens in half a second, and on every command."""
+    """Return a timeline with events in half a second, and on every command."""
     clock = ManualClock()
     happened: list[tuple[float, str]] = []
 

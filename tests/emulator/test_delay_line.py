@@ -41,7 +41,7 @@ class Line:
         self.delayed.put([Transmission(parts, faults=[text], **changes)])
 
     def at(self, seconds: float) -> list[str]:
-        """Return what has happened by ``seconds``, and forget it."""
+        """Return the events until ``seconds``, and forget them."""
         self.delayed.run()
         self.clock.advance(seconds - self.clock.now)
         seen, self.seen = self.seen, []
@@ -77,7 +77,7 @@ def test_delay_holds_what_is_behind() -> None:
     assert line.at(2) == ["c"]
 
 
-def test_overtaken_goes_behind_what_waits_when_it_is_time() -> None:
+def test_overtaken_goes_after_what_waits_when_it_is_time() -> None:
     line = Line()
     line.put("a", delay=1, overtaken=True)
     line.put("b", delay=2)
@@ -133,7 +133,7 @@ def test_gather_unordered_with_a_delayed_one_between() -> None:
     assert line.at(1) == ["b"]
 
 
-def test_end_comes_behind_its_bytes_and_before_the_next() -> None:
+def test_end_comes_after_its_bytes_and_before_the_next() -> None:
     line = Line()
     line.put("a")
     line.put("b", end=Ending("close", "close"))
@@ -148,7 +148,7 @@ def test_gather_unordered_with_parts_is_one_datagram() -> None:
     assert line.at(0) == ["abc"]
 
 
-def test_close_behind_the_last_part_is_not_told_of_it() -> None:
+def test_close_after_the_last_part_is_not_told_of_it() -> None:
     line = Line()
     line.close_at = "a"
     line.put("a")
@@ -189,7 +189,7 @@ def test_delay_that_is_no_whole_nanosecond_comes_once() -> None:
 # ---------------------------------------------------------------------- cutting
 
 
-def test_faults_leaves_no_pause_behind_what_is_cut_off() -> None:
+def test_faults_leaves_no_pause_after_what_is_cut_off() -> None:
     given: list[faults.Fault] = [
         faults.Split(after=2, pause=1),
         faults.Split(after=4, pause=2),

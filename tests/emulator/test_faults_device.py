@@ -70,7 +70,7 @@ async def test_busy_for_ever_for_a_time(
     await session.expect(wire.WAITING)
 
 
-async def test_busy_for_ever_at_a_switch_stays_behind_its_answer(
+async def test_busy_for_ever_at_a_switch_stays_after_its_answer(
     emulator: EmulatedCamera, session: RawClient, clock: ManualClock
 ) -> None:
     session.send(wire.STOP)

@@ -116,7 +116,7 @@ async def test_delay_of_the_clients_message_overtaken(
 
 
 @pytest.mark.parametrize("broken", [False, True])
-async def test_delay_of_the_clients_message_delays_the_end_behind_it(
+async def test_delay_of_the_clients_message_delays_the_end_after_it(
     emulator: EmulatedCamera, session: RawClient, clock: ManualClock, broken: bool
 ) -> None:
     emulator.inject(faults.Delay(on="Start", seconds=2), faults.Delay(on="Stop", seconds=3))
@@ -188,7 +188,7 @@ async def test_split_without_a_pause_is_two_writes(
     assert written == [wire.ACTIVE_1[:15], wire.ACTIVE_1[15:]]
 
 
-async def test_split_behind_the_end_leaves_it_whole(
+async def test_split_after_the_end_leaves_it_whole(
     emulator: EmulatedCamera, session: RawClient
 ) -> None:
     emulator.inject(faults.Split(on="QueryAnswer", after=16, pause=5))
@@ -448,7 +448,7 @@ async def test_end_before_the_clients_message_is_not_heard(
     assert (unheard.fault, unheard.wire) == (kind, "")
 
 
-async def test_close_after_the_clients_message_is_behind_its_answer(
+async def test_close_after_the_clients_message_is_after_its_answer(
     emulator: EmulatedCamera, session: RawClient
 ) -> None:
     emulator.inject(faults.Close(on="Start", when="after"))

@@ -178,7 +178,7 @@ async def test_half_open_loses_both_directions_for_its_time(
     await session.expect(wire.ACTIVE_1)
 
 
-async def test_half_open_stays_deaf_where_another_client_takes_over(
+async def test_half_open_stays_deaf_if_another_client_takes_over(
     emulator: EmulatedCamera, session: UdpClient
 ) -> None:
     emulator.inject(faults.HalfOpen(on="QueryAnswer"))

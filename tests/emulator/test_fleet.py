@@ -168,7 +168,7 @@ EXAMPLES = sorted((ROOT / "examples" / "scenarios").glob("*.yaml"))
 
 
 def check(data: Any) -> list[str]:
-    """Return what the schema has against a file."""
+    """Return the schema's complaints about a file."""
     jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")
     validator = jsonschema.Draft202012Validator(scenario_schema())
     return [error.json_path for error in validator.iter_errors(bare_on(data))]

@@ -249,7 +249,7 @@ class Owner:
 
 
 class OpenHouse(TcpListener):
-    """Has room for everybody, and no event loop."""
+    """Has room for every client, and no event loop."""
 
     def enter(self, link: _TcpLink) -> str:
         return ""
@@ -399,7 +399,7 @@ class Bench:
         self.received = b""
 
     async def turn(self) -> None:
-        """Let what was sent be handled."""
+        """Handle the sent bytes."""
         for _ in range(6):
             await asyncio.sleep(0)
 

@@ -344,7 +344,7 @@ async def test_timeline_begins_anew_with_each_start() -> None:
         clock.advance(5)
 
 
-async def test_too_many_faults_are_told_and_the_camera_goes_on(
+async def test_too_many_faults_are_reported_and_the_camera_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     waiting = [{"kind": "drop", "on": "ClockAnswer"}] * 100

@@ -1,4 +1,4 @@
-"""The emulator's log: entries are made when somebody reads them, and what they hold is bounded."""
+"""The emulator's log: entries are made when they are read, and their memory is bounded."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PEER = "127.0.0.1:5"
 
 
 def make(*numbers: int, maxlen: int = 3) -> Log:
-    """Return a log of answers to Query, told apart by their application."""
+    """Return a log of answers to Query, each with another application."""
     log = Log(HANDBOOK, maxlen)
     for number in numbers:
         put(log, number)

@@ -60,7 +60,7 @@ class Wire:
         return True
 
     def receive(self, seconds: float) -> bool:
-        """Take what comes within some seconds; return whether there was something."""
+        """Receive bytes for some seconds; return whether there were any."""
         if self.sock is None:
             return False
         self.sock.settimeout(max(seconds, 1e-3))

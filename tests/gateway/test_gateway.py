@@ -136,7 +136,7 @@ async def test_no_part_found_is_an_answer_of_its_own() -> None:
 @pytest.mark.parametrize(
     "request_", [b"PART\n", b"TRIGGER seven\n", b"NEXT 3\n", b"\xff\xfe\n", b"TRIGGER 1 2\n"]
 )
-async def test_what_is_no_request_is_told(request_: bytes) -> None:
+async def test_what_is_no_request_is_reported(request_: bytes) -> None:
     async with cell() as it:
         robot = await it.robot()
         assert (await robot.ask(request_)).startswith(b"10,0,BAD_REQUEST expected TRIGGER, NEXT")
@@ -226,7 +226,7 @@ async def test_wait_takes_only_what_comes_after_it() -> None:
         assert await one.reader.readuntil(b"\n") == FIRST
 
 
-async def test_a_camera_that_is_away_is_told() -> None:
+async def test_a_camera_that_is_away_is_reported() -> None:
     async with cell(timeout=2) as it:
         robot = await it.robot()
         await it.gateway.camera.close()
@@ -234,7 +234,7 @@ async def test_a_camera_that_is_away_is_told() -> None:
         assert await robot.ask(b"STATUS\n") == b"0,0,0,0,7\r\n"
 
 
-async def test_a_stopped_camera_is_told() -> None:
+async def test_a_stopped_camera_is_reported() -> None:
     async with cell(timeout=2) as it:
         robot = await it.robot()
         await it.gateway.camera.stop()
@@ -290,7 +290,7 @@ async def test_answers_of_a_fixed_width_have_it() -> None:
             assert (len(answer), answer[-2:]) == (96, b"\r\n")
 
 
-async def test_what_also_stands_behind_a_pose() -> None:
+async def test_what_also_stands_after_a_pose() -> None:
     async with cell(also=("quality", "feature_id")) as it:
         robot = await it.robot()
         assert await robot.ask(b"TRIGGER\n") == FIRST[:-2] + b",1.000,\r\n"
@@ -307,7 +307,7 @@ async def test_what_also_stands_behind_a_pose() -> None:
         ({"clients": 0}, "greater than or equal to 1"),
     ],
 )
-def test_settings_that_cannot_work_are_told(settings: dict[str, Any], words: str) -> None:
+def test_settings_that_cannot_work_are_reported(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         GatewaySettings.model_validate(settings)
 

@@ -97,7 +97,7 @@ def test_empty_slots_are_skipped_and_counted() -> None:
     assert context.empty_slots == 3
 
 
-def test_slots_behind_the_count_are_not_looked_at() -> None:
+def test_slots_after_the_count_are_not_looked_at() -> None:
     layout = "n: int8, (x: int8, y: int8)[n]"
     context = Context()
     interpreter = resolve(f"localizations: {layout}")

@@ -1,4 +1,4 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 

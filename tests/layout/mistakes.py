@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def cannot_tell_lines(mistake: Callable[..., Any]) -> tuple[object, str, Any]:
-    """Return where a line of YAML is found, with a mistake in its place."""
+    """Return a document with a mistake in place of a line, and the line's number."""
     return _yaml_files, "_line", mistake
 
 

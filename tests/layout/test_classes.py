@@ -165,7 +165,7 @@ def test_mistake_in_a_class_says_where_and_what_was_expected(kind: type) -> None
         Layout.of(kind)
 
 
-def test_class_that_is_not_at_the_top_of_its_module_says_so() -> None:
+def test_class_that_is_not_at_the_top_of_its_module_reports_it() -> None:
     class Hidden(NamedTuple):
         x: Annotated[int, "int8"]
 

@@ -77,7 +77,7 @@ def test_layouts_of_several_cameras_share_no_dtype_and_no_model() -> None:
     assert first.model is not second.model
 
 
-def test_layout_mistake_is_told_with_its_own_place_each_time() -> None:
+def test_layout_mistake_is_reported_with_its_own_place_each_time() -> None:
     for start in (0, 7, 0):
         text = "x" * start + "a: int32, b: nothing"
         with pytest.raises(LayoutError) as caught:

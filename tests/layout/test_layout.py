@@ -68,7 +68,7 @@ def test_text_is_canonical_and_stays_so(text: str, canonical: str) -> None:
         ("", 0, "expected a field or a group, got the end"),
         ("# nothing", 9, "got the end"),
         (",a: int8", 0, "expected a field or a group, got ','"),
-        ("a", 1, "expected ':' and a type behind 'a', got the end"),
+        ("a", 1, "expected ':' and a type after 'a', got the end"),
         ("a: int8 b: int8", 8, "a comma is missing before it"),
         ("a: int8, ,", 9, "expected a field or a group, got ','"),
         ("a: float", 3, "did you mean 'real32'?"),
@@ -92,10 +92,10 @@ def test_text_is_canonical_and_stays_so(text: str, canonical: str) -> None:
         ("1a: int8", 0, "expected a field or a group, got '1'"),
         ("a: int8; b: int8", 7, "expected a name, a number or one of : , ( ) [ ] * @ #, got ';'"),
         ("a: int8 @seq", 8, "expected '@sequence', got '@' and 'seq'"),
-        ("a: real32 @sequence", 10, "only behind an integer without a unit"),
-        ("a: int32 mm @sequence", 12, "only behind an integer without a unit"),
+        ("a: real32 @sequence", 10, "only after an integer without a unit"),
+        ("a: int32 mm @sequence", 12, "only after an integer without a unit"),
         ("a: int8 @sequence, b: int8 @sequence", 27, "expected one '@sequence', got a second"),
-        ("(a: int8)", 9, "expected '*', '[number]' or '[name]' behind the group, got the end"),
+        ("(a: int8)", 9, "expected '*', '[number]' or '[name]' after the group, got the end"),
         ("()*", 1, "expected a field, got ')'"),
         ("(a: int8", 8, "expected a unit, ',' or ')', got the end"),
         ("(a: bool b: int8)*", 9, "a comma is missing before it"),
@@ -320,7 +320,7 @@ def test_text_that_is_no_utf8_names_the_bad_byte() -> None:
     )
 
 
-def test_first_of_two_mistakes_is_told() -> None:
+def test_first_of_two_mistakes_is_reported() -> None:
     with pytest.raises(InterpretationError) as caught:
         Layout("(code: string[1], a: bool)*").parse(b"a\x02\xff\xff")
     assert caught.value.offset == 1
@@ -531,7 +531,7 @@ def test_dtype_is_the_wires() -> None:
 
 @pytest.mark.skipif(sys.byteorder != "little", reason="the view is of the machine's byte order")
 @pytest.mark.parametrize("kind", [bytes, bytearray])
-def test_table_is_a_view_where_nothing_is_converted(kind: type) -> None:
+def test_table_is_a_view_if_nothing_is_converted(kind: type) -> None:
     payload = kind(b"\2\0\1\0\2\0\3\0")
     table = Layout("n: int16, (a: int16)[n]").parse_table(payload)
     assert table["a"].tolist() == [1, 2]
@@ -840,7 +840,7 @@ def containers(draw: st.DrawFn) -> tuple[Layout, bytes]:
 
 
 def error_of(call: Callable[..., object], *args: object) -> Exception | None:
-    """Return what a call raises, None where it does not."""
+    """Return the error of a call, None without one."""
     try:
         call(*args)
     except Exception as exc:  # noqa: BLE001  the tests look at which it is

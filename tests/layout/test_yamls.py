@@ -67,7 +67,7 @@ def test_load_aliases_and_merges_of_people_are_taken() -> None:
 
 
 def scenario(tmp_path: Path, text: str) -> str:
-    """Return what a scenario file is refused with, behind its name."""
+    """Return the error of a scenario file, after the file's name."""
     path = tmp_path / "s.yaml"
     path.write_text(text)
     with pytest.raises(ConfigurationError) as told:

@@ -1,4 +1,4 @@
-"""No result is told as one application's that was made under another, whoever switches when."""
+"""No result counts for another application than its own, at any switch by any client."""
 
 from __future__ import annotations
 

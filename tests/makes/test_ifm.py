@@ -245,7 +245,7 @@ async def test_records_are_those_of_the_group_that_has_their_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "why"), [("n: int64", "no int64"), ("(n: int8)[3]", "as many records as there are")]
+    ("layout", "why"), [("n: int64", "no int64"), ("(n: int8)[3]", "records is not fixed")]
 )
 @pytest.mark.asyncio
 async def test_layout_that_no_device_can_send_is_a_mistake(layout: str, why: str) -> None:
@@ -264,7 +264,7 @@ async def test_version_without_lengths_has_no_binary_results() -> None:
 
 
 @pytest.mark.asyncio
-async def test_result_of_another_layout_is_told_and_not_read() -> None:
+async def test_result_of_another_layout_is_reported_and_not_read() -> None:
     async with by_hand(interpret_as="n: int32") as (peer, camera):
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         ticket, _ = await peer.requests.get()

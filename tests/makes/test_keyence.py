@@ -68,7 +68,7 @@ SR = {
 
 
 @pytest.mark.asyncio
-async def test_refusal_of_a_trigger_is_told_by_its_number() -> None:
+async def test_refusal_of_a_trigger_is_reported_by_its_number() -> None:
     refusals = ["ER,T2,02", "ER,T2,77", "RT,00001,OK"]
     async with sensor_by_hand({**IV3, "T2": refusals}, "iv3") as (_, camera):
         with pytest.raises(UnsupportedError, match="unknown command"):
@@ -135,7 +135,7 @@ async def test_result_is_of_the_program_that_somebody_else_has_chosen() -> None:
 
 
 @pytest.mark.asyncio
-async def test_reading_without_a_code_ends_before_the_deadline_and_says_so() -> None:
+async def test_reading_without_a_code_ends_before_the_deadline_and_reports_it() -> None:
     async with (
         EmulatedSr(codes=[None, "4006381333931"]) as emulator,
         smartcam.connect(emulator.url, interpret_as=CODE) as camera,
@@ -188,7 +188,7 @@ async def test_code_that_somebody_else_has_read_is_streamed() -> None:
 
 
 @pytest.mark.asyncio
-async def test_refused_reading_is_told_by_its_number() -> None:
+async def test_refused_reading_is_reported_by_its_number() -> None:
     says = {**SR, "LON": ["ER,LON,00", "ER,LON,99", "ER,LON,20", "A"]}
     async with sensor_by_hand(says, "sr") as (_, camera):
         with pytest.raises(UnsupportedError):
@@ -239,7 +239,7 @@ async def test_bytes_of_a_code_come_as_they_are() -> None:
 
 
 async def scanned(emulator: EmulatedSr, times: int, **options: Any) -> list[str | None]:
-    """Return what vention-barcode-scanner reads."""
+    """Return the codes that vention-barcode-scanner reads."""
     keyence = pytest.importorskip("barcode_scanner.scanners.keyence")
     scanner = keyence.KeyenceScanner("left", "127.0.0.1", emulator.port, **options)
     assert await scanner.connect()

@@ -68,7 +68,7 @@ async def standing(make: str) -> AsyncIterator[tuple[LineCamera, ManualClock, Ca
 
 
 def heard(emulator: LineCamera) -> int:
-    """Return how many triggers the camera has heard."""
+    """Return the number of triggers that the camera has received."""
     return sum(isinstance(one.message, m.Trigger) for one in emulator.log)
 
 

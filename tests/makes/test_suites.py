@@ -32,7 +32,7 @@ def result(application: int, data: bytes, mixed: str = "") -> m.ResultContainer:
 
 
 def code(line: str) -> m.ResultContainer:
-    """Return what a reader's line is told as."""
+    """Return the event for a reader's line."""
     read = line != "ERROR"
     cells = (m.CellValue("read", str(int(read))), m.CellValue("code", line if read else ""))
     return m.ResultContainer(data=line.encode(), cells=cells)

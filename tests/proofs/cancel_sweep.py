@@ -460,7 +460,7 @@ def _box(wire: Wire, *, running: bool) -> EmulatedCamera:
             # another part: a datagram like one that is there already counts as come twice
             data = run.number.to_bytes(4, "little") + b"\1\0\0\0"
             device = speaker[0].device
-            device._say(m.ResultContainer(application=device.active_application, data=data))
+            device._send(m.ResultContainer(application=device.active_application, data=data))
         return values(run)
 
     program = {

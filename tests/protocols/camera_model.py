@@ -131,7 +131,7 @@ class CameraModel:
             return LATEST
 
     def take(self) -> list[m.Message]:
-        """Return what it said since the last call."""
+        """Return its messages since the last call."""
         said, self._said = self._said, []
         return said
 
@@ -140,7 +140,7 @@ class CameraModel:
             self._said.append(message)
 
     def _report(self) -> None:
-        """After every change a status; a BVS ID only if it is told to."""
+        """Send a status after every change; a BVS ID does so only on request."""
         if (self.status, self.endian) != self._told and (
             not self.is_bid or self.options.push_status
         ):
@@ -153,7 +153,7 @@ class CameraModel:
     # ------------------------------------------------------------------ the client
 
     def hear(self, message: m.Message) -> None:
-        """Take a message of the session's client."""
+        """Handle a message of the session's client."""
         if self.mode == "rebooting":
             return
         if isinstance(message, m.Connect):

@@ -168,7 +168,7 @@ def _bid_status(word: int) -> Status:
 
 
 def known(wire: Wire, sender: m.Sender, message_id: int) -> type[m.Message] | None:
-    """Return what an id means from that sender."""
+    """Return the meaning of an id from that sender."""
     of_id = [one for one, body in wire.bodies.items() if body.message_id == message_id]
     return next((one for one in of_id if one.sender is sender), None)
 
@@ -189,7 +189,7 @@ def _filled(wire: Wire, sender: m.Sender, frame: Frame) -> Frame:
 
 
 def surplus(wire: Wire, sender: m.Sender, frame: Frame) -> int:
-    """Return how many bytes a body is too long; negative: too short."""
+    """Return the number of bytes that a body is too long; negative: too short."""
     message_type = known(wire, sender, frame.message_id)
     if message_type is None:
         return 0
@@ -272,7 +272,7 @@ def _numbers_at(wire: Wire, stream: bytes, at: int) -> tuple[int, int]:
 
 
 def _size_at(wire: Wire, stream: bytes, at: int) -> int | None:
-    """Return what a header announces; -1 for a wrong magic number, None for too few bytes."""
+    """Return a header's length; -1 for a wrong magic number, None for too few bytes."""
     if not _may_begin(wire, stream, at):
         return -1
     if len(stream) < at + wire.header:
@@ -371,7 +371,7 @@ class ClientEnd(_End):
         )
 
     def say(self, message: m.Message, answered: bool | None = None) -> bytes:
-        """Say what may be said; return its bytes."""
+        """Send an allowed message; return its bytes."""
         message_id = framed(self.wire, message).message_id
         if self._is_answered(message_id, answered):
             self.owed.add(message_id)
@@ -382,7 +382,7 @@ class ClientEnd(_End):
         return self._count_sent(message)
 
     def hear(self, data: bytes) -> list[object]:
-        """Take bytes; return the messages that the user hears, and the error that ends the link."""
+        """Receive bytes; return the messages for the user, and the error that ends the link."""
         if self.phase in ENDED:
             return []
         frames, intact = self._cut(data)
@@ -440,7 +440,7 @@ class CameraEnd(_End):
         self.tells = tells  # bodies of a wrong length are told
 
     def hear(self, data: bytes) -> list[m.Message]:
-        """Take bytes; return the messages that count."""
+        """Receive bytes; return the messages that count."""
         if self.phase in ENDED:
             return []
         frames, _ = self._cut(data)
@@ -455,7 +455,7 @@ class CameraEnd(_End):
         return heard
 
     def say(self, message: m.Message) -> bytes:
-        """Say something; return its bytes."""
+        """Send a message; return its bytes."""
         if isinstance(message, m.ConnectAnswer) and self.phase == "connecting":
             self.phase = "connected"
         return self._count_sent(message)
@@ -568,7 +568,7 @@ PAYLOADS = _SIZES.flatmap(lambda size: st.binary(min_size=size, max_size=size))
 
 
 class Extra(NamedTuple):
-    """A whole frame of any message, perhaps with something behind its body."""
+    """A whole frame of any message, perhaps with bytes after its body."""
 
     message: m.Message
     more: bytes

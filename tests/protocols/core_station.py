@@ -86,14 +86,14 @@ class Line:
 
     @property
     def clean(self) -> bool:
-        """True if the wires carried what was said and nothing else, in order."""
+        """True if the wires carried the sent messages and nothing else, in order."""
         stream = self.transport is Transport.TCP
         return stream and not any(pipe.disturbed for pipe in self.pipes.values())
 
     # ------------------------------------------------------------------ the client says
 
     def say(self, message: m.Message, answered: bool | None = None) -> None:
-        """Say what may be said; what may not must change nothing."""
+        """Send a message; a forbidden one must change nothing."""
         if self.pipes["up"].ended:
             return
         if not self.client_end.may_say(message, answered):
@@ -143,7 +143,7 @@ class Line:
             self.check_order()
 
     def check_order(self) -> None:
-        """On an undisturbed stream the client hears what was said, in order, none twice."""
+        """On an undisturbed stream the client receives the sent messages, in order, none twice."""
         said = iter(self.said)
         assert all(message in said for message in self.heard)
         unasked = self.client.counters.unexpected_messages
@@ -171,7 +171,7 @@ def check_end(machine: Machine, end: ClientEnd | CameraEnd) -> None:
 
 
 def refused(machine: Machine, message: m.Message, answered: bool | None = None) -> None:
-    """Say what may not be said: it is refused, and nothing has changed."""
+    """Send a forbidden message: it is refused, and nothing has changed."""
     before = (machine.state, machine.buffered, dataclasses.replace(machine.counters))
     with pytest.raises((LocalProtocolError, UnsupportedError)):
         machine.send(message, answered=answered)
@@ -251,7 +251,7 @@ class Station:
             self.served = None
 
     def end_session(self) -> None:
-        """Take the session away, and with it the link."""
+        """End the session, and with it the link."""
         line, self.served = self.served, None
         if line is not None:
             self.device.disconnect()

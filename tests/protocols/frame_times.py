@@ -20,7 +20,7 @@ def give_frames(monkeypatch: pytest.MonkeyPatch, **times: float) -> None:
 
 
 def small_reads(**sizes: Any) -> AbstractContextManager[object]:
-    """Have a framer read into small buffers, such as ``FIRST_READ_BYTES=16`` bytes."""
+    """Make a framer read into small buffers, such as ``FIRST_READ_BYTES=16`` bytes."""
     patched: AbstractContextManager[object] = mock.patch.multiple(
         framing, MIN_OWN_BUFFER_BYTES=32, **sizes
     )

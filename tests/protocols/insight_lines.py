@@ -38,7 +38,7 @@ def with_cells(*cells: str) -> InSightDialect:
 
 
 class Talk:
-    """A machine, what it wrote and what it told.
+    """A machine, its written bytes and its events.
 
     Args:
         dialect: of the machine.
@@ -56,7 +56,7 @@ class Talk:
         )
 
     def logged_in(self) -> Talk:
-        """Log in, and forget what was said for that."""
+        """Log in, and forget the messages for that."""
         self.machine.send(m.Connect())
         self.hear(LOGIN)
         self.told()
@@ -70,7 +70,7 @@ class Talk:
         return self.written()
 
     def hear(self, data: bytes) -> bytes:
-        """Take bytes, and return what is written at them."""
+        """Receive bytes, and return the bytes written in reply."""
         self.machine.receive_data(data)
         return self.written()
 

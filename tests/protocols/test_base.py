@@ -173,7 +173,7 @@ def test_tries_of_pinned_quirks_are_that_one(transport: Transport) -> None:
     assert BVS.tries(transport, "b16", ("no_id", "code")) == [(both,)]
 
 
-def test_tries_of_an_unknown_quirk_is_told() -> None:
+def test_tries_of_an_unknown_quirk_is_reported() -> None:
     with pytest.raises(ConfigurationError) as caught:
         BVS.tries(TCP, "handbook", ["code"])
     assert str(caught.value) == "dialect handbook has no quirk 'code'; it has none"

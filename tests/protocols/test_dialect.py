@@ -421,7 +421,7 @@ def test_with_quirks_same_names_give_the_same_dialect_in_any_order() -> None:
     assert B16.quirks == ()
 
 
-def test_with_quirks_one_behind_the_other_has_both() -> None:
+def test_with_quirks_one_after_the_other_has_both() -> None:
     both = B16.with_quirks(["code"]).with_quirks(["no_id"])
     assert both.quirks == ("code", "no_id")
     assert both.table == B16.with_quirks(["code", "no_id"]).table
@@ -448,7 +448,7 @@ def test_with_quirks_changes_its_own_messages_and_nothing_else() -> None:
     ],
     ids=label,
 )
-def test_with_quirks_unknown_one_is_told_with_those_there_are(
+def test_with_quirks_unknown_one_is_reported_with_those_there_are(
     dialect: FramedDialect, text: str
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:
@@ -606,7 +606,7 @@ def test_raw_request_with_a_word_for_an_id_is_unsupported() -> None:
 
 
 @each_message
-def test_body_is_an_answers_bytes_behind_the_header(
+def test_body_is_an_answers_bytes_after_the_header(
     dialect: FramedDialect, message: m.Message
 ) -> None:
     assert dialect.body(message) == dialect.encode(message)[dialect.header.size :]

@@ -29,7 +29,7 @@ FIXED = [
 
 
 def read(made: Machine, data: bytes, now: float) -> list[Event]:
-    """Have it read bytes as a transport does, all at one time."""
+    """Make it read bytes as a transport does, all at one time."""
     events: list[Event] = []
     while data and made.state is not State.FAILED:
         room = made.room()
@@ -211,7 +211,7 @@ def test_header_in_a_frame_that_takes_long_says_that_its_length_is_wrong(
 
 
 @with_magic
-def test_header_is_found_where_it_came_in_pieces_and_behind_what_was_searched(
+def test_header_is_found_where_it_came_in_pieces_and_after_what_was_searched(
     dialect: FramedDialect,
 ) -> None:
     made, status = client(dialect), dialect.encode(STATUS)

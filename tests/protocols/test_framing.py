@@ -230,7 +230,7 @@ def test_framer_five_megabytes_in_segments_are_collected_in_place() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 3, 4, 11, 12, 20, 100])
-def test_framer_wrong_magic_is_told_at_once_even_on_part_of_a_header(size: int) -> None:
+def test_framer_wrong_magic_is_reported_at_once_even_on_part_of_a_header(size: int) -> None:
     data = b"GET / HTTP/1.1\r\n".ljust(100, b"x")[:size]
     framer = fed(data)
     with pytest.raises(FrameError) as caught:
@@ -242,7 +242,7 @@ def test_framer_wrong_magic_is_told_at_once_even_on_part_of_a_header(size: int) 
     assert framer.buffered == size
 
 
-def test_framer_wrong_last_byte_of_a_magic_is_told_with_that_byte() -> None:
+def test_framer_wrong_last_byte_of_a_magic_is_reported_with_that_byte() -> None:
     framer = fed(MAGIC[:3])
     assert framer.next_frame() is None
     framer.feed(b"\x43")
@@ -281,7 +281,7 @@ def test_resync_skips_to_what_may_begin_a_frame(data: bytes, skipped: int, left:
     assert framer.buffered == len(left)
 
 
-def test_resync_behind_a_taken_frame_keeps_its_place() -> None:
+def test_resync_after_a_taken_frame_keeps_its_place() -> None:
     framer = fed(STATUS + b"??" + QUERY)
     assert framer.next_frame() == STATUS_FRAME
     with pytest.raises(FrameError):
@@ -337,7 +337,7 @@ def test_following_takes_those_that_begin_alike_and_no_more(
     assert followers(framer, dialect, 4) == ([one[4:] for one in payloads[1:]], behind)
 
 
-def test_following_takes_frames_of_other_lengths_and_goes_on_behind_them() -> None:
+def test_following_takes_frames_of_other_lengths_and_goes_on_after_them() -> None:
     lengths = [5] * 20 + [9] + [5] * 33 + [4, 100] + [5] * 16
     payloads = [b"\1\2\3\4" + bytes(length - 4) for length in lengths]
     framer = fed(b"".join(header(len(one)) + one for one in payloads))

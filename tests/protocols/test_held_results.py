@@ -71,7 +71,7 @@ class Station:
         self.listen()
 
     def listen(self) -> None:
-        """Take what the client says, and what its machine tells."""
+        """Handle the client's messages, and the machine's events."""
         said = b"".join(self.machine.data_to_send())
         for ticket, what in re.findall(rb"(\d+)>(\w+)\n", said):
             if what == b"JOB":
@@ -108,7 +108,7 @@ ACTIONS = ("result", "remark", "trigger", "answer trigger", "answer", "answer", 
 
 
 @given(st.lists(st.sampled_from(ACTIONS), max_size=60))
-def test_each_result_is_told_once_in_order_and_of_its_own_application(actions: list[str]) -> None:
+def test_each_result_is_reported_once_in_order_of_its_application(actions: list[str]) -> None:
     station = Station()
     for action in actions:
         station.step(action)

@@ -1,4 +1,4 @@
-"""In-Sight native mode, the client's machine: to the byte, in pieces, and with what nobody says."""
+"""In-Sight native mode, the client's machine: to the byte, in pieces, and with wrong bytes."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_login_after_a_disconnect_without_a_session_goes_on() -> None:
         GREETING + b"Password: Password: ",
     ],
 )
-def test_login_refused_is_told_once_and_nothing_is_said_again(said: bytes) -> None:
+def test_login_refused_is_reported_once_and_nothing_is_said_again(said: bytes) -> None:
     talk = Talk()
     talk.send(m.Connect())
     assert talk.hear(said).count(b"admin\r\n") == 1
@@ -446,7 +446,7 @@ BROKEN: list[tuple[m.Message, bytes, str]] = [
     (Command(line="EV a"), b"1\r\n4294967296\r\n", "a text of 4294967296 bytes comes; 0 to 1000"),
     (Command(line="EV a"), b"1\r\n-1\r\n", "a text of -1 bytes comes; 0 to 1000"),
     (Command(line="EV a"), b"1\r\n\r\n", "'' came, a length was expected"),
-    (Command(line="EV a"), b"1\r\n2\r\nabc\r\n", "'c' came behind a text of 2 bytes, its end was"),
+    (Command(line="EV a"), b"1\r\n2\r\nabc\r\n", "'c' came after a text of 2 bytes, its end was"),
 ]
 
 
@@ -499,7 +499,7 @@ REQUESTS: list[m.Message] = [one for one, _, _ in CONVERSATIONS] + [m.Connect(),
 
 
 def converse(requests: list[m.Message], pieces: list[bytes], *, login: bool) -> tuple[Any, ...]:
-    """Say and hear by turns; return all that was written and told."""
+    """Send and receive by turns; return all written bytes and events."""
     talk = Talk(CELLS, max_length=100)
     if login:
         talk.logged_in()

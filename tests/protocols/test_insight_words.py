@@ -232,7 +232,7 @@ each = pytest.mark.parametrize(("form", "heard", "answer"), FORMS)
 
 
 class Pieces:
-    """A reader and the pieces that it told of."""
+    """A reader and the pieces that it reported."""
 
     def __init__(self, max_length: int = 100) -> None:
         self.told: list[tuple[str, bool]] = []
@@ -257,7 +257,7 @@ def test_answer_is_read_at_every_split_point(
 
 
 @each
-def test_answer_is_told_in_pieces_with_their_ends(
+def test_answer_is_reported_in_pieces_with_their_ends(
     form: AnswerForm, heard: bytes, answer: CommandAnswer
 ) -> None:
     pieces = Pieces()
@@ -268,7 +268,7 @@ def test_answer_is_told_in_pieces_with_their_ends(
 
 
 @each
-def test_answer_leaves_what_stands_behind_it(
+def test_answer_leaves_what_stands_after_it(
     form: AnswerForm, heard: bytes, answer: CommandAnswer
 ) -> None:
     reader = Pieces().reader
@@ -353,7 +353,7 @@ def test_image_is_the_same_in_pieces_of_any_size_broken_or_not(
     assert read[0] == read[1] == read[2]
 
 
-def test_image_with_a_broken_line_behind_thousands_is_told_up_to_it() -> None:
+def test_image_with_a_broken_line_after_thousands_is_told_up_to_it() -> None:
     pieces = Pieces()
     pieces.reader.expect(AnswerForm.HEX)
     header = (b"BM" + struct.pack("<I", 1 << 20)).hex().encode()

@@ -121,7 +121,7 @@ ROWS, ECHOES, IDS = (
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have these protocols found by their names while a test runs."""
+    """Register these protocols by their names while a test runs."""
     for one in (ROWS, ECHOES, IDS):
         monkeypatch.setitem(PROTOCOLS._registered, one.name, one)
 

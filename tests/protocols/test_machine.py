@@ -319,7 +319,7 @@ def test_client_second_connect_answer_is_counted_only() -> None:
 # ---------------------------------------------------------------------- the camera's policy
 
 
-def test_camera_requests_behind_a_connect_in_the_same_bytes_are_heard_in_order() -> None:
+def test_camera_requests_after_a_connect_in_the_same_bytes_are_heard_in_order() -> None:
     made = Machine(HANDBOOK, Role.CAMERA, Transport.TCP)
     requests = [m.Connect(), m.Query(), m.Connect(), m.Trigger()]
     assert feed(made, b"".join(HANDBOOK.encode(one) for one in requests)) == requests
@@ -473,7 +473,7 @@ def test_client_one_open_request_per_id(request_: m.Request, answer: m.Message) 
 @pytest.mark.parametrize("trace", [None, lambda *_: None], ids=["plain", "traced"])
 @pytest.mark.parametrize("together", [True, False])
 def test_client_query_that_is_sent_again_is_answered_twice(*, together: bool, trace: Any) -> None:
-    """One stands in front of a trigger and one behind it; a third one is refused."""
+    """One stands before a trigger and one after it; a third one is refused."""
     made = client(trace=trace)
     for turn in range(1, 4):  # what came before is known by its bytes
         made.send(m.Query(), again=True)
@@ -682,7 +682,7 @@ def test_camera_hears_a_chunk_that_came_before_as_one_that_did_not(
 
 
 def _said(made: Machine, message: m.Message) -> list[bytes] | None:
-    """Return the bytes that saying a message makes, None where it may not be said."""
+    """Return the bytes of a sent message, None if it is forbidden."""
     try:
         made.send(message)
     except LocalProtocolError:
@@ -738,7 +738,7 @@ def test_status_that_was_asked_for_by_its_id_is_its_answer_though_it_came_before
     made.send(request, answered=True)
 
 
-def test_status_that_came_before_is_refused_where_none_may_come() -> None:
+def test_status_that_came_before_is_refused_if_none_may_come() -> None:
     made = client()
     feed(made, STATUS * 2)
     made.send(m.Disconnect())
@@ -769,7 +769,7 @@ ANSWERS = [
     ANSWERS,
     ids=[f"{dialect.label}-{label(answer)}" for dialect, answer in ANSWERS],
 )
-def test_answer_that_came_before_is_told_once_a_request_and_else_counted(
+def test_answer_that_came_before_is_reported_once_a_request_and_else_counted(
     dialect: FramedDialect, answer: m.Message
 ) -> None:
     request = request_for(answer, dialect)
@@ -793,7 +793,7 @@ def test_message_that_another_link_knows_is_refused_where_it_is_above_the_limit(
     assert "announces 8 bytes of payload; 0 to 7 are accepted" in str(failure(made.events()))
 
 
-def test_answer_that_came_before_is_refused_where_none_may_come() -> None:
+def test_answer_that_came_before_is_refused_if_none_may_come() -> None:
     made = client()
     made.send(m.Query())
     assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
@@ -840,7 +840,7 @@ def test_status_that_came_before_is_traced_each_time() -> None:
 
 
 APPLICATION = b"\x15\0\0" + MAGIC[:1]
-"""An id whose first bytes, with the next frame behind them, are read as it."""
+"""An id that the first bytes, with the next frame after them, are read as."""
 
 
 def result(data: bytes, application: int = 21) -> m.ResultContainer:
@@ -869,7 +869,7 @@ def test_result_as_there_was_one_before_waits_for_its_last_byte() -> None:
         assert feed(made, other[cut:] + STATUS) == [result(b"efgh"), STATUS_MESSAGE]
 
 
-def test_result_as_there_was_one_before_is_refused_where_none_may_come() -> None:
+def test_result_as_there_was_one_before_is_refused_if_none_may_come() -> None:
     made, frame = client(), HANDBOOK.encode(result(b"abcd"))
     feed(made, frame, frame)
     made.send(m.Disconnect())
@@ -897,7 +897,7 @@ def test_results_of_many_kinds_are_all_told() -> None:
 
 
 @pytest.mark.parametrize("dialect", [one for one in DIALECTS if one is not NO_ID], ids=label)
-def test_burst_is_of_containers_of_one_application_right_behind_one_another(
+def test_burst_is_of_containers_of_one_application_right_after_one_another(
     dialect: FramedDialect,
 ) -> None:
     said = [*(result(one) for one in (b"a", b"", b"ccc")), STATUS_MESSAGE, result(b"d")]
@@ -991,7 +991,7 @@ def test_containers_without_an_id_come_one_by_one_without_an_application(
 
 @pytest.mark.parametrize("before", [0, 1, 2])
 def test_bid_answer_to_disconnect_may_come_anywhere_and_is_expected(before: int) -> None:
-    """Before the session, while it is made, and behind it; once for each or more often."""
+    """Before the session, while it is made, and after it; once for each or more often."""
     answer = bytes.fromhex("02000200 0000")
     made = machine(Role.CLIENT, dialect=BID)
     steps = (m.Disconnect(), m.Connect(), m.Disconnect())
@@ -1108,7 +1108,7 @@ def test_camera_that_does_not_tell_drops_a_wrong_length() -> None:
 
 
 def asking(transport: Transport = TCP, *, kin: tuple[FramedDialect, ...] = KIN) -> Machine:
-    """Return a client that has said Disconnect and Connect and does not know to whom."""
+    """Return a client that has sent Disconnect and Connect to a camera of unknown dialect."""
     made = Machine(kin[0], Role.CLIENT, transport, kin=kin)
     made.send(m.Disconnect())
     made.send(m.Connect())

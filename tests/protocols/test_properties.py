@@ -174,7 +174,7 @@ def test_any_bytes_in_any_state_give_events_or_a_failed_link(
 
 
 def check_order(made: Machine, events: list[Event]) -> None:
-    """Nothing comes behind an end, and a failure is the client's on TCP alone."""
+    """Nothing comes after an end, and a failure is the client's on TCP alone."""
     ends = [one for one in events if isinstance(one, (LinkFailed, LinkEnded))]
     assert ends == events[len(events) - len(ends) :]
     assert len(ends) <= 1

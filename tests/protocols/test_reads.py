@@ -1,4 +1,4 @@
-"""Bytes that a transport writes where it is told: whatever it reads, it is as if they were fed.
+"""Bytes that a transport writes into a buffer: any read is the same as if they were fed.
 
 Most tests make buffers small: where frames are large, where reads begin and where they end to grow
 then lie within what Hypothesis tries. What is written is read over junk, so whatever still looks

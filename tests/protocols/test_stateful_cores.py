@@ -88,7 +88,7 @@ _Rule = TypeVar("_Rule", bound="Callable[..., None]")
 
 
 def only_with(feature: str) -> Callable[[_Rule], _Rule]:
-    """Let a rule run in histories that have the feature."""
+    """Run a rule in histories that have the feature."""
     return precondition(lambda self: feature in self.features)
 
 
@@ -191,7 +191,7 @@ class Cores(RuleBasedStateMachine):
             self.say(line, message, promptly, answered)
 
     def keeps_frames(self, payload: bytes) -> bool:
-        """Return True if the camera finds the next frame behind this one.
+        """Return True if the camera finds the next frame after this one.
 
         Without a magic number it does not behind one that is too long, and what it takes for
         frames then could be a Connect.
@@ -208,7 +208,7 @@ class Cores(RuleBasedStateMachine):
     @only_with("misuse")
     @rule(which=_WHICH, role=st.sampled_from(Role), message=st.sampled_from(MISFITS + EXAMPLES))
     def misuse(self, which: int, role: Role, message: m.Message) -> None:
-        """Say what does not fit, what the other side says, or what is not for now."""
+        """Send a message that does not fit, is the other side's, or is forbidden now."""
         line = self.line(which)
         machine = line.client if role is Role.CLIENT else line.camera
         end = line.client_end if role is Role.CLIENT else line.camera_end
@@ -255,7 +255,7 @@ class Cores(RuleBasedStateMachine):
     @only_with("surprises")
     @rule(which=_WHICH, what=SURPRISES, promptly=st.booleans())
     def surprise(self, which: int, what: Any, promptly: bool) -> None:
-        """The camera says what nobody asked for, what nobody knows, or more than is documented."""
+        """The camera sends unasked, unknown or too long messages."""
         line = self.line(which)
         line.pipes["down"].put(noise(self.wire, what))
         line.pipes["down"].disturbed = True
@@ -534,7 +534,7 @@ class UdpCores(Cores):
     @only_with("hang up")
     @rule(which=_WHICH)
     def vanish(self, which: int) -> None:
-        """A client is gone without a word, another comes; the camera goes on sending to nobody."""
+        """A client is gone without a message, another comes; the camera sends on to no client."""
         line = self.line(which)
         self.lines[self.lines.index(line)] = self.fresh_line()
 

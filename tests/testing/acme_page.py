@@ -36,7 +36,7 @@ acme: Any = _made
 
 @pytest.fixture(autouse=True)
 def acme_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have its protocol known while a test runs, and its module, where Protocol.emulator looks."""
+    """Register its protocol while a test runs, and its module for Protocol.emulator."""
     monkeypatch.setitem(sys.modules, "acme_camera", _made)
     monkeypatch.setitem(PROTOCOLS._registered, "acme", acme.ACME)
     monkeypatch.setitem(PROTOCOLS._loaded, "acme", acme.ACME)

@@ -20,7 +20,7 @@ SHORT = 0.05
 """Seconds of a timeout that is meant to fire."""
 MESSAGE = b"0123456789"
 OFFSETS = [0, 5, len(MESSAGE)]
-"""Points: before the first byte, in the middle, behind the last."""
+"""Points: before the first byte, in the middle, after the last."""
 PLACES = [0, 5, len(MESSAGE) - 1]
 """Bytes: the first, one in the middle, the last."""
 

@@ -111,7 +111,7 @@ def test_point_in_the_middle_of_a_chunk_stands_between_two_writes(
 
 
 @pytest.mark.parametrize(("rule", "end"), [(Cut(at=4), CUT), (ResetConnection(at=4), RESET)])
-def test_nothing_comes_behind_an_end(rule: PointRule, end: Any) -> None:
+def test_nothing_comes_after_an_end(rule: PointRule, end: Any) -> None:
     assert shown(fed([rule], DATA, DATA)) == [DATA[:4], end]
 
 
@@ -180,7 +180,7 @@ def test_any_rules_and_chunks_give_what_the_plain_way_gives(
     assert written(fed(rules, *chunks)) == plainly(rules, b"".join(chunks))
 
 
-def test_rules_added_later_stand_behind_and_past_places_do_nothing() -> None:
+def test_rules_added_later_come_after_and_past_places_do_nothing() -> None:
     editor = Editor([InsertBytes(at=6, data=b"a")])
     editor.feed(DATA[:4])
     editor.add([InsertBytes(at=6, data=b"b"), DropBytes(at=3, count=4), Flip(at=4)])

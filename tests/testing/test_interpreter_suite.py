@@ -302,7 +302,7 @@ def test_every_check_has_a_mistake() -> None:
     assert own == {check for check, *_ in MISTAKES}
 
 
-def test_sample_without_big_endian_skips_and_says_so() -> None:
+def test_sample_without_big_endian_skips_and_reports_it() -> None:
     with pytest.raises(pytest.skip.Exception, match=r"ContainerSample\(big=\.\.\.\) is missing"):
         suite(good, FOUR).test_big_endian_gives_the_same_value(replace(FOUR, big=None))
 

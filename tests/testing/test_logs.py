@@ -76,7 +76,7 @@ def test_message_that_did_not_come_is_named_with_the_log(emulator: ThreadedCamer
     assert failure(emulator.log.expect, 0x40, timeout=0).startswith("expected message 0x40, at fir")
 
 
-def test_log_that_was_full_is_told_and_is_no_proof(emulator: ThreadedCamera) -> None:
+def test_log_that_was_full_is_reported_and_is_no_proof(emulator: ThreadedCamera) -> None:
     log = emulator.log
     with talk(emulator, CONNECT, QUERY):
         log.expect(m.Query, "QueryAnswer", timeout=PATIENCE)

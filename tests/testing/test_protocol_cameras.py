@@ -181,7 +181,7 @@ def test_every_check_has_a_mistake() -> None:
     assert sorted(MISTAKES) == [name for name in dir(CameraSuite) if name.startswith("test_")]
 
 
-def test_check_that_leaves_a_task_behind_fails() -> None:
+def test_check_that_leaves_a_task_running_fails() -> None:
     left: list[asyncio.Task[None]] = []
 
     @in_a_loop

@@ -48,7 +48,7 @@ def carried(dialect: FramedDialect, message: m.Message) -> m.Message:
 
 
 def framed(dialect: FramedDialect, transport: Transport) -> Conversation:
-    """Return what a client and a camera say in frames: each answered request, and results."""
+    """Return a conversation of client and camera in frames: answered requests, and results."""
 
     def came(*messages: m.Message) -> list[Step]:
         told = [carried(dialect, one) for one in messages if dialect.has(type(one))]
@@ -203,7 +203,7 @@ def test_page_shows_tests_that_pass(pytester: pytest.Pytester) -> None:
     )
 
 
-def test_suite_without_what_it_needs_says_so(pytester: pytest.Pytester) -> None:
+def test_suite_without_what_it_needs_reports_it(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         from smartcam.testing import ProtocolSuite

@@ -57,7 +57,7 @@ NONSENSE = Conversation(
 
 
 def fails(check: str, protocol: Protocol, **arguments: Any) -> str:
-    """Return what a check says against a protocol; it must say something."""
+    """Return a check's failure for a protocol; there must be one."""
     members = {"protocol": protocol, "conversations": (TALK, NONSENSE)}
     suite = type("TestBad", (WireSuite,), members)
     try:
@@ -325,18 +325,18 @@ class Impatient(Machine):
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        asked, self._asked = self._asked, []
+        asked, self._open = self._open, []
         try:
             super().send(message, answered=answered)
         finally:
-            self._asked[:0] = asked
+            self._open[:0] = asked
 
 
 class Credulous(Machine):
     """Knows an answer by its looks."""
 
     def _read(self, line: str) -> None:
-        if line.isdecimal() and not self._asked:
+        if line.isdecimal() and not self._open:
             self._held.pass_on((m.QueryAnswer(application=int(line)),))
         else:
             super()._read(line)
@@ -417,7 +417,7 @@ MISTAKES = [
     ("test_disconnect_before_the_session_is_harmless", Touchy, "not yet"),
     ("test_message_that_it_has_not_is_refused", Obliging, "Reboot() was taken"),
     ("test_second_request_while_the_answer_is_owed_is_refused", Impatient, "Query() was taken"),
-    ("test_answer_that_nobody_asked_for_is_not_told", Credulous, "nobody had asked"),
+    ("test_answer_that_nobody_asked_for_is_not_told", Credulous, "no request was open"),
     ("test_disconnect_is_the_last_word", Restless, "GetStatus() was taken"),
     ("test_disconnect_is_the_last_word", Answering, "it said b'BYE"),
     ("test_machine_says_what_it_is", Kinless, "was not asked for"),

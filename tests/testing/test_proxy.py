@@ -1,4 +1,4 @@
-"""The proxy as a test uses it: addresses, rules, what it tells, and a real client behind it."""
+"""The proxy as a test uses it: addresses, rules, its log, and a real client through it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 CONNECT_ANSWER = 16
-"""Bytes of the answer to Connect in the dialect handbook; the status behind it has 20."""
+"""Bytes of the answer to Connect in the dialect handbook; the status after it has 20."""
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ async def test_rule_of_the_other_transport_is_refused_from_now() -> None:
             proxy.from_now(Lose())
 
 
-async def test_port_is_free_again_behind_it() -> None:
+async def test_port_is_free_again_after_it() -> None:
     async with target() as camera:
         async with LinkProxy(HOST, camera.port) as proxy:
             pass

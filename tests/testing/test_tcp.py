@@ -51,7 +51,7 @@ from tests.testing.proxykit import (
 )
 
 BEHIND = b"abc"
-"""Bytes that the camera sends behind the message."""
+"""Bytes that the camera sends after the message."""
 
 
 class Write(NamedTuple):
@@ -261,7 +261,7 @@ def bare_target() -> Iterator[socket.socket]:
 
 @pytest.mark.parametrize("at", OFFSETS)
 @pytest.mark.parametrize(("rule", "end"), [(Cut, "FIN"), (ResetConnection, "RST")])
-async def test_end_behind_exactly_so_many_bytes_is_the_one_asked_for(
+async def test_end_after_exactly_so_many_bytes_is_the_one_asked_for(
     rule: type[Cut | ResetConnection], end: str, at: int
 ) -> None:
     loop = asyncio.get_running_loop()
@@ -307,7 +307,7 @@ async def test_cut_connection_is_let_go_where_both_answer_with_a_reset() -> None
         await until(lambda: proxy.open_connections == 0)
 
 
-async def test_cut_connection_is_let_go_where_nobody_answers(
+async def test_cut_connection_is_let_go_if_nobody_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tcp, "LINGER", SHORT)

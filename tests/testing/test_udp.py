@@ -31,7 +31,7 @@ class Linked(NamedTuple):
 
 @contextlib.asynccontextmanager
 async def linked(*rules: Rule, echo: bool = True) -> AsyncIterator[Linked]:
-    """An echo behind a proxy, and a client."""
+    """An echo server, a proxy before it, and a client."""
     async with (
         mailbox(echo=echo) as camera,
         LinkProxy(HOST, camera.port, transport="udp", rules=rules) as proxy,
@@ -95,7 +95,7 @@ async def test_repeated_datagram_comes_again_at_once(number: int) -> None:
 @pytest.mark.parametrize(
     ("number", "order"), [(1, b"23145"), (3, b"12453"), (4, b"12354"), (5, b"12345")]
 )
-async def test_reordered_datagram_comes_behind_two_others_or_at_its_time(
+async def test_reordered_datagram_comes_after_two_others_or_at_its_time(
     number: int, order: bytes
 ) -> None:
     async with linked(Reorder(number=number, behind=2, seconds=SHORT)) as (_, client, _):

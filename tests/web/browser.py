@@ -55,7 +55,7 @@ hidden => {
   document.dispatchEvent(new Event("visibilitychange"));
 }
 """
-"""Tells a page that nobody looks at it, or that somebody does."""
+"""Tells a page whether it is visible."""
 
 
 async def pass_gate(page: Page) -> None:

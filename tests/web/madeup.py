@@ -1,4 +1,4 @@
-"""A fleet that is made up: as many cameras as wanted, which cost nothing and do as told."""
+"""A simulated fleet: any number of cheap cameras, which a test controls."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class MadeUpCamera:
         return stream
 
     def read_as(self, spec: Any) -> None:
-        """Have results that are read like this; none is read by this camera itself."""
+        """Set the interpretation of results; this camera itself interprets none."""
         self._default = Interpretation(spec, lenient=False, y_down=False)
 
     def send(self, value: Any, *, raw: bytes = b"", at: datetime | None = None) -> None:
-        """Have a result come."""
+        """Deliver a result."""
         self.sent += 1
         at = at or datetime.now(UTC)
         result = Result(self.name, 7, None, self.sent, None, at, None, raw, value)
@@ -63,23 +63,23 @@ class MadeUpCamera:
             stream.offer(result, 0.0, len(raw))
 
     def fail(self, error: Any) -> None:
-        """Have something come that cannot be read."""
+        """Deliver a container that cannot be read."""
         for stream in self._results:
             stream.offer(error, 0.0)
 
     def miss(self, count: int) -> None:
-        """Have some results that cannot come any more."""
+        """Report some results as lost."""
         for stream in self._results:
             stream.miss(count)
         self.say(self.status)
 
     def say(self, status: Status) -> None:
-        """Tell this status."""
+        """Report this status."""
         before, self.status = self.status, status
         self._tell(StatusChanged(camera=self.name, at=AT, status=status, previous=before))
 
     def lose(self, reason: str) -> None:
-        """Have no session any more."""
+        """End the session."""
         self.connected, self.trouble = False, LinkError(reason)
         self._tell(Disconnected(camera=self.name, at=AT, reason=reason, expected=False))
 
@@ -118,20 +118,20 @@ class MadeUpFleet:
         return self.made[name]
 
     def join(self, name: str, agent: str) -> MadeUpCamera:
-        """Have a camera, a new one or one that was gone."""
+        """Add a camera, a new one or one that was gone."""
         camera = self.made.setdefault(name, MadeUpCamera(name))
         self.agent[name] = agent
         self._tell(CameraJoined("plant", AT, agent, name))
         return camera
 
     def lose(self, agent: str) -> None:
-        """Have an agent no more."""
+        """Remove an agent."""
         for name in [name for name, one in self.agent.items() if one == agent]:
             self.leave(name)
         self._tell(AgentLeft("plant", AT, agent))
 
     def leave(self, name: str) -> None:
-        """Have a camera no more."""
+        """Remove a camera."""
         self._tell(CameraLeft("plant", AT, self.agent.pop(name), name))
 
     def _tell(self, event: FleetEvent) -> None:

@@ -92,7 +92,7 @@ class Listener:
                 return told.data
 
     async def end(self) -> bytes:
-        """Return what comes until the stream ends."""
+        """Return everything received until the stream ends."""
         async with asyncio.timeout(60):
             return await self.response.content.read()
 

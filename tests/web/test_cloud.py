@@ -35,7 +35,7 @@ class Looker:
         self.socket = socket
 
     async def cloud(self) -> tuple[dict[str, Any], Any, Any]:
-        """Return what is said of the next cloud, its points and colours."""
+        """Return the description of the next cloud, its points and colours."""
         async with asyncio.timeout(2 * SLOW):
             about = json.loads(await self.socket.receive_str())
             body = b""
@@ -127,7 +127,7 @@ async def test_cloud_is_packed_once_and_in_a_thread(monkeypatch: pytest.MonkeyPa
     assert not any(one.name.startswith("smartcam.web.cloud") for one in threading.enumerate())
 
 
-async def test_cloud_that_cannot_be_packed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cloud_that_cannot_be_packed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(cloud: Cloud, most: int) -> Any:
         raise MemoryError("no room for it")
 

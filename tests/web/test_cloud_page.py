@@ -74,7 +74,7 @@ async def opened(
 
 
 async def picture(page: Page) -> NDArray[np.uint8]:
-    """Return what is to be seen of the canvas, (H, W, 3)."""
+    """Return the picture on the canvas, (H, W, 3)."""
     await page.evaluate(DRAWN)
     shot = await page.locator("#canvas").screenshot()
     pixels: NDArray[np.uint8] = imagecodecs.png_decode(io.BytesIO(shot).getvalue())[..., :3]

@@ -206,7 +206,7 @@ async def test_source_that_gives_nothing_says_why() -> None:
             assert answer.value["came"] == ("scripted has ended" if error is None else str(error))
 
 
-async def test_broken_frame_is_told_and_the_next_is_shown() -> None:
+async def test_broken_frame_is_reported_and_the_next_is_shown() -> None:
     async with world() as all_of:
         asking = asyncio.create_task(all_of.refused("/api/look", range=BLACK))
         await all_of.driver.streams()
@@ -227,7 +227,7 @@ async def test_broken_frame_is_told_and_the_next_is_shown() -> None:
         ("/api/around", {"sequence": 1, "x": 1.5, "y": 0}, "valid integer"),
     ],
 )
-async def test_wrong_call_is_told(path: str, body: dict[str, Any], text: str) -> None:
+async def test_wrong_call_is_reported(path: str, body: dict[str, Any], text: str) -> None:
     async with world() as all_of:
         answer = await all_of.refused(path, **body)
         assert answer.status == 422
@@ -259,7 +259,7 @@ async def test_threads_end_with_the_site() -> None:
         assert (await all_of.get(coloured(2))).about["sequence"] == 2
 
 
-def test_quality_that_is_none_is_told() -> None:
+def test_quality_that_is_none_is_reported() -> None:
     _, source = scripted()
     with pytest.raises(ConfigurationError, match="quality: expected 1 to 100, got 0"):
         ColourSite(source, quality=0)

@@ -88,7 +88,7 @@ async def said(page: Page) -> ColourRange:
 
 
 async def white(page: Page) -> np.ndarray[Any, Any]:
-    """Return which pixels of the mask on the page are white; frames of regions are not."""
+    """Return the white pixels of the mask on the page, without frames of regions."""
     data = await page.eval_on_selector(
         "#mask", "c => Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data)"
     )
@@ -140,7 +140,7 @@ async def test_click_in_the_picture_takes_the_colour_there(page: Page) -> None:
         await see(page, "#part", "87.5 %")
 
 
-async def test_range_is_tried_on_the_picture_where_no_other_comes(page: Page) -> None:
+async def test_range_is_tried_on_the_picture_if_no_other_comes(page: Page) -> None:
     async with shown(page, colours=ColourRange(value=(0, 60))) as (camera, _):
         await see(page, LIVE)
         await see(page, "#part", "12.5 %")

@@ -1,4 +1,4 @@
-"""The connections of a site: bounded in number, time and bytes, whoever opens them."""
+"""The connections of a site: bounded in number, time and bytes, for every client."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def places_of(world: World) -> Places[Visitor]:
 
 
 async def ended(raw: Raw) -> bytes:
-    """Return what comes until the site closes the connection."""
+    """Return everything received until the site closes the connection."""
     async with asyncio.timeout(60):
         try:
             return await raw.reader.read()
@@ -116,7 +116,7 @@ async def test_streams_and_calls_that_wait_leave_places_free() -> None:
         assert world.site._waiting == 0
 
 
-async def test_where_every_place_is_taken_the_newcomer_is_told(
+async def test_where_every_place_is_taken_the_newcomer_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 1)

@@ -99,7 +99,7 @@ async def test_without_control_a_camera_is_not_commanded(call: str) -> None:
         assert world.fleet["line1/cam1"].statistics().received == 0
 
 
-async def test_refusal_of_the_camera_is_told() -> None:
+async def test_refusal_of_the_camera_is_reported() -> None:
     async with served(smartcam.fleet.open(CELL), control=True) as world:
         answer = await world.post("/switch", {"application": 999})
         assert answer.status == 409

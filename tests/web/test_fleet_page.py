@@ -293,7 +293,7 @@ async def test_key_opens_a_camera_and_back_finds_the_table_as_it_was(page: Page)
         assert page.url.endswith("/?filter=connected")
 
 
-async def test_without_control_there_is_no_trigger_and_an_unknown_camera_is_told(
+async def test_without_control_there_is_no_trigger_and_an_unknown_camera_is_reported(
     page: Page,
 ) -> None:
     async with smartcam.fleet.open(CELL) as fleet, opened(page, fleet) as site:
@@ -355,7 +355,7 @@ async def test_page_begins_with_the_units_of_its_command(page: Page) -> None:
         await see(page, "#units", "um")
 
 
-async def test_server_that_ends_and_comes_back_is_told(page: Page) -> None:
+async def test_server_that_ends_and_comes_back_is_reported(page: Page) -> None:
     fleet = MadeUpFleet(names(20))
     async with opened(page, fleet.as_fleet, port=free_port()) as site:
         await site.stop()

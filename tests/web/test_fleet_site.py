@@ -1,4 +1,4 @@
-"""The fleet's page at its WebSocket and its calls: what is told, to whom, and how much of it."""
+"""The fleet's page at its WebSocket and its calls: the messages, their readers, their bounds."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ MOST = 64_000
 
 
 class Looker:
-    """A browser's page, as far as it is told things."""
+    """A browser's page, as far as it receives messages."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
@@ -85,7 +85,7 @@ class Looker:
         return text
 
     async def until(self, condition: Any) -> str:
-        """Hear until something is true."""
+        """Receive until a condition is true."""
         while True:
             text = await self.hear()
             if condition():
@@ -110,7 +110,7 @@ class World(NamedTuple):
 
     @contextlib.asynccontextmanager
     async def looking(self, **sight: Any) -> AsyncIterator[Looker]:
-        """Look as the page does; who looks has heard what there is."""
+        """Connect as the page does; the viewer has received the first messages."""
         url = self.caller.url("/api/table")
         async with self.caller.session.ws_connect(url, protocols=[PROTOCOL]) as socket:
             looker = Looker(socket)
@@ -392,7 +392,7 @@ async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> 
         assert (told["totals"]["failures"], told["bars"]) == (8, [list(b) for b in view.series])
 
 
-async def test_parts_are_told_as_they_lie_and_long_results_by_their_length() -> None:
+async def test_parts_are_reported_as_they_lie_and_long_results_by_their_length() -> None:
     async with served(2) as world, world.looking() as looker:
         header = Header(1, AT, "line01/cam000")
         pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(1.5))

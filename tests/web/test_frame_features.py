@@ -82,7 +82,7 @@ async def test_a_trigger_answers_its_picture() -> None:
         ("command", {"name": "Width"}, 422, "it is no command"),
     ],
 )
-async def test_what_cannot_be_done_is_said(
+async def test_what_cannot_be_done_is_reported(
     path: str, body: dict[str, Any], status: int, text: str
 ) -> None:
     async with site() as (_, _, caller, _):
@@ -105,7 +105,7 @@ async def test_nothing_is_changed_unless_it_was_allowed() -> None:
         assert there.words == before
 
 
-async def test_a_source_without_features_says_so() -> None:
+async def test_a_source_without_features_reports_it() -> None:
     async with (
         smartcam.frames.open("synthetic://") as source,
         FramesSite([source], changes=True) as made,

@@ -1,4 +1,4 @@
-"""The site of pictures: who looks gets the newest frame, who is slow skips, nobody is no reader."""
+"""The site of pictures: viewers get the newest frame, slow ones skip, without viewers no reader."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Looker:
             return told
 
     async def picture(self) -> Shown:
-        """Return the next picture; it is not said that it was shown."""
+        """Return the next picture, without a report that it was shown."""
         async with asyncio.timeout(60):
             data = await self.socket.receive_bytes()
         end = 4 + int.from_bytes(data[:4], "little")
@@ -192,7 +192,7 @@ async def test_looker_that_says_something_else_is_disconnected(word: str) -> Non
         await all_of.driver.rests()
 
 
-async def test_looker_is_told_the_account_where_no_frame_comes() -> None:
+async def test_looker_is_told_the_account_if_no_frame_comes() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
         await all_of.driver.streams()
@@ -236,7 +236,7 @@ async def test_source_that_is_not_open_is_awaited_with_the_reason() -> None:
                 pass
 
 
-async def test_frame_that_is_broken_is_told_and_the_next_is_shown() -> None:
+async def test_frame_that_is_broken_is_reported_and_the_next_is_shown() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
         await all_of.driver.streams()
@@ -337,7 +337,7 @@ async def test_websocket_of_another_site_is_refused() -> None:
         ("/api/sources/x/picture", 404, "0 to 0"),
     ],
 )
-async def test_wrong_call_is_told(path: str, status: int, text: str) -> None:
+async def test_wrong_call_is_reported(path: str, status: int, text: str) -> None:
     async with world() as all_of:
         answer = await all_of.caller.call("GET", path)
     assert answer.status == status
@@ -384,7 +384,7 @@ async def test_picture_is_the_newest_frame() -> None:
         await all_of.driver.rests()
 
 
-async def test_picture_of_a_source_without_frames_says_so() -> None:
+async def test_picture_of_a_source_without_frames_reports_it() -> None:
     async with world() as all_of:
         answer = await all_of.caller.call("GET", "/api/sources/0/picture")
         assert answer.status == 409

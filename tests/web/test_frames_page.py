@@ -295,7 +295,7 @@ async def test_phone_has_four_pictures_at_once_that_stay_live(
 
 
 async def numbers_of(page: Page) -> list[Locator]:
-    """Return where the frames' numbers stand, which a phone does not show."""
+    """Return the place of the frames' numbers, which a phone does not show."""
     return await page.locator("[data-count=number]").all()
 
 

@@ -162,7 +162,7 @@ async def test_site_on_all_addresses_is_reached_by_any_with_the_token() -> None:
         ("2130706433", False),
     ],
 )
-def test_loopback_is_told_by_address_or_its_one_name(host: str, loopback: bool) -> None:
+def test_loopback_is_recognized_by_address_or_its_one_name(host: str, loopback: bool) -> None:
     assert is_loopback(host) is loopback
 
 
@@ -231,7 +231,7 @@ async def test_unknown_host_is_a_configuration_error() -> None:
         await EmulatorSite({}, host="no host").start()
 
 
-def test_missing_aiohttp_is_told_in_one_line() -> None:
+def test_missing_aiohttp_is_reported_in_one_line() -> None:
     code = (
         "import sys; sys.modules['aiohttp'] = None\n"
         "import smartcam.web\n"

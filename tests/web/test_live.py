@@ -178,7 +178,7 @@ async def test_site_is_guarded(emulator: EmulatedCamera) -> None:
         assert world.camera.statistics().received == 0
 
 
-async def test_token_is_needed_where_there_is_one(emulator: EmulatedCamera) -> None:
+async def test_token_is_needed_if_there_is_one(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url, token=TOKEN) as world:
         await world.caller.get("/api/camera")
         for path in ("camera", "results", "picture", "events"):
@@ -190,7 +190,7 @@ async def test_token_is_needed_where_there_is_one(emulator: EmulatedCamera) -> N
 # ---------------------------------------------------------------------- what is told
 
 
-async def test_result_is_told_and_the_account_adds_up(emulator: EmulatedCamera) -> None:
+async def test_result_is_reported_and_the_account_adds_up(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url, interpret_as=CHECK) as world, world.events() as events:
         first = await events.next("camera")
         assert (first.data["connection"], first.data["control"]) == ("connected", False)
@@ -206,7 +206,7 @@ async def test_result_is_told_and_the_account_adds_up(emulator: EmulatedCamera) 
     assert set(later) == {"at", "rate", "latency"}
 
 
-async def test_rate_is_told_over_time(emulator: EmulatedCamera) -> None:
+async def test_rate_is_reported_over_time(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url, application=6) as world, world.events() as events:
         told = await events.until(
             "clock", lambda clock: clock["series"] and clock["series"][-1]["rate"] > 10
@@ -214,7 +214,7 @@ async def test_rate_is_told_over_time(emulator: EmulatedCamera) -> None:
         assert told["series"][-1]["latency"] is None
 
 
-async def test_container_that_cannot_be_read_is_told(emulator: EmulatedCamera) -> None:
+async def test_container_that_cannot_be_read_is_reported(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url, interpret_as="text: string[50]") as world:
         with pytest.raises(smartcam.InterpretationError):
             await world.camera.trigger()
@@ -254,7 +254,7 @@ def test_long_values_are_cut() -> None:
     assert told["size"] == 1000
 
 
-def test_parts_are_told_in_the_plane_and_bounded() -> None:
+def test_parts_are_reported_in_the_plane_and_bounded() -> None:
     header = smartcam.Header(1, datetime.now(UTC), "table")
     pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(0.5))
     found = [Localization("bolt", 0.9, 0, pose)] * (MAX_PARTS + 1)
@@ -281,7 +281,7 @@ def test_parts_are_told_in_the_plane_and_bounded() -> None:
         ("ok_or_defect", None),
     ],
 )
-def test_what_is_good_is_told_by_the_name(name: str, good: bool | None) -> None:
+def test_what_is_good_is_judged_by_the_name(name: str, good: bool | None) -> None:
     assert meaning(name) is good
 
 
@@ -298,7 +298,7 @@ def test_verdict_of_records_counts() -> None:
 # ---------------------------------------------------------------------- connection
 
 
-async def test_lost_camera_is_told_and_found_again(emulator: EmulatedCamera) -> None:
+async def test_lost_camera_is_reported_and_found_again(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url, interpret_as=CHECK) as world, world.events() as events:
         await world.camera.trigger()
         await emulator.stop()
@@ -377,7 +377,7 @@ async def test_picture_is_fetched_when_somebody_looks() -> None:
     assert data.startswith(b"BM")
 
 
-async def test_picture_that_cannot_be_had_is_told() -> None:
+async def test_picture_that_cannot_be_had_is_reported() -> None:
     async with (
         EmulatedInSight(online=True) as emulator,
         shown(emulator.url) as world,

@@ -1,4 +1,4 @@
-"""Frames of a fleet's camera on its live page, where it has some and while somebody looks."""
+"""Frames of a fleet's camera on its live page, if it has some and while there are viewers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class World(NamedTuple):
 
     @contextlib.asynccontextmanager
     async def looking(self, **options: Any) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-        """Look as the page does; what is told first was heard."""
+        """Connect as the page does; the first message was received."""
         url = self.caller.url("/api/frames")
         options = {"protocols": [PROTOCOL], **options}
         async with asyncio.timeout(60), self.caller.session.ws_connect(url, **options) as socket:
@@ -60,7 +60,7 @@ async def shown(plant: Plant, *, token: str | None = None) -> AsyncIterator[Worl
 
 
 async def next_picture(socket: aiohttp.ClientWebSocketResponse) -> tuple[dict[str, Any], Any]:
-    """Return what is said of the next picture, and its pixels."""
+    """Return the description of the next picture, and its pixels."""
     while True:
         message = await socket.receive()
         if message.type is aiohttp.WSMsgType.BINARY:
@@ -128,7 +128,7 @@ async def test_device_that_is_not_there_says_why_and_comes() -> None:
                 assert (await next_picture(socket))[0]["sequence"] == 5
 
 
-async def test_agent_that_goes_and_comes_is_said() -> None:
+async def test_agent_that_goes_and_comes_is_reported() -> None:
     async with FramePlant() as plant, shown(plant) as world:
         await world.seen()
         async with world.looking() as socket:

@@ -113,7 +113,7 @@ async def _check_scale(
     assert moved == pytest.approx([(a.x - b.x) * pixels, (a.y - b.y) * pixels], abs=3)
 
 
-async def test_pass_and_fail_are_told_in_words(page: Page) -> None:
+async def test_pass_and_fail_are_reported_in_words(page: Page) -> None:
     async with (
         EmulatedCamera([CHECKED], running=True) as emulator,
         opened(page, emulator.url, interpret_as=CHECK),
@@ -147,7 +147,7 @@ async def test_failure_shows_the_picture_that_the_camera_had_then(page: Page) ->
         await page.wait_for_function("document.querySelector('#failure').naturalWidth > 0")
 
 
-async def test_lost_camera_and_lost_server_are_said(page: Page) -> None:
+async def test_lost_camera_and_lost_server_are_reported(page: Page) -> None:
     async with (
         EmulatedCamera(active=21, running=True, port=free_port()) as emulator,
         opened(page, emulator.url, port=free_port()) as site,
@@ -170,7 +170,7 @@ async def test_lost_camera_and_lost_server_are_said(page: Page) -> None:
             await see(page, LIVE)
 
 
-async def test_camera_that_is_taken_is_said(page: Page) -> None:
+async def test_camera_that_is_taken_is_reported(page: Page) -> None:
     async with (
         EmulatedCamera() as emulator,
         opened(page, emulator.url),

@@ -334,7 +334,7 @@ async def test_it_stops_while_somebody_asks_and_starts_again() -> None:
         assert await ask(site, "/healthz") == (200, "ok\n")
 
 
-async def test_what_cannot_be_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_cannot_be_is_reported_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = FleetServer(file({"one": "bvs://h"}, listen=None), bus=MemoryBus().end())
     with pytest.raises(ConfigurationError, match="nowhere to listen"):
         OperationsSite(nowhere)

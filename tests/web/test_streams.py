@@ -1,4 +1,4 @@
-"""Event streams: what they tell, and that nobody waits for them."""
+"""Event streams: their events, and that nothing waits for them."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def log_news(watcher: Watcher) -> list[News]:
 
 
 async def filled(emulator: EmulatedCamera, count: int) -> None:
-    """Have so many messages in the log."""
+    """Put so many messages into the log."""
     for number in range(count):
         emulator.device.set_endian(number % 2)
 

@@ -143,7 +143,7 @@ async def test_answer_made_again_changes_nothing(tmp_path: Path) -> None:
         assert first["step"] == "picture"
 
 
-async def test_failing_camera_keeps_the_step_and_is_told(tmp_path: Path) -> None:
+async def test_failing_camera_keeps_the_step_and_is_reported(tmp_path: Path) -> None:
     async with served(tmp_path) as world:
         view = await world.post("/start", name="table")
         view = await world.post("/step", token=view["token"], answers=ABOUT)

@@ -302,7 +302,7 @@ async def test_page_fits_its_width(page: Page, tmp_path: Path, width: int) -> No
 
 
 async def in_sight(page: Page) -> None:
-    """See that what goes on stands where nobody must scroll, and nothing beside the screen."""
+    """Check that the present step needs no scrolling, and nothing is beside the screen."""
     box = await page.locator("button.primary:visible").bounding_box()
     size = page.viewport_size
     assert box is not None

@@ -1,11 +1,11 @@
-"""Is this a BVS camera, and how does it do what the documents leave open?
+"""Judge whether a camera is a BVS camera, and observe behaviour without a document.
 
 On the command line, with the camera's address::
 
     pytest --pyargs smartcam.conformance.camera --camera-url bvs://192.168.0.10
 
-In a test file, :class:`CameraConformance` is subclassed. In a program, :func:`judge` does the same
-without pytest. Names are resolved when they are first used: importing this is light.
+In a test file, subclass :class:`CameraConformance`. In a program, :func:`judge` does the same
+without pytest. Importing this is light, since names are resolved when they are first used.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """List all checks and questions, in the order in which a camera is tested.
 
-Those that change least come first; those that may leave a camera confused (bytes that are no frame,
-a restart) come last. Each module has its own in this order.
+Items that change least come first; items that may leave a camera confused (bytes that are no frame,
+a restart) come last. Each module lists its own in this order.
 """
 
 from __future__ import annotations

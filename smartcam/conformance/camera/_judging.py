@@ -1,4 +1,4 @@
-"""Putting a camera through the checks and questions, one after the other."""
+"""Run the checks and questions on a camera, one after the other."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 CONNECT_CHECK = "connect-is-answered"
-"""The check that fails where there is no camera at all; the others are not observed then."""
+"""The check that fails if there is no camera at all; the others are not observed then."""
 
 
 def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> CameraReport:
-    """Put a camera through all checks and questions, or some, and return the report.
+    """Run all checks and questions, or some, on a camera, and return the report.
 
     It blocks, for a minute or two with the default times: do not call it in an event loop's thread.
-    The camera is taken from whoever has it. Application and run state are put back, also where an
-    exception, such as Ctrl-C, ends it.
+    The camera is taken from any other client. Application and run state are restored, also if an
+    exception, such as Ctrl-C, ends the call.
 
     Args:
         options: options of the examination.
@@ -57,9 +57,9 @@ def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> Ca
 
 
 def judge_item(camera: CameraUnderTest, item: Item) -> CameraFinding:
-    """Do one check or ask one question; what it changed is put back afterwards.
+    """Run one check or question; its changes are undone afterwards.
 
-    It takes as long as the options's times allow, and ends by itself in any case.
+    It takes as long as the options' times allow, and ends by itself in any case.
     """
     camera.forget_trail()
     began = time.monotonic()
@@ -108,7 +108,7 @@ def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
 
 
 def _unfit(camera: CameraUnderTest, item: Item) -> str:
-    """Return the reason why a check makes no sense here, "" if it does."""
+    """Return the reason why a check does not apply here, "" if it applies."""
     try:
         dialect = camera.dialect
     except Differs as exc:

@@ -1,4 +1,4 @@
-"""Checks: messages that a camera is to ignore, and what it may say at all."""
+"""Checks: messages that a camera has to ignore, and messages that it may send."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ _BODIES = {
 
 
 def wrong_magic(camera: CameraUnderTest) -> bytes:
-    """Return a Query whose magic number has every bit turned over."""
+    """Return a Query with every bit of its magic number inverted."""
     frame = camera.wire.request(m.Query())
     size = len(camera.wire.magic)
     return bytes(byte ^ 0xFF for byte in frame[:size]) + frame[size:]
 
 
 def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
-    """See that the camera says nothing to these bytes and answers a Query behind them once."""
+    """Check that the camera ignores these bytes and answers a Query after them once."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        came = [one for one in client.heard[mark:] if one.message_id != MessageId.STATUS]
+        came = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
         results = of_kind(came, MessageId.RESULT_CONTAINER)
         if len(came) - len(results) != 1:
-            raise Differs(f"no answer to {what}, one to the Query behind it", client.words(mark))
+            raise Differs(f"no answer to {what}, one to the Query after it", client.words(mark))
 
 
 @check(_IGNORED, dialects=SMART)

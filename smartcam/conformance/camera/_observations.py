@@ -1,6 +1,6 @@
-"""Observe once what several checks look at: inspections, switches, a reboot.
+"""Observe events that several checks need: inspections, switches, a reboot.
 
-Each is made at most once for a camera, so that a part on the machine is not inspected twenty times.
+Each observation is made at most once for a camera, so that a part is not inspected twenty times.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INSPECTIONS = 3
-"""Inspections that are looked at: an order that changes shows."""
+"""Number of inspections that are observed, so that a changing order shows."""
 
 REBOOT_POLL_INTERVAL = 0.25
-"""Seconds after which a camera that restarts gets the next Connect at the latest."""
+"""Largest number of seconds between two Connects to a camera that restarts."""
 
 
 def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:
-    """Make an observation at most once for a camera; what it raised is raised again."""
+    """Make an observation at most once for a camera; an exception is raised again each time."""
 
     @functools.wraps(observe)
     def observed(camera: CameraUnderTest) -> T:
@@ -42,11 +42,11 @@ def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest]
 
 
 class ObservedRun(NamedTuple):
-    """One trigger and what came of it."""
+    """One trigger and its outcome."""
 
     sent_at: float  # time of sending
-    came: list[Heard]  # the frames from then on until the camera waited for the next one
-    under_way: int | None  # status word that was asked for right behind the trigger; ``bid`` only
+    came: list[Heard]  # frames until the camera waited for the next trigger
+    under_way: int | None  # status word, asked for right after the trigger; ``bid`` only
     word: int  # size of a number, bytes
     waiting: int  # mask of Waiting for Trigger
 
@@ -56,7 +56,7 @@ class ObservedRun(NamedTuple):
         return of_kind(self.came, MessageId.RESULT_CONTAINER)
 
     def places(self) -> tuple[int | None, int | None, int | None]:
-        """Return the places where Waiting fell, the first result came, and Waiting rose again."""
+        """Return the places where Waiting ended, the first result came, and Waiting began again."""
         fell = result = rose = None
         for place, heard in enumerate(self.came):
             if heard.message_id == MessageId.RESULT_CONTAINER and result is None:
@@ -91,11 +91,11 @@ def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
 
 
 def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
-    mark, under_way = len(client.heard), None
+    mark, under_way = len(client.received), None
     waiting, word = camera.wire.bits.waiting, camera.wire.word
-    sent_at = client.say(m.Trigger())
+    sent_at = client.send(m.Trigger())
     if camera.wire.is_bid:
-        client.say(m.GetStatus())
+        client.send(m.GetStatus())
         answer = client.until(
             MessageId.STATUS, camera.options.timeout, "an answer to Get status", mark=mark
         )
@@ -106,43 +106,43 @@ def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
             camera.options.timeout,
             "a status with Waiting for Trigger",
         )
-        return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+        return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
     deadline = sent_at + camera.options.timeout
     while (left := deadline - time.monotonic()) > 0:
-        so_far = ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+        so_far = ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
         if None not in so_far.places():
             break
-        inspected = so_far.places()[2] is not None  # without a result so far: one may still come
+        inspected = so_far.places()[2] is not None  # a result may still come
         if client.next(min(left, camera.options.quiet) if inspected else left) is None:
             break
-    return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+    return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
 
 
 def _wait_result(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
     """Wait for a result as long as one may take."""
     deadline = time.monotonic() + camera.options.timeout
     while (left := deadline - time.monotonic()) > 0:
-        if of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER):
+        if of_kind(client.received[mark:], MessageId.RESULT_CONTAINER):
             return
         client.next(left)
 
 
 @_once
 def unasked(camera: CameraUnderTest) -> ObservedRun:
-    """Trigger once and ask for nothing: statuses in it came by themselves.
+    """Trigger once without asking for anything, so that all statuses are unasked.
 
-    For ``bid``, where :func:`inspections` asks. Raises as they do; NotObserved where no result
+    For ``bid``, for which :func:`inspections` asks. Raises the same; NotObserved if no result
     comes.
     """
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        sent_at = client.say(m.Trigger())
+        mark = len(client.received)
+        sent_at = client.send(m.Trigger())
         _wait_result(camera, client, mark)
         client.listen(camera.patience)
         seen = ObservedRun(
-            sent_at, client.heard[mark:], None, camera.wire.word, camera.wire.bits.waiting
+            sent_at, client.received[mark:], None, camera.wire.word, camera.wire.bits.waiting
         )
         if not seen.results:
             raise NotObserved(f"no result came of a trigger: {client.words(mark)}")
@@ -164,13 +164,13 @@ def inspection_time(camera: CameraUnderTest) -> float:
 
 
 def no_id(camera: CameraUnderTest) -> bool:
-    """Return True if result containers lack the application's id in front, as in some ``b16``.
+    """Return True if result containers do not begin with the application's id, as in some ``b16``.
 
     Raises:
         NotObserved: as :func:`inspection_time`.
         Undescribed: some containers begin with the id and others do not.
     """
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     if camera.dialect != "b16":
         return False
     first = [
@@ -185,11 +185,11 @@ def no_id(camera: CameraUnderTest) -> bool:
     return found
 
 
-# ---------------------------------------------------------------------- too many, or none wanted
+# ---------------------------------------------------------------------- triggers too many
 
 
 class DoubleTrigger(NamedTuple):
-    """Two triggers at once and what came of them."""
+    """Two triggers at once and their outcome."""
 
     results: int  # number of results that came
     rose_at: float | None  # time of the status with Overtriggered; None without one
@@ -198,24 +198,24 @@ class DoubleTrigger(NamedTuple):
 
 
 def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
-    """Trigger twice at once and watch Overtriggered rise and fall; raises as :func:`inspections`.
+    """Trigger twice at once and watch Overtriggered; raises as :func:`inspections`.
 
-    For cameras whose statuses come by themselves.
+    For cameras that send their status unasked.
     """
     takes = inspection_time(camera)
     bits, rose_at, fell_at = camera.wire.bits, None, None
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger(), m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger(), m.Trigger())
         client.fence()
         deadline, place = time.monotonic() + 2 * takes + camera.options.quiet, mark
         while fell_at is None:
-            if place == len(client.heard):
+            if place == len(client.received):
                 left = deadline - time.monotonic()
                 if left <= 0 or client.next(left) is None:
                     break
-            heard, place = client.heard[place], place + 1
+            heard, place = client.received[place], place + 1
             if heard.message_id != MessageId.STATUS:
                 continue
             if not camera.wire.numbers(heard.body)[0] & bits.overtriggered:
@@ -224,12 +224,12 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
                 rose_at = heard.at
                 deadline = rose_at + camera.options.timeout
         client.listen(takes)
-        results = len(of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER))
+        results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
         return DoubleTrigger(results, rose_at, fell_at, client.words(mark))
 
 
 class Stopped(NamedTuple):
-    """A trigger to a stopped camera and what came of it."""
+    """A trigger to a stopped camera and its outcome."""
 
     came: list[Heard]
     text: str  # observation in words
@@ -242,8 +242,8 @@ def stopped_trigger(camera: CameraUnderTest) -> Stopped:
     takes = inspection_time(camera)
     with camera.session() as client:
         camera.stop(client)
-        mark = len(client.heard)
-        client.say(m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger())
         came = client.listen(takes + camera.options.quiet)
         return Stopped(came, client.words(mark))
 
@@ -252,9 +252,9 @@ def stopped_trigger(camera: CameraUnderTest) -> Stopped:
 
 
 class Switch(NamedTuple):
-    """A switch and what came of it."""
+    """A switch and its outcome."""
 
-    application: int  # the one that was asked for
+    application: int  # application that was asked for
     came: list[Heard]  # the frames until the answer and the status that is not busy
     answer: Heard
     active: int  # application that Query reported afterwards
@@ -263,7 +263,7 @@ class Switch(NamedTuple):
 
 @_once
 def switch(camera: CameraUnderTest) -> Switch:
-    """Load the other application, of a stopped camera.
+    """Load the other application on a stopped camera.
 
     Raises:
         NotObserved: no application was named, or loading is not allowed.
@@ -279,13 +279,13 @@ def switch(camera: CameraUnderTest) -> Switch:
         if camera.active(client) == other:
             raise NotObserved(f"application {other} is the active one: name another application")
         camera.stop(client)
-        mark, began = len(client.heard), time.monotonic()
+        mark, began = len(client.received), time.monotonic()
         answer = client.answer(
             m.SwitchApplication(application=other), within=camera.options.switch_timeout
         )
         took = answer.at - began
         _wait_not_busy(camera, client, mark)
-        came = client.heard[mark:]
+        came = client.received[mark:]
         camera.measured["switch"] = took
         return Switch(other, came, answer, camera.active(client), took)
 
@@ -293,7 +293,7 @@ def switch(camera: CameraUnderTest) -> Switch:
 def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
     """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
-    words = camera.wire.statuses(client.heard[mark:])
+    words = camera.wire.statuses(client.received[mark:])
     if busy and any(one & busy for one in words) and words[-1] & busy:
         client.until(
             lambda one: (
@@ -308,7 +308,7 @@ class Downtime(NamedTuple):
     """A restart."""
 
     seconds: float  # seconds from the request to the first answered Connect
-    application: int  # the active one afterwards
+    application: int  # active application afterwards
     running: bool  # run mode afterwards
 
 
@@ -322,7 +322,7 @@ def downtime(camera: CameraUnderTest) -> Downtime:
     """
     camera.require(Allow.REBOOT)
     with camera.session() as client:
-        began = client.say(m.Reboot())
+        began = client.send(m.Reboot())
         _wait_gone(camera, client)
     deadline = began + camera.options.reboot_timeout
     while time.monotonic() < deadline:
@@ -342,7 +342,7 @@ def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
     deadline = time.monotonic() + camera.options.timeout
     try:
         while time.monotonic() < deadline:
-            client.say(m.Query())
+            client.send(m.Query())
             if client.next(camera.patience) is None:
                 return
     except EndedError:

@@ -1,4 +1,4 @@
-"""The options of a judgement: the camera, the actions allowed, the times to wait."""
+"""The options of a judgement: the camera, the allowed actions, the times to wait."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_SECONDS = 3600.0
-"""Seconds that may be waited for one thing at most."""
+"""Largest number of seconds of one wait."""
 
 MAX_INPUT_DATA_BYTES = 1 << 16
 """Largest number of bytes of input data: about 64 kB, as a container (HAL 15, published for the
@@ -30,31 +30,31 @@ other direction)."""
 class Allow(enum.Flag):
     """The actions that are allowed on a camera.
 
-    ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless options forbid them: what they change is
-    put back. The others leave something behind.
+    ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless options forbid them, since their changes
+    are undone. The others leave a change.
     """
 
     NOTHING = 0
     RUN = enum.auto()
-    """Start and stop; put back."""
+    """Start and stop; undone afterwards."""
     TRIGGER = enum.auto()
-    """Inspect; what hangs on the camera's outputs sees it."""
+    """Inspect; devices at the camera's outputs react."""
     SWITCH = enum.auto()
     """Load an application; the one from before is loaded again."""
     CLOCK = enum.auto()
-    """Set the clock; put back to the second."""
+    """Set the clock; restored to the second."""
     NUMBER = enum.auto()
-    """Set the number of the next run; it cannot be read, so it cannot be put back."""
+    """Set the number of the next run, which cannot be read, and so not be restored."""
     INPUT = enum.auto()
     """Send input data; the queue is left empty, or out of step until the application is loaded."""
     ERRORS = enum.auto()
-    """Reset error bits that stay set; gone is gone."""
+    """Reset error bits that stay set; they cannot be restored."""
     REBOOT = enum.auto()
     """Restart; the clock is lost and the numbering begins at 0."""
 
     @classmethod
     def read(cls, text: str) -> Allow:
-        """Read a comma list: names add to the three defaults, ``nothing`` removes those.
+        """Read a list with commas: names add to the three defaults, ``nothing`` removes those.
 
         Raises:
             ConfigurationError: a name is unknown.
@@ -84,17 +84,17 @@ class ConformanceOptions:
     """The options of a judgement. Times are seconds.
 
     Attributes:
-        url: the camera's address; a dialect that it does not name is found out.
-        application: id of the one that may be triggered, None for the one that is active.
-        other_application: id of one that may be loaded beside it, None for none.
+        url: the camera's address; a dialect that is not in it is found out.
+        application: id of the application to trigger, None for the active one.
+        other_application: id of another application that may be loaded, None for none.
         allow: actions that are allowed at the camera.
         timeout: longest time for an answer, a status or a result.
         quiet: time without a message for which a silent camera is listened to.
         switch_timeout: longest time for loading an application.
         reboot_timeout: longest time for a restart.
-        sequence_offset: where in the application's results the int32 stands that is the sequence
-            number, counted behind the application's id; None if it is not in them.
-        input_data: bytes that the application takes as input data, None if it takes none.
+        sequence_offset: place of the sequence number, an int32, in the application's results,
+            counted after the application's id; None if they have none.
+        input_data: input data that the application accepts, None for none.
 
     Raises:
         ConfigurationError: a number cannot work.

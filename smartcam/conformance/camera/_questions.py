@@ -1,4 +1,4 @@
-"""Questions: an experiment for each field of Quirks, and for what the documents contradict."""
+"""Questions: an experiment for each field of Quirks, and for each contradiction of documents."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 MAX_CONTAINERS = 1024
-"""Largest number of input containers sent to find how many are queued."""
+"""Largest number of input containers sent to find the length of the queue."""
 
 MAX_LEFT = 64
-"""Triggers at most to use up the input containers that somebody else has left."""
+"""Largest number of triggers that use up input containers of another client."""
 
 _OPEN = {"": "no document, open"}
 
@@ -74,7 +74,7 @@ def no_id(camera: CameraUnderTest) -> bool:
 @question(_OPEN, needs=Allow.TRIGGER)
 def waiting_before_result(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger rises before the result comes."""
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     orders: set[bool] = set()
     for one in [unasked(camera)] if camera.wire.is_bid else inspections(camera):
         _, result, rose = one.places()
@@ -151,11 +151,11 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
     takes = inspection_time(camera)
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger(), m.Stop())
+        mark = len(client.received)
+        client.send(m.Trigger(), m.Stop())
         client.fence()
         client.listen(takes + camera.patience)
-        came = client.heard[mark:]
+        came = client.received[mark:]
         if all(word & camera.wire.bits.running for word in camera.wire.statuses(came)):
             raise Differs("a status without Running after Stop", client.words(mark))
     results = len(of_kind(came, MessageId.RESULT_CONTAINER))
@@ -196,7 +196,7 @@ def switch_answer(camera: CameraUnderTest) -> str:
             was_busy = True
         elif was_busy:
             return "after_status" if answered > place else "before_status"
-    raise NotObserved("no status with BUSY came during the switch, and one without it behind")
+    raise NotObserved("no status with BUSY came during the switch, and one without it after")
 
 
 @question(_OPEN, needs=Allow.RUN | Allow.SWITCH, dialects=SMART)
@@ -206,8 +206,8 @@ def switch_while_running(camera: CameraUnderTest) -> str:
         camera.load(client, camera.application)
         camera.start(client)
         target = camera.options.other_application or camera.application
-        mark = len(client.heard)
-        client.say(m.SwitchApplication(application=target))
+        mark = len(client.received)
+        client.send(m.SwitchApplication(application=target))
         client.fence()
         answered = _switch_answers(client, mark)
         if not answered and not _was_busy(camera, client, mark):
@@ -228,12 +228,13 @@ def switch_while_running(camera: CameraUnderTest) -> str:
 
 def _switch_answers(client: RawClient, mark: int) -> list[int]:
     """Return the codes of the answers to a switch."""
-    answers = of_kind(client.heard[mark:], MessageId.SWITCH_APPLICATION)
+    answers = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
     return [(*client.wire.numbers(one.body), -1)[0] for one in answers]
 
 
 def _was_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> bool:
-    return any(word & camera.wire.bits.busy for word in camera.wire.statuses(client.heard[mark:]))
+    statuses = camera.wire.statuses(client.received[mark:])
+    return any(word & camera.wire.bits.busy for word in statuses)
 
 
 @question(
@@ -245,7 +246,7 @@ def _was_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> bool:
 def big_endian_number(camera: CameraUnderTest) -> bool:
     """The number of Set sequence number is big endian."""
     little = (0x01020304).to_bytes(4, "little")
-    observations.no_id(camera)  # which tells where the number stands
+    observations.no_id(camera)  # raises if the number's place is unknown
     with camera.session() as client:
         camera.ready(client)
         client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
@@ -266,21 +267,21 @@ def input_queue_depth(camera: CameraUnderTest) -> int:
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
     bit = camera.wire.bits.input_container
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
         camera.ready(client)
         _use_up(camera, client, MAX_LEFT)
-        client.say(m.SetInput(data=data))
+        client.send(m.SetInput(data=data))
         _inspect(camera, client)
         if client.look() & bit:
             raise NotObserved("Input Container stays set: perhaps the data does not fit")
         sent = 0
         while sent <= MAX_CONTAINERS and not client.look() & bit:
-            client.say(m.SetInput(data=data))
+            client.send(m.SetInput(data=data))
             sent += 1
         full = client.look() & bit
         _use_up(camera, client, sent + 1)
-        client.say(m.SetInput(data=data))
+        client.send(m.SetInput(data=data))
         _inspect(camera, client)
     if not full:
         raise NotObserved(f"{sent} containers were taken without a word")
@@ -313,10 +314,10 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
     """Answer to Disconnect, if there is one."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
-        client.say(m.Disconnect())
+        mark = len(client.received)
+        client.send(m.Disconnect())
         client.listen(camera.patience)
-        answers = of_kind(client.heard[mark:], MessageId.DISCONNECT)
+        answers = of_kind(client.received[mark:], MessageId.DISCONNECT)
         if not answers:
             return "silent"
         if [camera.wire.numbers(one.body) for one in answers] != [(0,)]:
@@ -329,7 +330,7 @@ def bad_message(camera: CameraUnderTest) -> str:
     """Answers to unknown ids and wrong lengths: a code, or none."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         client.write(
             camera.wire.frame(UNKNOWN_ID, bytes(2)),
             camera.wire.frame(MessageId.SWITCH_APPLICATION),
@@ -337,7 +338,7 @@ def bad_message(camera: CameraUnderTest) -> str:
         client.fence()
         answers = [
             (one.message_id, camera.wire.numbers(one.body))
-            for one in client.heard[mark:-1]
+            for one in client.received[mark:-1]
             if one.message_id in {UNKNOWN_ID, MessageId.SWITCH_APPLICATION}
         ]
         if answers == [(UNKNOWN_ID, (0x13,)), (MessageId.SWITCH_APPLICATION, (0x10,))]:
@@ -397,7 +398,7 @@ def _after(camera: CameraUnderTest, data: bytes) -> str:
     """Send bytes that are no frame, and a Query; return the camera's reaction in words."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         try:
             client.write(data, camera.wire.request(m.Query()))
             client.until(
@@ -413,7 +414,7 @@ def _after(camera: CameraUnderTest, data: bytes) -> str:
             return "close"
         if client.ended:
             return "close"
-        answers = [one for one in client.heard[mark:] if one.message_id != MessageId.STATUS]
+        answers = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
         return "skip" if len(answers) == 1 else "it is taken for a frame"
 
 

@@ -1,4 +1,4 @@
-"""One way to the camera: a socket, every wait with a deadline, everything written down."""
+"""A link to the camera: a socket, a deadline for every wait, a record of every message."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ if TYPE_CHECKING:
     from typing import Self
 
 MAX_HEARD_BYTES = 1 << 24
-"""Largest number of bytes of bodies that one client keeps: 256 of the largest results; more end the
+"""Largest number of bytes of bodies that one client keeps: 256 of the largest results. More end the
 experiment."""
 
 MAX_TRAIL = 60
-"""Largest number of lines of what went over the wire that a report shows: the last ones."""
+"""Largest number of lines of the record that a report shows: the last ones."""
 
 FAREWELL = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
 
 LOOK_AGAIN = 0.01
-"""Seconds between two requests for a status that does not come by itself."""
+"""Seconds between two requests for a status that does not come unasked."""
 
 
 class EndedError(Exception):
-    """The camera has ended the link, or nothing is there any more."""
+    """The camera has closed the link, or is gone."""
 
 
 @dataclass(eq=False)
 class RawClient:
     """A TCP connection or a UDP socket; a context manager.
 
-    Leaving it says Disconnect where there may be a session, and closes the socket.
+    Leaving it sends Disconnect if there may be a session, and closes the socket.
 
     Raises:
         OSError: no connection.
@@ -52,11 +52,11 @@ class RawClient:
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
     _quiet: float  # seconds of silence that count as no answer
-    _trail: deque[str]  # record of everything that passes
-    _on_change: Callable[[], None]  # before something goes out that changes the camera's state
+    _trail: deque[str]  # record of all messages
+    _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
-        self.heard: list[Heard] = []  # every frame that came, in order
+        self.received: list[Heard] = []  # every frame that came, in order
         self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
@@ -87,14 +87,14 @@ class RawClient:
         self.close()
 
     def close(self) -> None:
-        """End the session where there may be one, and close the socket; bounded."""
+        """End the session if there may be one, and close the socket; bounded."""
         with contextlib.suppress(OSError, EndedError), self._socket:
             if self.ended:
                 return
             if self._may_have_session:
                 self._write(self.wire.request(m.Disconnect()))
             if self._tcp:
-                # a socket that is closed with unread bytes sends a reset, which may overtake
+                # closing a socket with unread bytes sends a reset, which may overtake
                 self._socket.shutdown(socket.SHUT_WR)
                 deadline = time.monotonic() + FAREWELL
                 while (left := deadline - time.monotonic()) > 0:
@@ -104,8 +104,8 @@ class RawClient:
 
     # ------------------------------------------------------------------ out
 
-    def say(self, *messages: m.Message) -> float:
-        """Send requests, in one write on TCP and a datagram each on UDP; return when.
+    def send(self, *messages: m.Message) -> float:
+        """Send requests, in one write on TCP and a datagram each on UDP; return the time.
 
         Raises:
             EndedError: the link is down.
@@ -120,7 +120,7 @@ class RawClient:
         return self.write(*[self.wire.request(message) for message in messages])
 
     def write(self, *data: bytes) -> float:
-        """Send bytes, whatever they are; as :meth:`say`."""
+        """Send any bytes; as :meth:`send`."""
         for one in data:
             self._note(">", self.wire.spell_request(one))
         at = time.monotonic()
@@ -140,7 +140,7 @@ class RawClient:
     # ------------------------------------------------------------------ in
 
     def next(self, within: float) -> Heard | None:
-        """Return the next frame, None if none comes ``within`` so many seconds.
+        """Return the next frame, None if none comes within so many seconds.
 
         Raises:
             EndedError: the camera ends the link.
@@ -177,7 +177,7 @@ class RawClient:
         self._kept += len(body)
         if self._kept > MAX_HEARD_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
-        self.heard.append(heard)
+        self.received.append(heard)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]
         return heard
@@ -211,21 +211,21 @@ class RawClient:
     def until(
         self, fits: Callable[[Heard], object] | int, within: float, expected: str, *, mark: int = -1
     ) -> Heard:
-        """Return the first frame that fits, of those that came behind ``mark`` or come now.
+        """Return the first frame that fits, of those after ``mark`` and those that come now.
 
         Args:
             fits: id of the wanted message, or a function that is true for the wanted frame.
             within: seconds from now.
-            expected: text of the difference, where no such frame comes.
-            mark: a length of :attr:`heard`; default: only what comes now.
+            expected: text of the difference if no such frame comes.
+            mark: a length of :attr:`received`; default: only frames that come now.
 
         Raises:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
         is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
-        first = len(self.heard) if mark < 0 else mark
-        for heard in self.heard[first:]:
+        first = len(self.received) if mark < 0 else mark
+        for heard in self.received[first:]:
             if is_it(heard):
                 return heard
         deadline = time.monotonic() + within
@@ -238,40 +238,40 @@ class RawClient:
     def answer(self, request: m.Message, *, within: float | None = None) -> Heard:
         """Send a request and return its answer, which has its id; raises as :meth:`until`."""
         message_id = self.wire.dialect.message_id(request)
-        mark = len(self.heard)
-        self.say(request)
+        mark = len(self.received)
+        self.send(request)
         within = self._timeout if within is None else within
         return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
 
     def trigger(self, expected: str = "a result", *, within: float | None = None) -> Heard:
         """Send a trigger and return the next result; raises as :meth:`until`."""
-        mark = len(self.heard)
-        self.say(m.Trigger())
+        mark = len(self.received)
+        self.send(m.Trigger())
         within = self._timeout if within is None else within
         return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
 
     def fence(self) -> list[Heard]:
-        """Send a Query and return what came before its answer: all that was on its way.
+        """Send a Query and return the frames before its answer: all that were on their way.
 
         Raises:
             Differs: the Query is not answered.
             EndedError: the camera ends the link.
         """
-        mark = len(self.heard)
+        mark = len(self.received)
         self.answer(m.Query())
-        return self.heard[mark:-1]
+        return self.received[mark:-1]
 
     def listen(self, seconds: float) -> list[Heard]:
-        """Return the frames that come in so many seconds; an end of the link ends it."""
-        mark, deadline = len(self.heard), time.monotonic() + seconds
+        """Return the frames that come in so many seconds; the end of the link ends it."""
+        mark, deadline = len(self.received), time.monotonic() + seconds
         with contextlib.suppress(EndedError):
             while (left := deadline - time.monotonic()) > 0:
                 self.next(left)
-        return self.heard[mark:]
+        return self.received[mark:]
 
     def words(self, first: int = 0) -> str:
-        """Describe the frames from a place of :attr:`heard` on, for a difference."""
-        shown = [self.wire.spell(one) for one in self.heard[first:]]
+        """Describe the frames from a place of :attr:`received` on, for a difference."""
+        shown = [self.wire.spell(one) for one in self.received[first:]]
         if len(shown) > 5:
             shown = [*shown[:4], f"{len(shown) - 4} more"]
         end = ["the end of the link"] if self.ended else []
@@ -280,17 +280,17 @@ class RawClient:
     # ------------------------------------------------------------------ the status
 
     def look(self) -> int:
-        """Return the status word as it is now: asked for where it can be, else the last one.
+        """Return the present status word: by a request if possible, else the last one.
 
         Raises:
             NotObserved: no status came since Connect.
             Differs: a request is not answered.
         """
         if self.wire.is_bid:
-            self.say(m.GetStatus())
+            self.send(m.GetStatus())
         self.fence()
         if self.status is None:
-            raise NotObserved("the camera has told no status")
+            raise NotObserved("the camera has sent no status")
         return self.status
 
     def wait_status(self, fits: Callable[[int], object], within: float, expected: str) -> int:

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 SAME_TIME = 0.2
-"""Part by which a measured time may differ from a quirk's default and still be the same."""
+"""Part by which a measured time may differ from a quirk's default and still count as equal."""
 
 SAME_SECONDS = 0.02
-"""Seconds by which a measured time may differ so."""
+"""Seconds by which a measured time may differ and still count as equal."""
 
 
 class CameraReport:
-    """Everything that was found about one camera.
+    """All findings about one camera.
 
     Args:
         camera: the camera.
@@ -39,20 +39,20 @@ class CameraReport:
         self.camera: CameraUnderTest = camera
 
     def add(self, finding: CameraFinding) -> None:
-        """Add what came of a check or question; of one that is done again the last counts."""
+        """Add the outcome of a check or question; if it is repeated, the last outcome counts."""
         self.findings = [one for one in self.findings if one.item.name != finding.item.name]
         self.findings.append(finding)
 
-    # ------------------------------------------------------------------ what is in it
+    # ------------------------------------------------------------------ contents
 
     @property
     def url(self) -> str:
-        """The camera's address; dialect and quirks are pinned as they were found."""
+        """The camera's address, with the dialect and quirks that were found."""
         return self.camera.address.url
 
     @property
     def differing(self) -> list[CameraFinding]:
-        """The findings in which the camera is not the documented one."""
+        """The findings in which the camera differs from the documents."""
         return [one for one in self.findings if one.failed]
 
     @property
@@ -142,7 +142,7 @@ class CameraReport:
         return ["", "not observed:", *lines] if lines else []
 
     def yaml(self) -> str:
-        """Return the quirks as a part of a scenario file; what was not observed is a comment."""
+        """Return the quirks as a part of a scenario file; unobserved ones are comments."""
         lines: list[str] = []
         for one in self.findings:
             item = one.item
@@ -161,7 +161,7 @@ class CameraReport:
     # ------------------------------------------------------------------ as JSON
 
     def as_json(self) -> dict[str, Any]:
-        """Return the report as JSON has it."""
+        """Return the report as values for JSON."""
         camera, before = self.camera, self.camera.before
         return {
             "smartcam": smartcam.__version__,

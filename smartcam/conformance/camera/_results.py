@@ -1,7 +1,7 @@
 """The checks and questions about a camera, and their outcomes.
 
-A *check* holds the camera against something that is documented, and fails where it differs. A
-*question* is open in the documents; its answer is a value, mostly one of
+A *check* compares the camera with a documented fact, and fails if it differs. A *question* is open
+in the documents; its answer is a value, mostly of a field of
 :class:`~smartcam.emulator.Quirks`.
 """
 
@@ -39,15 +39,15 @@ class Item:
     """A check or a question."""
 
     name: str  # in reports and for ``-k``
-    about: str  # what is looked at, one sentence
-    # where it stands and its grade, ``"SC-A28, published"``, by dialect; ``""`` is for the others
+    about: str  # documented fact or question, one sentence
+    # source and grade, ``"SC-A28, published"``, by dialect; ``""`` is for the others
     sources: Mapping[str, str]
-    # does it. A check returns nothing or a remark, a question the value.
+    # runs it: a check returns nothing or a remark, a question returns the value
     run: Callable[[CameraUnderTest], Any]
-    needs: Allow = Allow.NOTHING  # what it does to the camera
-    dialects: tuple[str, ...] = EVERY_DIALECT  # those in which it makes sense
-    transports: tuple[str, ...] = ("tcp", "udp")  # those over which it makes sense
-    documents: tuple[str, ...] = ()  # which contradictions of ``docs/unknowns.md`` it decides
+    needs: Allow = Allow.NOTHING  # actions on the camera that it needs
+    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that it applies to
+    transports: tuple[str, ...] = ("tcp", "udp")  # transports that it applies to
+    documents: tuple[str, ...] = ()  # contradictions in ``docs/unknowns.md`` that it decides
 
     def source(self, dialect: str) -> tuple[str, str]:
         """Return the source for a dialect, and the grade."""
@@ -58,18 +58,18 @@ class Item:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check(Item):
-    """Something documented, which the camera is held against."""
+    """A documented fact that the camera is compared with."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Question(Item):
-    """Something that the documents leave open, or contradict each other about."""
+    """A fact that the documents leave open, or contradict each other about."""
 
     @property
     def quirk(self) -> str | None:
-        """The field of :class:`~smartcam.emulator.Quirks` that the answer is a value of.
+        """The field of :class:`~smartcam.emulator.Quirks` whose value is the answer.
 
-        None if it is a fact for people.
+        None for a fact without such a field.
         """
         return self.name if self.name in Quirks.model_fields else None
 
@@ -84,11 +84,11 @@ NAMES = (
 def check(
     sources: str | Mapping[str, str], *, about: str = "", **more: Any
 ) -> Callable[[Callable[[CameraUnderTest], Any]], Check]:
-    """Make a check of the function below: its name and docstring are those of the check.
+    """Make the decorated function a check, with the function's name and docstring.
 
-    ``_items.py`` finds it where its module is one of ``_MODULES`` there, in the file's order.
-    The rest is what an :class:`Item` has: ``sources`` as a text hold for every dialect, ``about``
-    stands where the docstring's line has no room for it.
+    ``_items.py`` finds it if its module is in ``_MODULES`` there, in the file's order.
+    The arguments are fields of :class:`Item`: ``sources`` as a text is for every dialect, ``about``
+    replaces a docstring's line that is too short.
     """
     return lambda run: Check(
         name=run.__name__.replace("_", "-"), **_described(run, sources, about), **more
@@ -98,7 +98,7 @@ def check(
 def question(
     sources: str | Mapping[str, str], **more: Any
 ) -> Callable[[Callable[[CameraUnderTest], Any]], Question]:
-    """Make a question of the function below, as :func:`check`."""
+    """Make the decorated function a question, as :func:`check`."""
     return lambda run: Question(name=run.__name__, **_described(run, sources), **more)
 
 
@@ -118,22 +118,22 @@ class CameraFinding:
 
     item: Item
     outcome: CheckOutcome
-    source: str  # where it stands
-    grade: str  # of the source
+    source: str  # source of the fact
+    grade: str  # grade of the source
     value: Any = None  # the answer to a question; None for a check
-    text: str = ""  # a remark, or why nothing was observed
-    expected: str = ""  # where it differs, what was expected
-    came: str = ""  # where it differs, what came
-    wire: tuple[str, ...] = ()  # what went over the wire, where it differs
-    seconds: float = 0.0  # how long it took
+    text: str = ""  # a remark, or the reason why nothing was observed
+    expected: str = ""  # expected behaviour, if it differs
+    came: str = ""  # observed behaviour, if it differs
+    wire: tuple[str, ...] = ()  # messages on the wire, if it differs
+    seconds: float = 0.0  # duration
 
     @property
     def failed(self) -> bool:
-        """True if the camera is not the documented one here."""
+        """True if the camera differs from the documents here."""
         return self.outcome in {CheckOutcome.DIFFERS, CheckOutcome.UNDESCRIBED}
 
     def as_json(self) -> dict[str, Any]:
-        """Return the finding as JSON has it."""
+        """Return the finding as values for JSON."""
         row: dict[str, Any] = {
             "name": self.item.name,
             "about": self.item.about,

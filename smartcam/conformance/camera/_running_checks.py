@@ -31,7 +31,7 @@ def start_begins_run_mode(camera: CameraUnderTest) -> str:
     with camera.session() as client:
         camera.load(client, camera.application)
         camera.stop(client)
-        began = client.say(m.Start())
+        began = client.send(m.Start())
         client.wait_status(
             lambda word: word & bits.running, camera.options.timeout, "a status with Running"
         )
@@ -54,7 +54,7 @@ def second_start_is_harmless(camera: CameraUnderTest) -> None:
 @check({"": "SC-B33, MV27, published", "bid": "ID-b 213, ID-b 221, published"}, needs=Allow.TRIGGER)
 def trigger_gives_one_result(camera: CameraUnderTest) -> str:
     """A trigger gives one result container, of the active application."""
-    inspection_time(camera)  # there are results
+    inspection_time(camera)  # raises if there are no results
     word = camera.wire.word
     for one in inspections(camera):
         if len(one.results) != 1:
@@ -86,8 +86,8 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
         if one.under_way is not None:
             fell = not one.under_way & one.waiting
             if not fell and one.results and one.results[0].at - one.sent_at < camera.options.quiet:
-                continue  # it was over before the status was asked for
-            rose = True  # observing has waited for it
+                continue  # the inspection was over before the status came
+            rose = True  # the observation has waited for it
         else:
             places = one.places()
             fell, rose = places[0] is not None, places[2] is not None
@@ -123,15 +123,15 @@ def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
     """Reset errors is answered with the code 0, and a status follows."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         answer = client.answer(m.ResetErrors())
         if camera.wire.numbers(answer.body) != (0,):
             raise Differs("the code 0", camera.wire.spell(answer))
-        behind = client.heard.index(answer) + 1
+        behind = client.received.index(answer) + 1
         client.until(
             MessageId.STATUS,
             camera.options.timeout,
-            f"a status behind the answer ({client.words(mark)})",
+            f"a status after the answer ({client.words(mark)})",
             mark=behind,
         )
 
@@ -143,11 +143,11 @@ def trigger_error_stays_until_reset(camera: CameraUnderTest) -> None:
     error = camera.wire.bits.overtriggered
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger(), m.Trigger())
+        mark = len(client.received)
+        client.send(m.Trigger(), m.Trigger())
         client.listen(2 * takes + camera.options.quiet)
         word = client.look()
-        results = len(of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER))
+        results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
         if not word & error and results >= 2:
             raise NotObserved("the camera took both of two triggers at once")
         if not word & error:
@@ -175,7 +175,7 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         )
         camera.stop(client)
         client.fence()
-        mark = len(client.heard)
+        mark = len(client.received)
         came = client.listen(2 * camera.options.quiet)
         if of_kind(came, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.words(mark))
@@ -188,7 +188,7 @@ def stop_ends_run_mode(camera: CameraUnderTest) -> None:
     with camera.session() as client:
         camera.load(client, camera.application)
         camera.start(client)
-        client.say(m.Stop())
+        client.send(m.Stop())
         word = client.wait_status(
             lambda word: not word & bits.running, camera.options.timeout, "a status without Running"
         )
@@ -207,13 +207,13 @@ def second_stop_is_harmless(camera: CameraUnderTest) -> None:
 def _changes_nothing(camera: CameraUnderTest, message: Message) -> None:
     with camera.session() as client:
         was = camera.running(client)
-        mark = len(client.heard)
-        client.say(message)
+        mark = len(client.received)
+        client.send(message)
         client.fence()
         client.listen(camera.options.quiet)
         now = camera.running(client)
         name = type(message).__name__
-        if of_kind(client.heard, camera.wire.dialect.message_id(message)):
+        if of_kind(client.received, camera.wire.dialect.message_id(message)):
             raise Differs(f"no answer to {name}", client.words(mark))
         if was != now:
             raise Differs(f"a second {name} changes nothing", client.words(mark))

@@ -1,4 +1,4 @@
-"""Checks: how a session begins and ends, and what a camera says outside of one."""
+"""Checks: begin and end of a session, and messages outside of a session."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._wire import Heard
 
 ON_THE_WAY = 0.02
-"""Seconds that what was said before a Disconnect may be on its way at least."""
+"""Least number of seconds that messages before a Disconnect may be on their way."""
 
 
 BETWEEN_PIECES = 0.005
-"""Seconds between the bytes of a message that comes in pieces, so that each has a segment."""
+"""Seconds between the bytes of a message that is sent in pieces, so that each has a segment."""
 
 _NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
 
@@ -40,7 +40,7 @@ def connect_is_answered(camera: CameraUnderTest) -> None:
         except (Differs, EndedError):
             # the first attempt after an old session may fail (T 3.1.4, published)
             with camera.link() as client:
-                client.say(m.Disconnect())
+                client.send(m.Disconnect())
                 answer = client.answer(m.Connect())
     except (Differs, EndedError, NotObserved) as exc:
         camera.gone = str(exc)
@@ -53,7 +53,7 @@ def connect_is_answered(camera: CameraUnderTest) -> None:
     size = len(expected) * camera.wire.word
     if numbers != expected or len(answer.body) != size:
         raise Differs(
-            f"the version 1{' behind the code 0' if coded else ''}, {size} bytes",
+            f"the version 1{' after the code 0' if coded else ''}, {size} bytes",
             camera.wire.spell(answer),
         )
 
@@ -75,7 +75,7 @@ def status_follows_connect(camera: CameraUnderTest) -> None:
 def endian_field_is_0(camera: CameraUnderTest) -> None:
     """The second word of the status is 0: result containers are little endian."""
     with camera.session() as client:
-        status = of_kind(client.heard, MessageId.STATUS)[0]
+        status = of_kind(client.received, MessageId.STATUS)[0]
     if camera.wire.numbers(status.body)[1:2] != (0,):
         raise Differs("the endian field 0: little endian", camera.wire.spell(status))
 
@@ -104,7 +104,7 @@ def silent_before_connect(camera: CameraUnderTest) -> None:
 def deaf_before_connect(camera: CameraUnderTest) -> None:
     """Requests before Connect are ignored."""
     with camera.link() as client:
-        client.say(m.Query())
+        client.send(m.Query())
         if client.listen(camera.options.quiet):
             raise Differs("no answer to a Query before Connect", client.words())
 
@@ -114,8 +114,8 @@ def silent_after_disconnect(camera: CameraUnderTest) -> None:
     """After Disconnect nothing comes, of a smart camera not even an answer to it."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
-        client.say(m.Disconnect())
+        mark = len(client.received)
+        client.send(m.Disconnect())
         came = _without_answer(camera, client.listen(camera.options.quiet))
         if came:
             raise Differs("nothing after Disconnect", client.words(mark))
@@ -126,9 +126,9 @@ def deaf_after_disconnect(camera: CameraUnderTest) -> None:
     """Requests after Disconnect are ignored."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.heard)
-        client.say(m.Disconnect())
-        client.say(m.Query())
+        mark = len(client.received)
+        client.send(m.Disconnect())
+        client.send(m.Query())
         if _without_answer(camera, client.listen(camera.options.quiet)):
             raise Differs("no answer to a Query after Disconnect", client.words(mark))
 
@@ -146,9 +146,9 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
     takes = inspection_time(camera)
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        client.say(m.Trigger())
-        ended_at = client.say(m.Disconnect())
+        mark = len(client.received)
+        client.send(m.Trigger())
+        ended_at = client.send(m.Disconnect())
         came = client.listen(takes + camera.options.quiet)
         grace = max(ON_THE_WAY, 2 * camera.measured.get("query", 0.0))
         results = of_kind(came, MessageId.RESULT_CONTAINER)
@@ -162,7 +162,7 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
 def disconnect_without_session_is_harmless(camera: CameraUnderTest) -> None:
     """A Disconnect without a session does no harm."""
     with camera.link() as client:
-        client.say(m.Disconnect())
+        client.send(m.Disconnect())
         try:
             client.answer(m.Connect())
         except EndedError as exc:
@@ -185,7 +185,7 @@ def newcomer_wins(camera: CameraUnderTest) -> None:
     """The Connect of a second client ends the session of the first."""
     with camera.session() as first, camera.link() as second:
         second.answer(m.Connect())
-        mark = len(first.heard)
+        mark = len(first.received)
         first.write(camera.wire.request(m.Query()))
         if first.listen(camera.options.quiet):
             raise Differs("silence for the client that was there before", first.words(mark))
@@ -196,10 +196,10 @@ def newcomer_wins(camera: CameraUnderTest) -> None:
 def messages_share_a_segment(camera: CameraUnderTest) -> None:
     """Several requests in one segment are all answered."""
     with camera.session() as client:
-        mark = len(client.heard)
-        client.say(m.Query(), m.Query(), m.Query())
+        mark = len(client.received)
+        client.send(m.Query(), m.Query(), m.Query())
         client.until(
-            lambda _: len(of_kind(client.heard[mark:], MessageId.QUERY_APPLICATION)) == 3,
+            lambda _: len(of_kind(client.received[mark:], MessageId.QUERY_APPLICATION)) == 3,
             camera.options.timeout,
             "three answers to three Queries in one segment",
         )
@@ -209,7 +209,7 @@ def messages_share_a_segment(camera: CameraUnderTest) -> None:
 def a_message_may_come_in_pieces(camera: CameraUnderTest) -> None:
     """A request that comes byte by byte is answered."""
     with camera.session() as client:
-        mark = len(client.heard)
+        mark = len(client.received)
         for byte in camera.wire.request(m.Query()):
             client.write(bytes([byte]))
             client.listen(BETWEEN_PIECES)

@@ -1,4 +1,4 @@
-"""The camera under test: sessions with it, the states a check needs, and what is put back."""
+"""The camera under test: sessions, states that a check needs, and the restored state."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SESSION_TRIES = 3
-"""Links tried for a session: the first attempt after an old session may fail (T 3.1.4,
+"""Number of links tried for a session: the first attempt after an old session may fail (T 3.1.4,
 published)."""
 
 DETECTION_TIMEOUT = 10.0
-"""Seconds in which the dialect is found out."""
+"""Seconds for finding out the dialect."""
 
 RESTORE_TRIES = 2
-"""Sessions tried for putting back the state of before."""
+"""Number of sessions tried for restoring the state from before."""
 
 
 class StateBefore(NamedTuple):
-    """The camera's state that is put back."""
+    """The camera's state that is restored at the end."""
 
     application: int  # id of the active one
     running: bool  # whether the camera is in run mode
 
 
 class CameraUnderTest:
-    """One camera and what was learned of it so far.
+    """One camera and the facts learned about it so far.
 
     Raises:
         ConfigurationError: the address cannot work, or is no BVS camera's.
@@ -56,13 +56,13 @@ class CameraUnderTest:
     def __init__(self, options: ConformanceOptions) -> None:
         self.options: ConformanceOptions = options
         self.before: StateBefore | None = None  # state to restore; None until the first session
-        self.gone: str = ""  # why there is no camera any more, "" while there is one
+        self.gone: str = ""  # reason why the camera is gone, "" while it is there
         self.left: str = ""  # state that could not be restored; "" if everything was
-        # messages on the wire since the last forget_trail
+        # messages on the wire since the last forget_trail()
         self.trail: deque[str] = deque(maxlen=MAX_TRAIL)
-        # frames of the camera that are not documented, as texts, each kind once
+        # undocumented frames of the camera, as texts, each kind once
         self.flaws: dict[str, str] = {}
-        self.measured: dict[str, float] = {}  # times in seconds, by what was measured
+        self.measured: dict[str, float] = {}  # times in seconds, by their names
         self._address = parse_address(options.url)
         if self._address.protocol != "bvs":
             raise ConfigurationError(
@@ -73,7 +73,7 @@ class CameraUnderTest:
         self._allow = options.allow
         self._dirty = False
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def transport(self) -> str:
@@ -90,7 +90,7 @@ class CameraUnderTest:
 
     @property
     def wire(self) -> RawDialect:
-        """The dialect; it is found out where the address does not name it.
+        """The dialect; it is found out if the address does not name it.
 
         Raises:
             Differs: no dialect is answered.
@@ -120,7 +120,7 @@ class CameraUnderTest:
         return cast("FramedDialect", dialect).with_quirks(address.quirks)
 
     def learn_quirk(self, name: str, *, on: bool) -> None:
-        """The camera deviates from its dialect in this way, or does not."""
+        """Note whether the camera deviates from its dialect in this way."""
         dialect = self.wire.dialect
         names = {*dialect.quirks, name} if on else {*dialect.quirks} - {name}
         plain = cast("FramedDialect", load_protocol("bvs").dialects[dialect.name])
@@ -128,7 +128,7 @@ class CameraUnderTest:
 
     @property
     def patience(self) -> float:
-        """Seconds that an answer gets which may not come, where no other answer can tell."""
+        """Seconds to wait for an answer that may not come, if no other answer can show that."""
         return 4 * self.options.quiet
 
     def once(self, name: str, observe: Callable[[], T]) -> T:
@@ -144,14 +144,14 @@ class CameraUnderTest:
         return cast("T", found)
 
     def forget_trail(self) -> None:
-        """Begin anew to write down what goes over the wire."""
+        """Begin a new record of messages on the wire."""
         self.trail.clear()
 
-    # ------------------------------------------------------------------ ways to it
+    # ------------------------------------------------------------------ links
 
     @contextlib.contextmanager
     def link(self) -> Iterator[RawClient]:
-        """Open a way to the camera, without a session.
+        """Open a link to the camera, without a session.
 
         Raises:
             NotObserved: there is no connection.
@@ -165,14 +165,14 @@ class CameraUnderTest:
             with client:
                 yield client
         finally:
-            for heard in client.heard:
+            for heard in client.received:
                 self._learn_code(heard)
                 flaw = self.wire.flaw(heard)
                 if flaw is not None:
                     self.flaws.setdefault(flaw, self.wire.spell(heard))
 
     def open(self) -> RawClient:
-        """Open a way to the camera; whoever does it closes it.
+        """Open a link to the camera; the caller closes it.
 
         Raises:
             OSError: there is no connection.
@@ -192,7 +192,7 @@ class CameraUnderTest:
 
     @contextlib.contextmanager
     def session(self) -> Iterator[RawClient]:
-        """Open a session; a smart camera's first status has come.
+        """Open a session; a smart camera's first status has been received.
 
         Raises:
             NotObserved: the camera gives no session.
@@ -212,7 +212,7 @@ class CameraUnderTest:
             try:
                 client = attempt.enter_context(self.link())
                 if number:
-                    client.say(m.Disconnect())
+                    client.send(m.Disconnect())
                 self.greet(client)
             except (NotObserved, Differs, EndedError) as exc:
                 attempt.close()
@@ -224,7 +224,7 @@ class CameraUnderTest:
         raise NotObserved(f"there is no session: {why}")
 
     def greet(self, client: RawClient) -> Heard:
-        """Connect on a link and return the answer; a status has come where one comes by itself.
+        """Connect on a link and return the answer; also wait for a status that comes unasked.
 
         Raises:
             Differs: the camera does not answer.
@@ -238,7 +238,7 @@ class CameraUnderTest:
         return answer
 
     def _learn_code(self, heard: Heard) -> None:
-        """In ``b16`` the length of the answer to Connect tells whether answers have a code."""
+        """Learn whether ``b16`` answers have a code, from the length of the answer to Connect."""
         if self.dialect == "b16" and heard.message_id == MessageId.CONNECT:
             self.learn_quirk("code", on=len(heard.body) == 4)
 
@@ -254,7 +254,7 @@ class CameraUnderTest:
         """Return the active application's id.
 
         Raises:
-            Differs: the camera does not tell it.
+            Differs: the camera does not answer with it.
         """
         answer = client.answer(m.Query())
         numbers = self.wire.numbers(answer.body)
@@ -269,7 +269,7 @@ class CameraUnderTest:
 
     @property
     def application(self) -> int:
-        """Id of the application that may be triggered."""
+        """Id of the application to trigger."""
         if self.options.application is not None:
             return self.options.application
         if self.before is None:
@@ -277,7 +277,7 @@ class CameraUnderTest:
         return self.before.application
 
     def require(self, needs: Allow) -> None:
-        """See that something is allowed.
+        """Check that an action is allowed.
 
         Raises:
             NotObserved: the option does not allow this.
@@ -287,7 +287,7 @@ class CameraUnderTest:
             raise NotObserved(f"--camera-allow does not have {' and '.join(missing.names)}")
 
     def stop(self, client: RawClient) -> None:
-        """Have the camera out of run mode.
+        """Make sure that the camera is not in run mode.
 
         Raises:
             NotObserved: Stop is not allowed.
@@ -297,24 +297,24 @@ class CameraUnderTest:
         if self.wire.is_bid or not client.look() & bits.running:
             return
         self.require(Allow.RUN)
-        client.say(m.Stop())
+        client.send(m.Stop())
         client.wait_status(
             lambda word: not word & bits.running, self.options.timeout, "a status without Running"
         )
 
     def start(self, client: RawClient) -> None:
-        """Have the camera in run mode; raises as :meth:`stop`."""
+        """Make sure that the camera is in run mode; raises as :meth:`stop`."""
         bits = self.wire.bits
         if self.wire.is_bid or client.look() & bits.running:
             return
         self.require(Allow.RUN)
-        client.say(m.Start())
+        client.send(m.Start())
         client.wait_status(
             lambda word: word & bits.running, self.options.timeout, "a status with Running"
         )
 
     def load(self, client: RawClient, application: int) -> list[Heard]:
-        """Have an application loaded; return what came from the request to its end.
+        """Load an application; return the frames from the request to its end.
 
         Raises:
             NotObserved: the switch is not allowed, or the camera refuses it.
@@ -324,7 +324,7 @@ class CameraUnderTest:
             return []
         self.require(Allow.SWITCH)
         self.stop(client)
-        mark = len(client.heard)
+        mark = len(client.received)
         answer = client.answer(
             m.SwitchApplication(application=application), within=self.options.switch_timeout
         )
@@ -341,10 +341,10 @@ class CameraUnderTest:
             self.options.switch_timeout,
             "a status that is not busy",
         )
-        return client.heard[mark:]
+        return client.received[mark:]
 
     def ready(self, client: RawClient) -> None:
-        """Have the application loaded and waiting for a trigger.
+        """Make sure that the application is loaded and waits for a trigger.
 
         Raises:
             NotObserved: a switch is not allowed, or the application needs no trigger.
@@ -375,10 +375,10 @@ class CameraUnderTest:
     # ------------------------------------------------------------------ afterwards
 
     def restore(self, *, again: bool = False) -> None:
-        """Put back which application is active and whether it runs; never raises.
+        """Restore the active application and whether it runs; never raises.
 
-        Bounded: two sessions, each wait in them has its own limit. What cannot be put back stands
-        in :attr:`left`. With ``again`` it is tried also where it could not be done before.
+        Bounded: two sessions, in which each wait has its own limit. A state that cannot be restored
+        is named in :attr:`left`. ``again``: try it even if it failed before.
         """
         before, why = self.before, ""
         if not self._dirty or before is None or (self.left and not again):
@@ -402,7 +402,7 @@ class CameraUnderTest:
 
     def _put_back(self, client: RawClient, before: StateBefore) -> None:
         allowed = self._allow
-        self._allow |= Allow.RUN | Allow.SWITCH  # what we have changed may be changed back
+        self._allow |= Allow.RUN | Allow.SWITCH  # our own changes may be undone
         try:
             self.load(client, before.application)
             (self.start if before.running else self.stop)(client)
@@ -411,7 +411,7 @@ class CameraUnderTest:
 
 
 async def _probe(address: Address) -> Address | str:
-    """Return the address with its dialect, or what came of each try."""
+    """Return the address with its dialect, or the outcome of each try as text."""
     tried: list[str] = []
     found: Address | str | None = None
     async with contextlib.aclosing(probe_trials(address, timeout=DETECTION_TIMEOUT)) as trials:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._wire import Heard
 
 UNKNOWN_APPLICATION = 0xFFFD
-"""An id that no application has, in all probability; it fits 16 bits."""
+"""An id that most probably no application has; it fits 16 bits."""
 
 SECONDS_APART = timedelta(seconds=3)
-"""Time by which a clock may be off right after it was set: the way, and the next full second."""
+"""Time by which a clock may be off right after it was set: transmission, and the next second."""
 
 A_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
 """The date of the published examples (MV30, ID-b 218). The camera has no time zone."""
@@ -71,7 +71,7 @@ def switch_loads_the_application(camera: CameraUnderTest) -> str:
         raise Differs(f"the code 0 and the id {seen.application}", camera.wire.spell(seen.answer))
     if seen.active != seen.application:
         raise Differs(
-            f"application {seen.application} is active", f"Query tells application {seen.active}"
+            f"application {seen.application} is active", f"Query reports application {seen.active}"
         )
     return f"{seen.seconds:.3f} s"
 
@@ -84,12 +84,12 @@ def busy_during_a_switch(camera: CameraUnderTest) -> None:
     words = camera.wire.statuses(seen.came)
     if not any(word & busy for word in words) or words[-1] & busy:
         shown = "; ".join(map(camera.wire.spell, seen.came))
-        raise Differs("a status with BUSY during the switch, and one without it behind", shown)
+        raise Differs("a status with BUSY during the switch, and one without it after", shown)
 
 
 @check(
     {"": "no document, inferred", "bid": "ID-a 229, ID-b 216, published"},
-    about="during a switch a second one is not answered and Query tells the old application; "
+    about="during a switch a second one is not answered and Query reports the old application; "
     "a BVS ID answers both with Busy",
     needs=Allow.SWITCH,
 )
@@ -102,9 +102,9 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
             camera.load(client, camera.application)
             active = camera.active(client)
         camera.stop(client)
-        mark = len(client.heard)
+        mark = len(client.received)
         request = m.SwitchApplication(application=other)
-        client.say(request, request, m.Query())
+        client.send(request, request, m.Query())
         first = client.until(
             MessageId.QUERY_APPLICATION,
             camera.options.switch_timeout,
@@ -128,16 +128,16 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
 def _judge_second(
     camera: CameraUnderTest, client: RawClient, mark: int, query: Heard, active: int
 ) -> None:
-    switched = of_kind(client.heard[mark:], MessageId.SWITCH_APPLICATION)
+    switched = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
     answers = [camera.wire.numbers(one.body) for one in switched]
-    told = camera.wire.numbers(query.body)
+    numbers = camera.wire.numbers(query.body)
     if camera.wire.is_bid:
-        if told != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
+        if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
             raise Differs(
                 f"the code 0x16 and 0 to the Query, 0x16 and {active} to the second switch",
                 client.words(mark),
             )
-    elif told[-1] != active or len(answers) != 1:
+    elif numbers[-1] != active or len(answers) != 1:
         raise Differs(
             f"the id of before, {active}, and no answer to the second switch", client.words(mark)
         )
@@ -169,16 +169,16 @@ def _set_clock(camera: CameraUnderTest, client: RawClient, when: datetime) -> No
         minute=when.minute,
         second=when.second,
     )
-    _tell(camera, client, request, (0,))
+    _send_setting(camera, client, request, (0,))
 
 
-def _tell(
+def _send_setting(
     camera: CameraUnderTest, client: RawClient, request: m.Request, code: tuple[int, ...]
 ) -> None:
     """Send a request that a BVS ID acknowledges and a smart camera does not answer."""
     if not camera.wire.is_bid:
         message_id = camera.wire.dialect.message_id(request)
-        client.say(request)
+        client.send(request)
         if of_kind(client.fence(), message_id):
             raise Differs(f"no answer to {type(request).__name__}", client.words())
         return
@@ -217,8 +217,8 @@ def impossible_date_is_harmless(camera: CameraUnderTest) -> None:
     with camera.session() as client:
         was, began = _read_clock(camera, client), time.monotonic()
         try:
-            _tell(camera, client, request, (0x10,))
-            _read_clock(camera, client)  # which is a date
+            _send_setting(camera, client, request, (0x10,))
+            _read_clock(camera, client)  # raises if it is no date
         finally:
             _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
 
@@ -235,7 +235,7 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     offset = camera.options.sequence_offset
     if offset is None:
         raise NotObserved(
-            "it is not known where the sequence number stands in a result: --camera-sequence-offset"
+            "the place of the sequence number in a result is not known: --camera-sequence-offset"
         )
     camera.once_waiting(client)
     result = client.trigger()
@@ -253,9 +253,9 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     documents=("C6",),
 )
 def sequence_number_is_set(camera: CameraUnderTest) -> None:
-    """Set sequence number is the number of the next run; the run behind has one more."""
+    """Set sequence number is the number of the next run; the next run has one more."""
     number = 0x01020304
-    no_id(camera)  # which tells where the number stands
+    no_id(camera)  # raises if the number's place is unknown
     little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")
     with camera.session() as client:
         camera.ready(client)
@@ -263,11 +263,11 @@ def sequence_number_is_set(camera: CameraUnderTest) -> None:
         first = next_number(camera, client)
         second = next_number(camera, client)
     if camera.dialect == "b16" and first == big:
-        return  # the question big_endian_number tells it
+        return  # the question big_endian_number reports it
     following = (number + 1).to_bytes(4, "little")
     if (first, second) != (little, following):
         raise Differs(
-            f"{little.hex(' ')} and, in the run behind, {following.hex(' ')}",
+            f"{little.hex(' ')} and, in the next run, {following.hex(' ')}",
             f"{first.hex(' ')} and {second.hex(' ')}",
         )
 
@@ -285,11 +285,11 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
     bits = camera.wire.bits
     with camera.session() as client:
         camera.ready(client)
-        mark = len(client.heard)
-        for _ in range(2):  # what the bit says of the time before is over then
-            _tell(camera, client, m.SetInput(data=data), (0,))
+        mark = len(client.received)
+        for _ in range(2):  # the first trigger clears the bit's history
+            _send_setting(camera, client, m.SetInput(data=data), (0,))
             camera.once_waiting(client)
-            mark = len(client.heard)
+            mark = len(client.received)
             within = takes + camera.options.timeout
             client.trigger("a result of a trigger with input data", within=within)
         if client.look() & bits.input_container:

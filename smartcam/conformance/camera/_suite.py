@@ -1,4 +1,4 @@
-"""The suite for pytest: one test for each check and each question, and the report at the end."""
+"""The suite for pytest: one test for each check and question, and the report at the end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHARED = (
 
 
 class _Reports:
-    """Shows the reports at the end of the run; a plugin of pytest while there are any."""
+    """Shows the reports at the end of the run; a pytest plugin while there are reports."""
 
     NAME: ClassVar[str] = "smartcam-conformance"
 
@@ -61,7 +61,7 @@ def _reports(config: pytest.Config) -> _Reports:
 
 
 class CameraConformance:
-    """A camera is put through all checks and questions: subclass it and say where the camera is.
+    """Runs all checks and questions on a camera: subclass it and give the camera's address.
 
     ::
 
@@ -69,11 +69,11 @@ class CameraConformance:
             camera_url = "bvs://192.168.0.10"
             camera_options = {"other_application": 3}
 
-    Where the address comes from a fixture, override :meth:`camera_address`. What the class does not
-    say is taken from pytest's options ``--camera-...``. Without an address the tests are skipped.
+    If the address comes from a fixture, override :meth:`camera_address`. Other values come from
+    pytest's options ``--camera-...``. Without an address the tests are skipped.
 
-    The tests are synchronous and need no plugin for event loops. Each test puts back which
-    application is active and whether it runs. At the end of the run the report is shown.
+    The tests are synchronous and need no plugin for event loops. Each test restores the active
+    application and whether it runs. The report is shown at the end of the run.
 
     Attributes:
         camera_url: the camera's address, None to take ``--camera-url``.
@@ -86,7 +86,7 @@ class CameraConformance:
 
     @pytest.fixture
     def camera_address(self, request: pytest.FixtureRequest) -> str | None:
-        """The camera's address, None if there is none."""
+        """The camera's address, None without one."""
         address: str | None = self.camera_url or request.config.getoption("--camera-url", None)
         return address
 
@@ -94,7 +94,7 @@ class CameraConformance:
     def camera_report(
         self, request: pytest.FixtureRequest, camera_address: str | None
     ) -> CameraReport:
-        """The report that the tests of this class add to; skips where there is no camera."""
+        """The report for the tests of this class; they are skipped without a camera."""
         config = request.config
         if not camera_address:
             pytest.skip(NO_CAMERA)
@@ -133,7 +133,7 @@ class CameraConformance:
 
     @pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.name)
     def test_camera(self, camera_report: CameraReport, item: Item) -> None:
-        """The camera does what is documented; where nothing is, a quirk's setting describes it."""
+        """The camera follows the documents; without one, a quirk's setting describes it."""
         finding = judge_item(camera_report.camera, item)
         camera_report.add(finding)
         if finding.failed:

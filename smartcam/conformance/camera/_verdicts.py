@@ -1,4 +1,4 @@
-"""The exceptions by which checks and questions end: verdicts on the camera or the experiment."""
+"""The exceptions that end checks and questions: verdicts on the camera or the experiment."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(eq=False)
 class Differs(Exception):  # noqa: N818 - it is a verdict on the camera
-    """The camera does something else than the documents say."""
+    """The camera behaves differently than documented."""
 
-    expected: str  # what the documents say
-    came: str  # what was seen instead
+    expected: str  # documented behaviour
+    came: str  # observed behaviour
 
     def __str__(self) -> str:
-        """Return both."""
+        """Return both behaviours as text."""
         return f"expected: {self.expected}; came: {self.came}"
 
 
 class Undescribed(Differs):
-    """A question was answered by something that no setting of its quirk describes."""
+    """No setting of a quirk describes the answer to its question."""
 
 
 class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment
-    """The camera could not be seen doing it; the text says why, as what follows "because"."""
+    """The camera could not be observed; the text is the reason, to follow "because"."""

@@ -1,7 +1,7 @@
-"""Frames as bytes: the requests from the dialect's table, what comes read by code of its own.
+"""Frames as bytes: requests by the dialect's table, received frames by independent code.
 
-What is judged here is also what the library's own codecs rest on, so only the header's shape and
-the ids are taken from the table; numbers are read out of the bytes below.
+The library's own codecs rest on the same table, so only the header's form and the ids are taken
+from it; numbers are read from the bytes by this module.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message
 
-MAX_BODY = 1 << 20
-"""Bytes of a body: the camera sends about 64 kB at most (HAL 15, published)."""
+MAX_BODY_BYTES = 1 << 20
+"""Largest number of bytes of a body: the camera sends about 64 kB (HAL 15, published)."""
 
 
 _REFUSALS = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
-"""Codes of BVS ID that stand alone (ID-a 52, published)."""
+"""Codes of BVS ID that come alone (ID-a 52, published)."""
 
 
 class BadBytesError(Exception):
-    """The bytes that came are no frame of this dialect; the text says why."""
+    """Received bytes are no frame of this dialect; the text says why."""
 
 
 class Heard(NamedTuple):
@@ -48,7 +48,7 @@ def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
 
 @dataclass(frozen=True, slots=True)
 class Bits:
-    """Masks of a status word's bits by meaning; 0 where no bit has it.
+    """Masks of a status word's bits by meaning; 0 if no bit has it.
 
     Source: SC-A30, SC-B33 (published) for smart cameras; ID-b 210 and the example of ID-a 227
     (published and derived) for BVS ID.
@@ -73,7 +73,7 @@ BITS: Mapping[str, Bits] = {
 
 
 class RawDialect:
-    """One dialect on the wire, its quirks included."""
+    """One dialect on the wire, including its quirks."""
 
     def __init__(self, dialect: FramedDialect) -> None:
         self.dialect: FramedDialect = dialect
@@ -82,7 +82,7 @@ class RawDialect:
 
     @property
     def magic(self) -> bytes:
-        """Beginning of a frame, nothing in the dialects with 16 bits."""
+        """Beginning of a frame; empty in the dialects with 16 bits."""
         return self.dialect.header.magic
 
     @property
@@ -93,20 +93,20 @@ class RawDialect:
     # ------------------------------------------------------------------ out
 
     def request(self, message: Message) -> bytes:
-        """Return a request's bytes, as the table has it."""
+        """Return a request's bytes by the table."""
         return self.dialect.encode(message)
 
     def frame(self, message_id: int, body: bytes = b"", *, length: int | None = None) -> bytes:
-        """Return any frame; ``length`` is what the length field says of its body, if not so."""
+        """Return any frame; ``length`` replaces the correct value of the length field."""
         return self.dialect.header.pack(message_id, len(body) if length is None else length) + body
 
     # ------------------------------------------------------------------ in
 
     def cut(self, buffer: bytes) -> tuple[int, bytes, int] | None:
-        """Return the first frame as id, body and size; None while it is not all there.
+        """Return the first frame as id, body and size; None while it is incomplete.
 
         Raises:
-            BadBytesError: these bytes begin none.
+            BadBytesError: no frame begins with these bytes.
         """
         magic, word = self.magic, self.word
         if not magic.startswith(buffer[: len(magic)]):
@@ -120,14 +120,14 @@ class RawDialect:
         first = int.from_bytes(buffer[len(magic) : len(magic) + word], "little")
         second = int.from_bytes(buffer[len(magic) + word : begin], "little")
         message_id, length = (second, first) if magic else (first, second)
-        length -= 4 if self.dialect.name == "thesis" else 0  # it counts the message id
-        if not 0 <= length <= MAX_BODY:
+        length -= 4 if self.dialect.name == "thesis" else 0  # the length counts the message id
+        if not 0 <= length <= MAX_BODY_BYTES:
             raise BadBytesError(f"a frame announces {length} bytes: {hex_excerpt(buffer[:begin])}")
         end = begin + length
         return (message_id, buffer[begin:end], end) if end <= len(buffer) else None
 
     def numbers(self, body: bytes) -> tuple[int, ...]:
-        """Return a body as ordinary numbers; bytes that are left over are not among them."""
+        """Return a body as ordinary numbers, without surplus bytes."""
         code = "I" if self.word == 4 else "H"
         count = len(body) // self.word
         return struct.unpack_from(f"<{count}{code}", body)
@@ -140,11 +140,11 @@ class RawDialect:
     # ------------------------------------------------------------------ in words
 
     def spell(self, heard: Heard) -> str:
-        """Return a frame of the camera in words and hex, for people."""
+        """Return a frame of the camera in readable form, with hex."""
         return self._spell(Sender.CAMERA, heard.message_id, heard.body)
 
     def spell_request(self, data: bytes) -> str:
-        """Describe what was sent in words and hex; bytes that are no frame in hex only."""
+        """Return a sent frame in readable form, with hex; only hex for bytes that are no frame."""
         try:
             found = self.cut(data)
         except BadBytesError:
@@ -155,8 +155,8 @@ class RawDialect:
 
     def _spell(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
         spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
-        said = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
-        shown = f"{spelled.message}({said})" if len(said) <= 100 else spelled.message
+        fields = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
+        shown = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
         if not self.dialect.knows(sender, message_id):
             shown = f"id {message_id:#04x}"
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
@@ -164,7 +164,7 @@ class RawDialect:
     def flaw(self, heard: Heard) -> str | None:
         """Return the undocumented property of a frame of the camera, None if there is none."""
         if self.is_bid and self.numbers(heard.body) in _REFUSALS:
-            return None  # a refusal may be nothing but its code, whatever was asked
+            return None  # a refusal may be only its code, for any request
         size = self._sizes().get(heard.message_id)
         if size is None:
             return f"message {heard.message_id:#04x} is not one of a camera's"

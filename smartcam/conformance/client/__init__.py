@@ -1,6 +1,6 @@
-"""Judging clients: an emulated camera has them do tasks, makes trouble, and looks at what they say.
+"""Judge clients: an emulated camera gives them tasks, misbehaves, and observes their messages.
 
-In a test file of whoever wrote the client::
+In a test file of the client's author::
 
     from smartcam.conformance.client import ClientConformance
 
@@ -11,8 +11,8 @@ or without one::
 
     pytest --pyargs smartcam.conformance.client --client-command "./mydriver {host} {port} {task}"
 
-What is judged stands in :data:`CHECKS`: a scene (a camera and a task), a rule, and the source of
-what the camera expects. Names are resolved when they are first used: importing this is light.
+:data:`CHECKS` has all checks: a scene (a camera and a task), a rule, and the source of the camera's
+expectation. Importing this is light, since names are resolved when they are first used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The rules for a client, each with its scene, its weight and the state of the camera.
+"""The rules for a client, each with its scene, its weight and its source.
 
 Sources are the keys of the list in ``docs/sources.md``.
 """
@@ -26,13 +26,13 @@ class Grade(enum.Enum):
     MUST = "must"
     """A client that breaks the rule is wrong: a test fails."""
     SHOULD = "should"
-    """A client that keeps the rule is better, but the documents leave it open, or it costs
-    something: only reported."""
+    """A client that follows the rule is better, but the documents leave it open, or it costs
+    effort: only reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientCheck:
-    """A rule in a scene."""
+    """A rule with the scene in which it is checked."""
 
     name: str  # name of the check, in reports and for ``-k``
     scene: Scene  # the camera and the task
@@ -230,7 +230,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         expects="a container begins with the id of the application that made it",
         source="SC-B33, SC-C45, published",
     ),
-    # ------------------------------------------------------------------ whose result it is
+    # ------------------------------------------------------------------ owners of results
     ClientCheck(
         name="takes_no_earlier_result",
         scene=SCENES["inspection_under_way"],
@@ -254,7 +254,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         source="inferred",
         grade=Grade.SHOULD,
     ),
-    # ------------------------------------------------------------------ what never comes
+    # ------------------------------------------------------------------ missing answers
     ClientCheck(
         name="fails_where_triggers_are_dropped",
         scene=SCENES["overtriggered"],
@@ -301,7 +301,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_nothing_listens",
         scene=SCENES["nothing_listens"],
         rule=rules.fails,
-        expects="a restart takes about 30 s, in which nobody listens",
+        expects="a restart takes about 30 s, in which nothing is received",
         source="MV31, published",
     ),
     # ------------------------------------------------------------------ broken links
@@ -337,7 +337,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_garbage_comes",
         scene=SCENES["garbage"],
         rule=rules.fails,
-        expects="behind bytes that make no frame nothing can be trusted; " + _BOUND,
+        expects="after bytes that make no frame nothing can be trusted; " + _BOUND,
         source="inferred",
     ),
     ClientCheck(

@@ -1,4 +1,4 @@
-"""Report on a client in words: in a failed test, and at the end of a run."""
+"""Report on a client: in a failed test, and at the end of a run."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ClientFinding(NamedTuple):
 
 
 def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
-    """Judge a run of a check's scene; return the finding, None if all is well."""
+    """Judge a run of a check's scene; return the finding, None if the rule was followed."""
     wrong = check.rule(run)
     if wrong is None:
         return None
@@ -77,7 +77,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
 def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """Write findings into pytest's report.
 
-    A breach of ``must`` is shown in full by its failed test, so here it is one line; a breach of
+    A breach of ``must`` is shown in full by its failed test, so it is one line here; a breach of
     ``should`` is shown in full.
     """
     reporter.section("smartcam: the client")

@@ -1,7 +1,7 @@
 """Rules for a client, checked against its messages and its results.
 
-Each rule takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake in
-words, or None.
+Each rule gets a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake as
+text, or None.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.messages import Request, Sender
 
 if TYPE_CHECKING:
-    from smartcam.conformance.client._runs import ClientRun, Said
+    from smartcam.conformance.client._runs import ClientRun, WireMessage
 
 GRACE = 0.05
-"""Seconds that a status may take to the client, which cannot know of it before."""
+"""Seconds that a status may take to reach the client, which cannot know it earlier."""
 
 
 def _wrong_results(run: ClientRun) -> str | None:
-    """Return the first mistake in the client's results; too few are no mistake."""
+    """Return the first mistake in the client's results; too few results are no mistake."""
     scene, sent, last = run.scene, run.sent_turns, -1
     for number, data in enumerate(run.outcome.results, 1):
         what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
         if content is None:
-            return f"{what} is {len(data)} bytes long; the containers have 8 behind the id"
+            return f"{what} is {len(data)} bytes long; the containers have 8 after the id"
         application, turn = content
         if application != scene.application:
             return f"{what} is of application {application}, not of {scene.application}"
@@ -83,7 +83,7 @@ def gives_results(run: ClientRun) -> str | None:
 
 
 def sends_whole_messages(run: ClientRun) -> str | None:
-    """Everything that the client says is a message of the dialect."""
+    """The client sends only messages of the dialect."""
     for _, one in run.requests:
         if one.error is not None and "came in state" in one.error:
             continue  # a message, at the wrong time
@@ -93,9 +93,9 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 
 
 def connects_first(run: ClientRun) -> str | None:
-    """The client says nothing but Connect, and Disconnect before it, until it is answered."""
+    """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
     answered: set[str] = set()
-    for one in run.said:
+    for one in run.messages:
         if isinstance(one.message, m.ConnectAnswer):
             answered.add(one.peer)
         elif (
@@ -111,8 +111,8 @@ def connects_first(run: ClientRun) -> str | None:
 
 def disconnects(run: ClientRun) -> str | None:
     """The client's last word is Disconnect."""
-    last: dict[str, Said] = {}
-    for one in run.said:
+    last: dict[str, WireMessage] = {}
+    for one in run.messages:
         if one.sender is Sender.CLIENT:
             last[one.peer] = one
     if not last:
@@ -122,19 +122,19 @@ def disconnects(run: ClientRun) -> str | None:
 
 
 def asks_one_at_a_time(run: ClientRun) -> str | None:
-    """The client has one request of a kind open at a time: answers do not say whose they are.
+    """The client has one request of a kind open at a time: answers do not name their request.
 
     A trigger may stand between two Queries, or two Get status: their answers come in order.
     """
     open_requests: set[tuple[str, type[m.Message]]] = set()
-    for one in run.said:
+    for one in run.messages:
         message = one.message
         if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
             key = (one.peer, message.answer)
             if key in open_requests:
                 return f"{_name(one)} came although the one before was not answered yet"
             open_requests.add(key)
-        if isinstance(message, m.Trigger):  # which may stand between two questions
+        if isinstance(message, m.Trigger):  # a trigger may stand between two queries
             open_requests -= {(one.peer, m.QueryAnswer), (one.peer, m.StatusReport)}
         elif message is not None and one.sender is Sender.CAMERA:
             open_requests.discard((one.peer, type(message)))
@@ -142,7 +142,7 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
 
 
 def triggers_as_told(run: ClientRun) -> str | None:
-    """The client sends as many triggers as its task says."""
+    """The client sends the number of triggers in its task."""
     count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
     if count != run.scene.wanted:
         return f"it sent {count} triggers, {run.scene.wanted} were asked for"
@@ -181,8 +181,8 @@ def stops_first(run: ClientRun) -> str | None:
 
 def waits_for_switch(run: ClientRun) -> str | None:
     """The client gives no command between SwitchApplication and its answer."""
-    switching: Said | None = None
-    for one in run.said:
+    switching: WireMessage | None = None
+    for one in run.messages:
         if isinstance(one.message, m.SwitchApplication):
             switching = one
         elif isinstance(one.message, m.SwitchAnswer):
@@ -196,20 +196,20 @@ def waits_for_switch(run: ClientRun) -> str | None:
 def is_quiet_while_busy(run: ClientRun) -> str | None:
     """The client gives no command while the last status that was sent has BUSY."""
     since: float | None = None
-    for one in run.said:
+    for one in run.messages:
         if isinstance(one.message, m.StatusReport) and not one.lost:
             busy = Status.BUSY in one.message.status
             since = None if not busy else one.time if since is None else since
         elif since is not None and _is_command(one) and one.time - since > GRACE:
-            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was told"
+            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was sent"
     return None
 
 
-def _is_command(one: Said) -> bool:
-    """Return True if a message is a command; questions and the session's end are not."""
+def _is_command(one: WireMessage) -> bool:
+    """Return True if a message is a command; queries and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 
 
-def _name(one: Said) -> str:
+def _name(one: WireMessage) -> str:
     return one.hex if one.message is None else type(one.message).__name__

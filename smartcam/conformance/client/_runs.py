@@ -1,4 +1,4 @@
-"""One task in one scene: what the client made of it, and what went over the wire."""
+"""One task in one scene: its outcome, and the messages on the wire."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 SETTLING = 0.3
-"""Seconds that the camera gets to hear the end of a client that has ended: loopback is faster."""
+"""Seconds that the camera waits for the end of a client that has ended: loopback is faster."""
 
 MAX_LINES = 40
 """Largest number of lines of the wire that a finding shows: the last ones."""
 
 
-class Said(NamedTuple):
-    """Something that went over the wire."""
+class WireMessage(NamedTuple):
+    """A message, or other bytes, on the wire."""
 
     time: float  # seconds since the scene began
     sender: Sender  # side that sent it
@@ -38,7 +38,7 @@ class Said(NamedTuple):
     message: Message | None  # decoded message; None for bytes that are no message of the dialect
     text: str  # the message with its fields, ``?`` for none
     hex: str  # the frame as it passed, or the bytes
-    error: str | None = None  # reason why the camera ignored it; None if it did not
+    error: str | None = None  # reason why the camera ignored it, if it did
     lost: bool = False  # whether the message was lost on the way
 
     def __str__(self) -> str:
@@ -51,14 +51,14 @@ class Said(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientRun:
-    """A task that was done, or not.
+    """A task that a client has tried to do.
 
     Attributes:
         scene: the camera.
         task: the task.
         dialect: name of the dialect that was spoken.
         outcome: outcome as the client reports it.
-        said: messages on the wire, in the order in which the camera saw them.
+        messages: messages on the wire, in the order in which the camera saw them.
         timeout: seconds that the client had.
     """
 
@@ -66,19 +66,19 @@ class ClientRun:
     task: Task
     dialect: FramedDialect
     outcome: Outcome
-    said: tuple[Said, ...]
+    messages: tuple[WireMessage, ...]
     timeout: float
 
     @property
-    def requests(self) -> Iterator[tuple[int, Said]]:
-        """The client's messages, with their places in ``said``."""
-        return ((n, one) for n, one in enumerate(self.said) if one.sender is Sender.CLIENT)
+    def requests(self) -> Iterator[tuple[int, WireMessage]]:
+        """The client's messages, with their places in ``messages``."""
+        return ((n, one) for n, one in enumerate(self.messages) if one.sender is Sender.CLIENT)
 
     @property
     def sent_turns(self) -> list[int]:
         """Turns of the results that really came from the application, in order."""
         found: list[int] = []
-        for one in self.said:
+        for one in self.messages:
             if isinstance(one.message, ResultContainer) and not one.lost:
                 content = read_container(one.message.data)
                 if content is not None and content[0] == self.scene.application:
@@ -87,16 +87,16 @@ class ClientRun:
 
     def status_before(self, place: int) -> Status | None:
         """Return the last status that the camera had sent before a place, None for none."""
-        for one in reversed(self.said[:place]):
+        for one in reversed(self.messages[:place]):
             if isinstance(one.message, StatusReport) and not one.lost:
                 return one.message.status
         return None
 
     @property
     def lines(self) -> list[str]:
-        """The last of what went over the wire, for people."""
-        left_out = len(self.said) - MAX_LINES
-        lines = [str(one) for one in self.said[-MAX_LINES:]]
+        """The last messages on the wire as lines, for people."""
+        left_out = len(self.messages) - MAX_LINES
+        lines = [str(one) for one in self.messages[-MAX_LINES:]]
         return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
 
 
@@ -108,7 +108,7 @@ async def perform(
     transport: str = "tcp",
     timeout: float = 30.0,
 ) -> ClientRun:
-    """Have a client do its task in a scene.
+    """Run a client's task in a scene.
 
     Args:
         client: the client.
@@ -148,23 +148,23 @@ async def perform(
         began = camera.clock.now
         outcome = await client.perform(task, timeout)
         await _settle(camera)
-        said = tuple(_said(camera.spoken, one, began) for one in _merged(camera.log))
+        messages = tuple(_message_of(camera.spoken, one, began) for one in _merged(camera.log))
     return ClientRun(
         scene=scene,
         task=task,
         dialect=camera.spoken,
         outcome=outcome,
-        said=said,
+        messages=messages,
         timeout=timeout,
     )
 
 
 async def _settle(camera: EmulatedCamera) -> None:
-    """Wait until the camera has heard what the client said last."""
+    """Wait until the camera has received the client's last message."""
     end = time.monotonic() + SETTLING
     seen = -1
     while time.monotonic() < end:
-        # each turn of the loop takes datagrams and deliveries that are there already
+        # each turn of the loop handles datagrams and deliveries that are there already
         for _ in range(5):
             await asyncio.sleep(0)
         if not camera.links or (camera.transport == "udp" and len(camera.log) == seen):
@@ -174,7 +174,7 @@ async def _settle(camera: EmulatedCamera) -> None:
 
 
 def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
-    """Join the entry of a whole frame that is ignored with the one that says why."""
+    """Join the entry of an ignored frame with the entry that gives the reason."""
     merged: list[LogEntry] = []
     for one in log:
         before = merged[-1] if merged else None
@@ -193,12 +193,12 @@ def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
     return merged
 
 
-def _said(dialect: FramedDialect, entry: LogEntry, began: float) -> Said:
+def _message_of(dialect: FramedDialect, entry: LogEntry, began: float) -> WireMessage:
     data = entry.wire
     if data is None and entry.message_id is not None:
         payload = bytes.fromhex(entry.hex)
         data = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
-    return Said(
+    return WireMessage(
         entry.time - began,
         Sender.CLIENT if entry.direction == "in" else Sender.CAMERA,
         entry.peer,

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from smartcam.protocols import FramedDialect
 
 APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
-"""The application that is loaded at first, one to switch to, one that sends results by itself, and
+"""The application that is loaded at first, one to switch to, one that sends results unasked, and
 an id that no application has."""
 
 WAIT = 0.25
 """Seconds for which a message is held back; a client's time-outs are longer."""
 
 LONG = 1.0
-"""Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to meet
+"""Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to see
 it."""
 
 STATUS_GO = 0x280
@@ -80,7 +80,7 @@ class Scene:
 
     Attributes:
         name: name of the scene.
-        about: text on what is special about the scene, for people.
+        about: text about the special condition of the scene, for people.
         verb: verb of the task.
         number: number of the task.
         active: application that is loaded at first.
@@ -117,7 +117,7 @@ class Scene:
 
 def _unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
     data = dialect.encode_frame(Frame(0x77, b"new in this firmware"))
-    # not before the answer to Connect: until then the camera says nothing (SC-A28, published)
+    # not before the answer to Connect: until then the camera sends nothing (SC-A28, published)
     between = ("StatusReport", "QueryAnswer", "ResultContainer")
     return [f.Insert(data=data, on=one, where="before", times=None) for one in between]
 
@@ -236,7 +236,7 @@ SCENES: Mapping[str, Scene] = {
         ),
         Scene(
             name="unknown_messages",
-            about="messages with an id that nobody knows come in between",
+            about="messages with an unknown id come in between",
             faults=_unknown_messages,
         ),
         Scene(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.conformance.client._tasks import Task
 
 MAX_SECONDS = 3600
-"""Seconds that a task may be given at most."""
+"""Largest number of seconds for a task."""
 
 _RUNS: pytest.StashKey[dict[tuple[type, str, str, str], ClientRun]] = pytest.StashKey()
 
@@ -31,12 +31,12 @@ class ClientOptions(NamedTuple):
 
     command: str | None = None  # ``--client-command``, None if it is not given
     dialects: tuple[str, ...] | None = None  # ``--client-dialect``, names with commas between them
-    transports: tuple[str, ...] | None = None  # ``--client-transport``, the same
+    transports: tuple[str, ...] | None = None  # ``--client-transport``, with commas
     timeout: float | None = None  # ``--client-timeout``, seconds
 
 
 def read_options(config: Any) -> ClientOptions:
-    """Read the options from pytest's ``config``; none is given where no plugin has them.
+    """Read the options from pytest's ``config``; without the plugin all are None.
 
     Raises:
         pytest.UsageError: a value is not valid.
@@ -66,18 +66,18 @@ def _names(config: Any, option: str, known: Sequence[str]) -> tuple[str, ...] | 
 
 
 class ClientConformance:
-    """Tests of a client: each check in each dialect over each transport that it claims.
+    """Tests of a client: each check in each dialect over each transport that the client supports.
 
-    Inherit from it and say how the client is run: a :attr:`command`, or override :meth:`perform`.
-    The tests are synchronous and need no other plugin. What a test with grade "should" finds does
-    not fail it; the plugin ``smartcam`` shows it at the end.
+    Subclass it and set how to run the client: a :attr:`command`, or override :meth:`perform`.
+    The tests are synchronous and need no other plugin. A breach of a rule with grade "should" does
+    not fail its test; the plugin ``smartcam`` shows it at the end.
 
     Attributes:
         command: program and arguments, see :class:`~smartcam.conformance.client.CommandClient`;
-            ``--client-command`` where it is None.
+            None for ``--client-command``.
         dialects: names of the dialects that the client speaks.
         transports: names of the transports that the client can use.
-        timeout: seconds that a task may take. A client's own time-outs must end within it.
+        timeout: seconds for a task. A client's own timeouts must end within it.
     """
 
     command: ClassVar[str | Sequence[str] | None] = None
@@ -91,20 +91,20 @@ class ClientConformance:
         It runs in a thread of its own, an asynchronous one in a loop of its own.
 
         Args:
-            task: what to do.
+            task: the task.
 
         Returns:
             The data of the results, in order, each without the application's id.
 
         Raises:
             NotImplementedError: the client cannot do such a task; its tests are skipped.
-            Exception: whatever says that the client has failed.
+            Exception: any error that means that the client has failed.
         """
         raise NotImplementedError
 
     @classmethod
     def pytest_generate_tests(cls, metafunc: pytest.Metafunc) -> None:
-        """Make a test of each check for each camera that it is about."""
+        """Make a test of each check for each camera that it applies to."""
         if "client_case" not in metafunc.fixturenames:
             return
         options = read_options(metafunc.config)
@@ -118,7 +118,7 @@ class ClientConformance:
         metafunc.parametrize("client_case", cases)
 
     def client(self, config: pytest.Config) -> Client | None:
-        """Return the client that is judged, None if nothing says which one."""
+        """Return the client to judge, None without one."""
         if type(self).perform is not ClientConformance.perform:
             return FunctionClient(self.perform)
         command = self.command or read_options(config).command
@@ -130,7 +130,7 @@ class ClientConformance:
         request: pytest.FixtureRequest,
         record_property: Callable[[str, object], None],
     ) -> None:
-        """Have the client do the check's task, and judge what it did."""
+        """Run the check's task with the client, and judge the run."""
         check, dialect, transport = client_case
         run = self._run(check, dialect, transport, request.config)
         if not run.outcome.supported:
@@ -146,7 +146,7 @@ class ClientConformance:
     def _run(
         self, check: ClientCheck, dialect: str, transport: str, config: pytest.Config
     ) -> ClientRun:
-        """Return a run of the check's scene; several checks look at one."""
+        """Return a run of the check's scene; several checks share one run."""
         runs = config.stash.setdefault(_RUNS, {})
         key = (type(self), check.scene.name, dialect, transport)
         if key not in runs:

@@ -1,9 +1,9 @@
 """The tasks for a client, and the ways to run one: a command, or a Python function.
 
 A command gets the task as arguments and prints one line for each result: the bytes of the result
-container behind the application's id as hex, or a JSON object that has them as ``data`` or ``raw``.
-It ends with 0 where it has done the task, with 77 where it cannot do such a task at all, and with
-anything else where it failed.
+container after the application id as hex, or a JSON object that has them as ``data`` or ``raw``.
+Its exit code is 0 if it has done the task, 77 if it cannot do such a task at all, and any other
+number if it failed.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     Perform: TypeAlias = "Callable[[Task], Iterable[bytes] | Awaitable[Iterable[bytes]]]"
 
 UNSUPPORTED = 77
-"""Exit code of a command that cannot do such a task: what automake's tests mean by "skipped"."""
+"""Exit code of a command that cannot do such a task; automake's tests use it for "skipped"."""
 
 MAX_OUTPUT_BYTES = 1 << 20
 """Largest number of bytes of a command's output that are read; a client that prints more has
 failed."""
 
-SHOWN = 2000
-"""Characters of a command's output that a report shows."""
+SHOWN_LENGTH = 2000
+"""Largest number of characters of a command's output that a report shows."""
 
 DYING = 2.0
-"""Seconds in which a client has to end that was told to."""
+"""Seconds that a client has for its end, after the request to end."""
 
 Verb = Literal["trigger", "switch", "watch"]
 
@@ -53,12 +53,12 @@ class Task:
       print each result, disconnect.
     - ``switch ID``: connect, have application ID loaded and running, trigger once, print the
       result, disconnect.
-    - ``watch N``: connect, print the next N results that come by themselves, disconnect.
+    - ``watch N``: connect, print the next N unasked results, disconnect.
 
     Attributes:
         verb: the first word of the task.
         number: N or ID; None for one trigger.
-        url: the camera's address as smartcam has it, its dialect pinned.
+        url: the camera's address in smartcam's form, with the dialect pinned.
         host: name or address of the camera's host.
         port: number of the camera's port.
         transport: ``tcp`` or ``udp``.
@@ -79,7 +79,7 @@ class Task:
         return [self.verb, *([] if self.number is None else [str(self.number)])]
 
     def __str__(self) -> str:
-        """Return the task in the words that a command gets."""
+        """Return the task as a command gets it."""
         return " ".join(self.words)
 
 
@@ -88,8 +88,8 @@ class Outcome(NamedTuple):
 
     Attributes:
         results: data of the results that the client gave, in order.
-        error: the client's words on its failure; None if the client reports success.
-        ended: whether the client came to an end in time.
+        error: the client's text about its failure; None if the client reports success.
+        ended: whether the client ended in time.
         supported: whether the client can do such a task at all.
         seconds: duration of the task.
         said: further output of the client, shortened.
@@ -104,40 +104,40 @@ class Outcome(NamedTuple):
 
 
 class Client(ABC):
-    """A client as it is judged: something that does tasks."""
+    """A client to be judged, which does tasks."""
 
     @abstractmethod
     async def perform(self, task: Task, timeout: float) -> Outcome:
-        """Have a task done.
+        """Do a task.
 
         Args:
-            task: what to do.
-            timeout: seconds, then the client is ended.
+            task: the task.
+            timeout: seconds until the client is stopped.
 
         Returns:
-            What came of it; a client that fails, or does not end, is no error here.
+            The outcome; a client that fails, or does not end, is no error here.
 
         Raises:
-            ConfigurationError: the client cannot even be started.
+            ConfigurationError: the client cannot be started.
         """
 
 
 class FunctionClient(Client):
-    """A client behind a Python function, in a thread of its own.
+    """A client called by a Python function, in a thread of its own.
 
     Args:
-        function: function that takes a task, returns the results' bytes; plain or asynchronous. It
-            raises NotImplementedError for a task that it cannot do, any other exception where it
-            failed. Returning from it means that all is well.
+        function: function that gets a task and returns the results' bytes; plain or asynchronous.
+            It raises NotImplementedError for a task that it cannot do, any other exception for a
+            failure. Returning means success.
     """
 
     def __init__(self, function: Perform) -> None:
         self._function = check_callable(function, "function", "client")
 
     async def perform(self, task: Task, timeout: float) -> Outcome:
-        """Have a task done, see :meth:`Client.perform`.
+        """Do a task, see :meth:`Client.perform`.
 
-        A plain function that does not end is left behind in its thread, which does not keep the
+        A plain function that does not end is left in its thread, which does not keep the
         process alive; an asynchronous one is cancelled.
         """
         worker = _Worker(self._function, task)
@@ -181,11 +181,11 @@ class _Worker:
         except NotImplementedError as exc:
             self.outcome = Outcome(supported=False, said=str(exc))
         except BaseException as exc:  # noqa: BLE001 - whatever a client raises is its failure
-            self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:SHOWN])
-        with contextlib.suppress(RuntimeError):  # nobody waits any more
-            self._home.call_soon_threadsafe(self._tell)
+            self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:SHOWN_LENGTH])
+        with contextlib.suppress(RuntimeError):  # the waiting loop is closed
+            self._home.call_soon_threadsafe(self._wake)
 
-    def _tell(self) -> None:
+    def _wake(self) -> None:
         if not self.done.done():
             self.done.set_result(None)
 
@@ -204,13 +204,13 @@ class _Worker:
 
 
 class CommandClient(Client):
-    """A client behind a command, in any language.
+    """A client run by a command, in any language.
 
     Args:
         command: the program and its arguments. ``{host}``, ``{port}``, ``{url}``, ``{transport}``,
             ``{dialect}`` and ``{task}`` are replaced; an argument that is ``{task}`` alone becomes
             the task's words: ``trigger``, or ``switch`` and ``3``. A text is split as a shell does.
-        cwd: folder to run it in; default the present one.
+        cwd: folder to run it in; default the current one.
 
     Raises:
         ConfigurationError: the command has no place for the task or for the camera's address.
@@ -253,9 +253,9 @@ class CommandClient(Client):
         return result
 
     async def perform(self, task: Task, timeout: float) -> Outcome:
-        """Have a task done, see :meth:`Client.perform`.
+        """Do a task, see :meth:`Client.perform`.
 
-        A command that does not end is killed, with all that it has started where the system can.
+        A command that does not end is killed, and so are its child processes if the system can.
         """
         arguments, began = self.arguments(task), time.monotonic()
         try:
@@ -301,7 +301,7 @@ async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
-    """Kill what still runs, and close the pipes."""
+    """Kill the process if it still runs, and close the pipes."""
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             if hasattr(os, "killpg"):
@@ -311,18 +311,18 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(DYING):
             await process.wait()
-    transport = getattr(process, "_transport", None)  # the only way to close pipes that others hold
+    transport = getattr(process, "_transport", None)  # closes pipes that child processes hold
     if transport is not None:
         transport.close()
 
 
 def _shorten(data: bytes) -> str:
     text = data.decode(errors="replace").strip()
-    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
+    return text if len(text) <= SHOWN_LENGTH else text[:SHOWN_LENGTH] + "..."
 
 
 def read_results(output: bytes) -> tuple[bytes, ...]:
-    """Read what a command printed: one result a line, empty lines aside.
+    """Read a command's output: one result a line, without empty lines.
 
     Raises:
         ValueError: a line is not valid.

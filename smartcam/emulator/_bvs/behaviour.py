@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 class Behaviour:
     """The behaviour of a camera beyond its answers to requests."""
 
-    coded: bool = False  # whether its answers have a result code
-    acknowledges: bool = False  # every request is answered with one
-    tells_bad_messages: bool = False  # unknown and malformed requests are answered with one, too
-    answers_disconnect: bool = False  # so is Disconnect
+    coded: bool = False  # answers have a result code
+    acknowledges: bool = False  # every request is answered with a result code
+    tells_bad_messages: bool = False  # unknown and malformed requests, too
+    answers_disconnect: bool = False  # Disconnect is answered, too
     runs_always: bool = False  # there is no run mode to enter or leave; not Ready is BUSY
     status_with_session: bool = True  # a status comes after Connect
-    reports_changes: bool = True  # a status comes with every change of it
+    reports_changes: bool = True  # every change of the status is reported
     sticky_errors: bool = False  # error bits stay until they are reset
 
     @property
@@ -39,8 +39,8 @@ SMART_CAMERA = Behaviour()
 def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:
     """Return the behaviour of a camera that speaks ``dialect``.
 
-    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the rest is told at the
-    quirks.
+    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the quirks have the
+        sources of the rest.
     """
     if not dialect.has(m.TriggerAnswer):
         return Behaviour(coded="code" in dialect.quirks)

@@ -32,7 +32,7 @@ class CalendarClock:
         self._time = self._time.replace(tzinfo=UTC)
 
     def read(self, now: int) -> datetime:
-        """Return the time it shows; it stops at the end of the year 9999."""
+        """Return the time that the clock shows; it stops at the end of the year 9999."""
         try:
             return self._time + timedelta(microseconds=(now - self._set_at) // 1000)
         except OverflowError:
@@ -51,7 +51,7 @@ class CalendarClock:
         return True
 
     def answer(self, now: int, *, code: int = 0) -> m.ClockAnswer:
-        """Return the time it shows as a message."""
+        """Return the time that the clock shows as a message."""
         time = self.read(now)
         return m.ClockAnswer(code=code, **{name: getattr(time, name) for name in _UNITS})
 
@@ -73,7 +73,7 @@ class InputQueue:
 
     @property
     def was_given(self) -> bool:
-        """True if there was a container since everything was forgotten."""
+        """True if there was a container since the last :meth:`clear`."""
         return bool(self._queue) or self._last is not None
 
     def put(self, values: Mapping[str, Any]) -> bool:
@@ -87,7 +87,7 @@ class InputQueue:
     def take(self) -> tuple[Mapping[str, Any] | None, bool]:
         """Return the next container, or the last one again and False.
 
-        None stands for the one before the first: zeros.
+        None stands for the values before the first container: zeros.
         """
         fits = bool(self._queue)
         if fits:
@@ -95,7 +95,7 @@ class InputQueue:
         return self._last, fits
 
     def clear(self) -> None:
-        """Forget everything, the last one too."""
+        """Forget all containers, including the last one."""
         self._queue.clear()
         self._last = None
 
@@ -104,6 +104,6 @@ class InputQueue:
 class RunChange:
     """The changes that faults make to one inspection."""
 
-    late: int = 0  # additional duration, nanoseconds
+    late: int = 0  # additional duration of the inspection, nanoseconds
     silent: bool = False  # whether the evaluation sends nothing
-    extra: int = 0  # number of times that its container comes again
+    extra: int = 0  # number of repetitions of its container

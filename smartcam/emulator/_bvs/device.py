@@ -1,4 +1,4 @@
-"""The camera behind the wire: a model that is moved by time differences.
+"""The device of an emulated camera: a model whose time is advanced by its caller.
 
 It knows no socket, loop or clock. Messages of the active session go in by :meth:`Device.handle`,
 time by :meth:`Device.tick`; the camera's messages are taken with :meth:`Device.take_output`.
@@ -6,8 +6,8 @@ time by :meth:`Device.tick`; the camera's messages are taken with :meth:`Device.
 Inside, time is in whole nanoseconds, and each future event is a row of one small table: instant by
 kind. Events at the same instant happen in the order of :class:`_Event`.
 
-Facts stand in ``docs/protocol.md``. Where the documents are silent the choice is a field of
-:class:`~smartcam.emulator.Quirks`, or is marked *inferred* here.
+Facts stand in ``docs/protocol.md``. Where the documents are silent, a field of
+:class:`~smartcam.emulator.Quirks` decides, or the choice is marked *inferred* in this module.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ PROTOCOL_VERSION = 1
 """The answer to Connect (SC manual p. 29, published)."""
 
 OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
-"""Bits that nothing in the model sets: :meth:`Device.set_condition` does."""
+"""Bits that only an operator sets, by :meth:`Device.set_condition`."""
 
 _DATA = "data"  # the only value of input data that the device does not read
 
 _NUMBERS = 1 << 32  # sequence numbers are UINT32
 
-# the status is put together as a plain number: with an IntFlag each step of that costs a call
+# the status is a plain number, since each step of an IntFlag costs a call
 _BUSY = Status.BUSY.value
 _RUNNING = Status.RUNNING.value
 _WAITING = Status.WAITING_FOR_TRIGGER.value
@@ -104,7 +104,7 @@ class _Inspection(NamedTuple):
 
 
 class LastReport(NamedTuple):
-    """The report of a run, whether or not a client received it."""
+    """The report of a run, even if no client received it."""
 
     time: float  # seconds
     byte_order: ByteOrder
@@ -112,15 +112,15 @@ class LastReport(NamedTuple):
 
 
 MAX_EXTRA = 1000
-"""Copies of one run's container that a fault may send at most."""
+"""Largest number of copies of one run's container that a fault may send."""
 
 
 class Device:
     """One camera.
 
     Args:
-        applications: the programs stored on it; at least one, ids differ.
-        active: id of the loaded one; by default the first.
+        applications: the programs stored on it; at least one, with different ids.
+        active: id of the loaded application; by default the first.
         running: True for run mode from the beginning.
         quirks: assumptions about unknown behaviour of real cameras.
         clock_time: first time of its clock; a time without a zone is used unchanged.
@@ -134,7 +134,7 @@ class Device:
             time and afterwards sends the messages that the action caused.
 
     Raises:
-        ConfigurationError: no application, one id twice, or ``active`` is none of them.
+        ConfigurationError: no application, one id twice, or ``active`` is not among them.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Device:
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
         self.sessions: int = 0
-        self._owes_switch = False  # the session's
+        self._switch_answer_due = False  # an answer to a switch is due in this session
         self.last_report: LastReport | None = None
         self._output: list[m.Message] = []
         self._reported: tuple[int, int] | None = None
@@ -182,7 +182,7 @@ class Device:
         if running or behaviour.runs_always:
             self._enter_run_mode()
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def applications(self) -> Mapping[int, Application]:
@@ -206,7 +206,7 @@ class Device:
 
     @property
     def processing(self) -> bool:
-        """True while an inspection is under way."""
+        """True while an inspection is running."""
         return self._processing
 
     @property
@@ -248,8 +248,8 @@ class Device:
     def status(self) -> Status:
         """The status word.
 
-        Source: SC manual p. 30 and p. 33 (published); BUSY during an inspection is a quirk; a
-        camera with a System Error takes no trigger (inferred).
+        Source: SC manual p. 30 and p. 33 (published); BUSY during an inspection is a quirk; that
+            a camera with a System Error accepts no trigger is inferred.
         """
         return Status(self._status_word())
 
@@ -272,7 +272,7 @@ class Device:
     # ------------------------------------------------------------------ the wire
 
     def handle(self, message: m.Message) -> None:
-        """Take a message of the client; without a session everything but Connect is ignored.
+        """Handle a message of the client; without a session only Connect has an effect.
 
         The caller must pass only one client's messages. Never raises.
         """
@@ -289,11 +289,11 @@ class Device:
         self._advance(self._now)
 
     def connect(self) -> None:
-        """Begin a session: send the answer, then any status.
+        """Begin a session: send the answer, then the status if the dialect sends one.
 
         Source: SC manual p. 28, 29 (published); that ``bid`` sends no status is inferred.
         """
-        self._session, self._owes_switch = True, False
+        self._session, self._switch_answer_due = True, False
         self.sessions += 1
         self._enter(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
@@ -304,20 +304,20 @@ class Device:
             self._reported = (self._status_word(), self._endian)
 
     def disconnect(self) -> None:
-        """End the session; the camera goes on without sending anything.
+        """End the session; the camera continues without sending anything.
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
         if self._session:
             self._enter(DeviceState.DISCONNECTED)
-        self._session = self._owes_switch = False  # an answer is for the client that asked
+        self._session = self._switch_answer_due = False  # only the asking client gets an answer
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
         """Call a function for every state that the device enters from now on.
 
-        It is called right after the event that led to the state; after a message or an operator's
-        action by the next :meth:`tell_entered`.
+        It is called right after the event that led to the state; for a message or an operator's
+        action, by the next :meth:`tell_entered`.
         """
         self._on_entered = on_entered
         self._bits = self._status_word()
@@ -344,7 +344,7 @@ class Device:
         self._advance(self._now + nanoseconds(dt))
 
     def next_event_in(self) -> float | None:
-        """Return the seconds until something happens by itself, None if nothing will."""
+        """Return the seconds until the next scheduled event, None without one."""
         if not self._events:
             return None
         return max(0, min(when for when, _ in self._events.values()) - self._now) / NANOSECONDS
@@ -372,7 +372,7 @@ class Device:
     def switch_application(self, application: int, *, running: bool = False) -> bool:
         """Load another application without the client's knowledge.
 
-        It is stopped for that, whatever the quirks say about a client's switch.
+        The application is stopped first, regardless of quirks of a client's switch.
 
         Args:
             application: id of the application to load.
@@ -407,11 +407,11 @@ class Device:
     def set_condition(self, condition: Status, on: bool) -> None:
         """Set or clear Overheat or System Error.
 
-        With a System Error the inspection under way is void, and none begins until it is cleared
+        With a System Error the running inspection is void, and none begins until it is cleared
         (inferred); a reboot clears it.
 
         Raises:
-            ConfigurationError: another bit, which follows from the camera's state.
+            ConfigurationError: another bit, which only the camera's state sets.
         """
         condition = check_kind(condition, Status, "condition", "a Status", "device")
         on = check_flag(on, "on", "device")
@@ -460,7 +460,7 @@ class Device:
         self._trigger_drops += check_integer(count, "count", 0, who="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
-        """Change the inspection under way, else the next that begins.
+        """Change the running inspection, or else the next one.
 
         Args:
             late: seconds by which the inspection takes longer.
@@ -479,7 +479,7 @@ class Device:
                 self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
 
     def end_faults(self) -> None:
-        """Undo all faults: BUSY falls, and the next triggers are taken as usual."""
+        """Undo all faults: BUSY is cleared, and triggers are accepted again."""
         with self.around():
             self._forget_faults()
             self._report()
@@ -503,12 +503,12 @@ class Device:
                     self._acknowledge(message, self._ready_code)
                 self._trigger()
             case m.Query():
-                self._say(self._name_active())
+                self._send(self._name_active())
             case m.SwitchApplication(application=application):
                 self._switch(application)
             case m.GetClock():
                 code = ResultCode.OK_DATE_TIME if self.behaviour.coded else 0
-                self._say(self._clock.answer(self._now, code=code))
+                self._send(self._clock.answer(self._now, code=code))
             case m.SetClock():
                 done = self._clock.set(message, self._now)
                 self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
@@ -524,7 +524,7 @@ class Device:
             case m.Reboot():
                 self._reboot()
             case m.GetStatus():
-                self._say_status()
+                self._send_status()
             case m.ResetErrors():
                 self._reset_errors(message)
             case m.UnknownMessage(message_id=message_id):
@@ -538,29 +538,29 @@ class Device:
         """Answer a request that other cameras do not answer."""
         answer = request.answer
         if self.behaviour.acknowledges and answer and issubclass(answer, m.Acknowledgement):
-            self._say(answer(code=code))
+            self._send(answer(code=code))
 
     def _complain(self, message_id: int, code: int) -> None:
-        """Answer a bad message with its result code, except as a smart camera (SC manual p. 28)."""
+        """Answer a bad message with a result code; a smart camera ignores it (SC manual p. 28)."""
         if self.behaviour.tells_bad_messages:
-            self._say(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
+            self._send(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
 
     @property
     def _ready_code(self) -> int:
         return ResultCode.BUSY if self._status_word() & _BUSY else ResultCode.OK
 
     def _name_active(self) -> m.QueryAnswer:
-        """Send the active application; ``bid`` does not while another one is being loaded."""
+        """Send the active application; ``bid`` waits while another one is being loaded."""
         if self.behaviour.acknowledges and self._mode is Mode.SWITCHING:
             return m.QueryAnswer(code=ResultCode.BUSY, application=0)
         code = ResultCode.OK_INSPECTION_ID if self.behaviour.coded else 0
         return m.QueryAnswer(code=code, application=self._active.id)
 
     def _reset_errors(self, request: m.ResetErrors) -> None:
-        """Clear the sticky bits; a status follows, whatever was set (BVS ID guide p. 227)."""
+        """Clear the sticky bits; a status follows in any case (BVS ID guide p. 227)."""
         self._conditions &= ~(_OVERTRIGGERED | _INPUT_CONTAINER)
         self._acknowledge(request, ResultCode.OK)
-        self._say_status()
+        self._send_status()
 
     def _enter_run_mode(self) -> None:
         if self._mode is not Mode.STOPPED:
@@ -581,8 +581,8 @@ class Device:
     def _trigger(self) -> bool:
         """Begin an inspection, or drop the trigger and report that.
 
-        A stopped, switching or untriggered application ignores it (mvBlueGEMINI manual p. 31 and
-        the newest SC manual p. 48, published).
+        A stopped or switching application ignores it, and so does one without triggers
+        (mvBlueGEMINI manual p. 31 and the newest SC manual p. 48, published).
         """
         if self._mode is not Mode.RUNNING or not self._active.triggered or not self._takes_runs:
             return False
@@ -601,15 +601,15 @@ class Device:
     def _switch(self, application: int) -> None:
         always = self.behaviour.runs_always
         if always and self._status_word() & _BUSY:
-            self._say(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
+            self._send(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
             return
         if self._mode is Mode.SWITCHING:
             return  # not answered: inferred
-        target = self._applications.get(application)  # 0 is never used
+        target = self._applications.get(application)  # no application has id 0
         stopped = always or self._mode is not Mode.RUNNING
         how = "allow" if stopped else self.quirks.switch_while_running
         if target is None or how == "refuse":
-            self._say(m.SwitchAnswer(code=self.behaviour.refused, application=self._active.id))
+            self._send(m.SwitchAnswer(code=self.behaviour.refused, application=self._active.id))
         elif how == "allow":
             self._load(target, answer=True, running=False)
 
@@ -618,7 +618,7 @@ class Device:
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
         self._set_mode(Mode.SWITCHING)
-        self._owes_switch = answer
+        self._switch_answer_due = answer
         finish = functools.partial(self._finish_load, target, running=running)
         self._after(target.load_time, _Event.LOADED, finish)
         self._report()
@@ -644,7 +644,7 @@ class Device:
         self._events[event] = (self._now + nanoseconds(seconds), action)
 
     def _advance(self, target: int) -> None:
-        """Let everything happen that is due until ``target``."""
+        """Run all events that are due until ``target``."""
         while self._events:
             when, event = min([(row[0], event) for event, row in self._events.items()])
             if when > target:
@@ -672,13 +672,13 @@ class Device:
         self._forget_inputs()
         self._set_mode(Mode.STOPPED)
         message = m.SwitchAnswer(code=0, application=target.id)
-        answer, self._owes_switch = self._owes_switch, False
+        answer, self._switch_answer_due = self._switch_answer_due, False
         before = self.quirks.switch_answer == "before_status"
         if answer and before:
-            self._say(message)
+            self._send(message)
         self._report()
         if answer and not before:
-            self._say(message)
+            self._send(message)
         if running or self.behaviour.runs_always:
             self._enter_run_mode()
 
@@ -711,7 +711,7 @@ class Device:
         return "big" if self._endian == 1 else "little"
 
     def _plan_free_run(self, origin: int, count: int) -> None:
-        """Plan run ``count`` of a free-running application, counted from its start: no drift."""
+        """Schedule run ``count`` of a free-running application, timed from its start: no drift."""
         when = origin + nanoseconds(count / (self._active.rate or 1.0))
         self._events[_Event.FREE_RUN] = (
             when,
@@ -720,11 +720,11 @@ class Device:
 
     def _begin_free_run(self, origin: int, count: int) -> None:
         self._plan_free_run(origin, count + 1)
-        if not self._takes_runs or self._processing:  # the last one is late
+        if not self._takes_runs or self._processing:  # the last run is late
             return
         self._begin_run()
         if not self._change.late and _Event.INSPECTED in self._events:
-            # a run never overlaps with the next, however both were rounded
+            # a run never overlaps with the next, whatever the rounding
             (ends, action), (following, _) = (
                 self._events[_Event.INSPECTED],
                 self._events[_Event.FREE_RUN],
@@ -732,7 +732,7 @@ class Device:
             self._events[_Event.INSPECTED] = (min(ends, following), action)
 
     def _begin_run(self) -> None:
-        """Take the next number and the next input container."""
+        """Begin a run with the next number and the next input container."""
         change = self._change
         run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), change)
         self._next_number = (self._next_number + 1) % _NUMBERS
@@ -747,14 +747,14 @@ class Device:
         self._report()
 
     def _inspect(self, application: InspectedApplication, run: _Inspection) -> None:
-        """Have a picture inspected for a run, which ends when that is done."""
+        """Start the inspection of a picture; the run ends when it is done."""
         data = b"" if run.input is None else run.input[_DATA]
         order = InspectionOrder(application.id, run.number, data)
         self._inspector = application.inspector
         application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
 
     def _inspected(self, run: _Inspection, found: Values | None) -> None:
-        """Take an inspector's result; a fault may make the run's end late."""
+        """Use an inspector's result; a fault may delay the run's end."""
         self._inspector = None
         with self.around():
             finish = functools.partial(self._finish_run, run, found)
@@ -762,7 +762,7 @@ class Device:
             self._advance(self._now)
 
     def _finish_run(self, run: _Inspection, found: Values | None = None) -> None:
-        """Send the result, then Waiting for Trigger rises again (the order is a quirk)."""
+        """Send the result, and set Waiting for Trigger (the order is a quirk)."""
         self._processing = False
         self._change = RunChange()
         result = self._result(run, found)
@@ -771,7 +771,7 @@ class Device:
         if result is not None and not run.change.silent:
             self.last_report = LastReport(self.time, self._byte_order, result)
             for _ in range(1 + run.change.extra):
-                self._say(result)
+                self._send(result)
         self._report()
 
     def _result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
@@ -811,7 +811,7 @@ class Device:
         return None if data is None else m.ResultContainer(application=application.id, data=data)
 
     def _void_run(self) -> None:
-        """Drop the inspection under way: no result comes from it (inferred)."""
+        """Drop the running inspection: it gives no result (inferred)."""
         if self._processing:
             self._change = RunChange()
         self._processing = False
@@ -823,7 +823,7 @@ class Device:
     # ------------------------------------------------------------------ input data
 
     def _take_input(self, data: bytes) -> bool:
-        """Queue a container; one that does not fit the layout is dropped (inferred): False."""
+        """Queue a container; drop one that does not fit the layout, and return False (inferred)."""
         values = None if self._mode is Mode.SWITCHING else self._read_input(data)
         if values is None:
             return False
@@ -860,7 +860,7 @@ class Device:
     def _in_step(self, *, fits: bool) -> None:
         """Set the bit if containers and inspections are out of step, else clear it.
 
-        A reference value does not queue, so it cannot get out of step.
+        A reference value is not queued, so it cannot get out of step.
         """
         self._conditions &= ~_INPUT_CONTAINER
         if not fits and not self.behaviour.acknowledges:
@@ -873,7 +873,7 @@ class Device:
 
     # ------------------------------------------------------------------ output
 
-    def _say(self, message: m.Message) -> None:
+    def _send(self, message: m.Message) -> None:
         if self._session:
             self._output.append(message)
 
@@ -886,23 +886,23 @@ class Device:
         self._enter(DeviceState(mode.value))
 
     def _note_bits(self, word: int) -> None:
-        """Note which bits of the status word have risen."""
+        """Note which bits of the status word were set anew."""
         risen, self._bits = word & ~self._bits, word
         self._entered += risen_states(risen)
 
     def _report(self) -> None:
-        """Send the status if it differs from the one the client has."""
+        """Send the status if it differs from the last one that the client got."""
         now = (self._status_word(), self._endian)
         if self._on_entered is not None:
             self._note_bits(now[0])
         if now != self._reported and self.behaviour.reports_changes:
             self._reported = now
-            self._say(_status_report(*now))
+            self._send(_status_report(*now))
 
-    def _say_status(self) -> None:
-        """Send the status, even if the client has it."""
+    def _send_status(self) -> None:
+        """Send the status, even if the client has it already."""
         self._reported = now = (self._status_word(), self._endian)
-        self._say(_status_report(*now))
+        self._send(_status_report(*now))
 
     def _known(self, application: int) -> int:
         if application not in self._applications:

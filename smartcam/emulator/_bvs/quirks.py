@@ -1,11 +1,11 @@
 """The open questions about real cameras, as options.
 
-Each field is one open question: its default is what the emulator does, its description says why and
-how well that is founded. Grades: *published* in a manual of this product or a sibling, *inferred*,
+Each field is one open question: its default is the emulator's choice, its description gives the
+reason and its grade. Grades: *published* in a manual of this product or a sibling, *inferred*,
 *recommended* (nothing is known; some choice had to be made).
 
-Most act in ``device.py`` and ``behaviour.py`` beside this; ``bad_frame`` and ``second_client`` on
-the link and in the camera; those of :meth:`Quirks.of_the_wire` in ``protocols/_bvs.py``.
+``device.py`` and ``behaviour.py`` beside this file carry out most of them; the link and the camera,
+``bad_frame`` and ``second_client``; ``protocols/_bvs.py`` those of :meth:`Quirks.of_the_wire`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
     async with EmulatedInSight(jobs=[{"file": "7bolts.job", "cells": {"B2": 12.5}}]) as emulator:
         emulator.url    # insight://127.0.0.1:PORT
 
-What it answers, and what is known of that, stands in ``docs/insight.md``.
+The answers, and the sources of the facts, are in ``docs/insight.md``.
 """
 
 from __future__ import annotations
@@ -67,29 +67,29 @@ class EmulatedInSight(LineCamera):
     """An In-Sight camera made of software, on a real port.
 
     Several clients may be logged in at a time: that a camera has several users at once is
-    published, how many is not.
+    published, their largest number is not.
 
     Args:
         jobs: jobs stored on the camera: :class:`Job` or mappings of its fields.
-        users: password of each user; published is that a new camera has ``admin`` without one.
+        users: password of each user; it is published that a new camera has ``admin`` without one.
         model: name of the camera model, in the first line that the camera sends.
-        active: file, or id, of the job that is loaded at first; default the first of the jobs,
-            without any an empty one that was never saved.
+        active: file, or id, of the job that is loaded at first; default the first of the jobs;
+            without jobs, an empty one that was never saved.
         online: whether the camera is online at first.
         image: the 8 bit grey image that the camera sees; default a pattern.
         evaluations: answers to ``EV``: expression to the text that is sent; others fail.
-        info: what ``GI`` tells, instead of the emulator's own.
-        quirks: what is not known of real cameras: :class:`InSightQuirks` or a mapping.
+        info: lines of the answer to ``GI``, instead of the emulator's own.
+        quirks: unknown behaviour of real cameras: :class:`InSightQuirks` or a mapping.
         options: options of :class:`~smartcam.emulator.LineCamera`.
 
     Attributes:
-        device: the camera behind the wire, for looking; to make it do something, use the methods
-            of the emulator.
+        device: the camera itself, to be read only; to make it act, use the emulator's
+            methods.
         refuse_login: refuse every user.
-        silent: hear commands and do them, but send no answer.
+        silent: carry commands out, but send no answer.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     protocol: Protocol = INSIGHT
@@ -145,17 +145,17 @@ class EmulatedInSight(LineCamera):
 
     @classmethod
     def from_scenario(cls, plan: Scenario, **given: Any) -> Self:
-        """Return a camera of a scenario; without jobs it has the built-in ones."""
+        """Return a camera of a scenario; without jobs, with the built-in ones."""
         options = {"jobs": BUILTIN_JOBS, **plan.options}
         return super().from_scenario(plan.model_copy(update={"options": options}), **given)
 
     @classmethod
     def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which a job is active, and online, from the beginning."""
+        """Return the options for a camera whose job is active, and online, from the start."""
         return {"active": active, "online": running}
 
     def make_codec(self) -> LineCodec:
-        """Return the lines it speaks."""
+        """Return the codec of its lines."""
         return LineCodec(
             next(iter(INSIGHT.dialects)),
             ROWS,
@@ -165,11 +165,11 @@ class EmulatedInSight(LineCamera):
             encoding=words.ENCODING,
         )
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def application_ids(self) -> list[int]:
-        """Ids of the jobs on it that have one."""
+        """Ids of its jobs, as far as they have one."""
         return [job.id for job in self.device.jobs.values() if job.id is not None]
 
     def shown(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ class EmulatedInSight(LineCamera):
 
     @property
     def quirks(self) -> InSightQuirks:
-        """Its quirks."""
+        """The camera's quirks."""
         return self._commands.quirks
 
     @property
@@ -246,11 +246,11 @@ class EmulatedInSight(LineCamera):
         self.device.image = image
 
     def trigger(self) -> bool:
-        """Trigger by the input; False if the camera does not take it."""
+        """Trigger by the input; return False if the camera does not accept it."""
         return self.device.trigger()
 
     def load(self, job: str | int) -> None:
-        """Load a job by hand, at once and in either mode; a run under way ends without a result.
+        """Load a job by hand, at once and in either mode; a running run ends without a result.
 
         Args:
             job: file name or id of the job.
@@ -261,11 +261,11 @@ class EmulatedInSight(LineCamera):
         self.device.load(check_application_or_name(job, "job", "emulator"))
 
     def answer_next(self, code: int, *, command: str | None = None) -> None:
-        """Answer a command with a status code instead of doing it; the oldest order goes first.
+        """Answer a command with a status code instead of carrying it out; the oldest order counts.
 
         Args:
             code: the code.
-            command: the two letters of the command that is meant; default the next one, whichever.
+            command: the two letters of the command; default the next command of any kind.
 
         Raises:
             ConfigurationError: 1000 answers are ordered already.
@@ -278,19 +278,19 @@ class EmulatedInSight(LineCamera):
         self._ordered.append(_Ordered(code, None if command is None else command.upper()))
 
     def drop_connections(self) -> None:
-        """End every connection at once, as a broken network does. What is under way goes on."""
+        """End every connection at once, like a broken network. Running events continue."""
         for one in self._by_number():
             one.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
-        """Wait until clients have sent a command, since the beginning.
+        """Wait until clients have sent a command so many times since the beginning.
 
-        When it returns, the camera has begun to do it. The timeout runs in real time, whatever the
-        emulator's clock is.
+        On return, the camera has begun to carry the command out. The timeout runs in real time,
+        whatever the emulator's clock is.
 
         Args:
             command: the two letters of the command.
-            count: how often, what came before this call included.
+            count: number of times, including those before this call.
             timeout: seconds.
 
         Raises:
@@ -312,12 +312,12 @@ class EmulatedInSight(LineCamera):
     # ------------------------------------------------------------------ life
 
     async def stop(self) -> None:
-        """Close the port and every connection; the camera stands still. Nothing if stopped.
+        """Close the port and every connection; the camera stands still. Do nothing if stopped.
 
         Cancellation: everything is closed nevertheless.
         """
         with self.step():
-            pass  # what was due happens
+            pass  # events that were due happen
         await super().stop()
 
     # ------------------------------------------------------------------ clients
@@ -329,12 +329,12 @@ class EmulatedInSight(LineCamera):
         return TelnetClient(self, link, server, number)
 
     def greet(self, client: LineClient) -> None:
-        """Say the greeting and ask for the user."""
+        """Send the greeting and ask for the user."""
         if isinstance(client, TelnetClient):
             client.say_bytes(self.greeting(client.number))
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Do what a line says."""
+        """Carry out a line."""
         if isinstance(client, TelnetClient):
             client.take(line)
 
@@ -344,7 +344,7 @@ class EmulatedInSight(LineCamera):
         return isinstance(client, TelnetClient) and client.logged_in
 
     def say(self, link: ClientLink, message: SaidLine) -> None:
-        """Say something to a link, unless it is silent."""
+        """Send a line to a link, unless the camera is silent."""
         if not self.silent:
             super().say(link, message)
 
@@ -359,7 +359,7 @@ class EmulatedInSight(LineCamera):
         return known is not None and known == password and not self.refuse_login
 
     def execute(self, client: TelnetClient, line: str) -> None:
-        """Do what a line of a logged-in client says."""
+        """Carry out a line of a logged-in client."""
         mnemonic = line[:2].upper()
         code = self._take_ordered(mnemonic)
         if code is not None:

@@ -1,4 +1,4 @@
-"""Answer a line as the emulated In-Sight camera does, to the byte."""
+"""Answer a line exactly as the emulated In-Sight camera does."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _log = logging.getLogger("smartcam.emulator")
 
 
 class InSightQuirks(EmulatorData):
-    """Choices for behaviour of real cameras that is not known."""
+    """Choices for unknown behaviour of real cameras."""
 
     event_answer: Literal["code", "sized"] = Field(
         default="code",
@@ -52,7 +52,7 @@ class InSightQuirks(EmulatorData):
 
 
 class Respond(Protocol):
-    """Takes what answers a command."""
+    """A function that sends the answer to a command."""
 
     def __call__(self, data: bytes, *, more: bool = False) -> None:
         """Send bytes; with ``more`` the rest comes in another call."""
@@ -62,7 +62,7 @@ class InSightCommands:
     """A camera's commands; the arguments are those of the emulator.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class InSightCommands:
         }
 
     def execute(self, line: str, respond: Respond) -> None:
-        """Do what a line without its end says; the answer comes at once or in the device's time."""
+        """Carry out a line without its end; the answer comes at once or in the device's time."""
         mnemonic, argument = line[:2].upper(), line[2:]
         row = words.COMMANDS.get(mnemonic)
         if row is None or (argument and not row.arguments):
@@ -122,21 +122,21 @@ class InSightCommands:
         return _coded(self._device.request_online(argument == "1"))
 
     def _set_event(self, argument: str, respond: Respond) -> None:
-        def told(code: StatusCode) -> None:
+        def done(code: StatusCode) -> None:
             sized = code == StatusCode.DONE and self.quirks.event_answer == "sized"
             respond(_sized("") if sized else _coded(code))
 
-        self._event(argument, told, at_image=True)
+        self._event(argument, done, at_image=True)
 
     def _set_event_and_wait(self, argument: str, respond: Respond) -> None:
         self._event(argument, lambda code: respond(_coded(code)), at_image=False)
 
-    def _event(self, argument: str, told: Callable[[StatusCode], None], *, at_image: bool) -> None:
+    def _event(self, argument: str, done: Callable[[StatusCode], None], *, at_image: bool) -> None:
         event = _integer(argument)
         if event is None or not 0 <= event <= words.TRIGGER_EVENT:
-            told(StatusCode.INVALID_ARGUMENT)
+            done(StatusCode.INVALID_ARGUMENT)
         else:
-            self._device.request_event(event, told, at_image=at_image)
+            self._device.request_event(event, done, at_image=at_image)
 
     # ------------------------------------------------------------------ jobs
 
@@ -169,7 +169,7 @@ class InSightCommands:
         return _coded(self._device.request_value(key, kind, value))
 
     def _target(self, argument: str) -> tuple[str | None, str]:
-        """Return under what the cell to be set is kept, None if there is no such, and the rest."""
+        """Return the key of the cell to set, None if there is no such cell, and the rest."""
         cell = words.parse_wire_cell(argument)
         if cell is not None:
             return cell[0].wire, cell[1]
@@ -177,7 +177,7 @@ class InSightCommands:
         return self._named(name), rest
 
     def _named(self, name: str) -> str | None:
-        """Return under what a cell with a name is kept, None if there is no such.
+        """Return the key of a cell with a name, None if there is no such cell.
 
         Cells are kept in upper case, so one without its three digits is not found.
         """
@@ -199,7 +199,7 @@ class InSightCommands:
         if device.sight is None:
             self._send_image(coded_image(device.image), respond)
             return
-        # one that a sensor took is large: it is written in a thread
+        # a sensor's image is large: it is written in a thread
         writing = asyncio.get_running_loop().run_in_executor(None, _seen_image, device.sight)
 
         def written(done: asyncio.Future[CodedImage | None]) -> None:
@@ -239,7 +239,7 @@ def coded_image(image: NDArray[np.uint8]) -> CodedImage:
 
 
 def _seen_image(sight: Callable[[], Any]) -> CodedImage | None:
-    """Return the image of the last run; None if that is no image of such a camera."""
+    """Return the image of the last run; None if it is no image of such a camera."""
     try:
         return coded_image(check_image(sight()))
     except ConfigurationError as exc:
@@ -275,7 +275,7 @@ def _coded(code: StatusCode) -> bytes:
 
 
 def _found(value: str | int | None) -> bytes:
-    """Return the answer with what was asked for; None: not possible."""
+    """Return the answer with a value; None: not possible."""
     if value is None:
         return _coded(StatusCode.FAILED)
     return _coded(StatusCode.DONE) + _line(str(value))

@@ -1,4 +1,4 @@
-"""Clients of the emulated In-Sight camera: they log in, then their commands are done."""
+"""Clients of the emulated In-Sight camera: they log in, then their commands are carried out."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_codec import LineServer
 
 MAX_SESSIONS = 16
-"""Largest number of connections at a time. For a newcomer the one makes room that waits for its
-login for longest; where all are logged in, it is closed at once. The real camera's bound is not
-published."""
+"""Largest number of connections at a time. The connection that has waited longest for its login
+makes room for a newcomer; if all are logged in, the newcomer is closed. The real camera's bound is
+not published."""
 
 WRITE_LIMIT = 1 << 25
-"""Bytes kept for a client that does not read; more end its connection. An image of 8 megapixels
-makes 17 million."""
+"""Bytes kept for a client that does not read; more end its connection. An image
+of 8 megapixels makes 17 million."""
 
 
 def _code(line: str) -> int:
@@ -32,7 +32,7 @@ def _code(line: str) -> int:
 
 
 def _value(line: str) -> int:
-    """Return the number after the status code, or that of no job."""
+    """Return the number after the status code, or the number that means no job."""
     code, _, value = line.partition("\r\n")
     return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
 
@@ -62,7 +62,7 @@ ROWS = (
     LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_code(line))),
     LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_code(line), data=b"")),
 )
-"""The commands that are the library's requests, by whose names faults call them."""
+"""The commands that are requests of the library, whose names faults use."""
 
 
 class _LoginState(enum.Enum):
@@ -74,7 +74,7 @@ class _LoginState(enum.Enum):
 
 
 class TelnetClient(LineClient):
-    """One client: it logs in, then its commands are done one after the other (decided).
+    """One client: it logs in, then its commands are carried out one by one (decided).
 
     Attributes:
         number: number of the session, from 0.
@@ -91,11 +91,11 @@ class TelnetClient(LineClient):
 
     @property
     def logged_in(self) -> bool:
-        """True once the client is logged in, so that its commands are done."""
+        """True once the client is logged in, so that its commands are carried out."""
         return self._state is _LoginState.COMMANDS
 
     def take(self, line: str) -> None:
-        """Take a line."""
+        """Handle a line."""
         if self._state is _LoginState.COMMANDS:
             self._emulator.execute(self, line)
         elif self._state is _LoginState.USER:
@@ -111,7 +111,7 @@ class TelnetClient(LineClient):
             self.end("the login was refused")
 
     def respond(self, data: bytes, *, more: bool = False) -> None:
-        """Answer the line under way; without ``more`` it is done."""
+        """Answer the current line; without ``more`` the answer is complete."""
         self.say_bytes(data)
         if not more:
             self.go_on()

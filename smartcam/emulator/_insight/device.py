@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._generators import Values
     from smartcam.emulator._inspected import Inspector
 
-    Told: TypeAlias = Callable[[StatusCode], None]
+    OnCode: TypeAlias = Callable[[StatusCode], None]
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -46,20 +46,20 @@ _MAX_NUMBER = 0xFFFFFFFF  # largest number of a run, as for other cameras
 class _PendingEvent:
     """An acquisition with its evaluation, or a soft event."""
 
-    def __init__(self, told: Told | None) -> None:
+    def __init__(self, on_code: OnCode | None) -> None:
         self.over: bool = False
-        self._told = told
+        self._on_code = on_code
 
-    def tell(self, code: StatusCode) -> None:
+    def report(self, code: StatusCode) -> None:
         """Report the outcome of the event; every call after the first does nothing."""
-        told, self._told = self._told, None
-        if told is not None:
-            told(code)
+        on_code, self._on_code = self._on_code, None
+        if on_code is not None:
+            on_code(code)
 
     def end(self, code: StatusCode) -> None:
         """Finish the event, whatever its outcome."""
         self.over = True
-        self.tell(code)
+        self.report(code)
 
 
 class InSightDevice:
@@ -85,7 +85,7 @@ class InSightDevice:
         self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])
         # active job; None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
-        # context around actions of an operator, if something has to follow them
+        # context around an operator's actions, if something has to follow them
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         # function that returns the image of the last run, if an inspector takes the pictures
         self.sight: Callable[[], Any] | None = None
@@ -94,20 +94,20 @@ class InSightDevice:
         self._now = 0
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._wanted_online = online  # whether clients want it online
-        self._allowed_online = True  # whether the operator or an input holds it offline
+        self._wanted_online = online  # whether clients have switched it online
+        self._allowed_online = True  # False while the operator or an input holds it offline
         self._loading = False
         self._blind = False  # whether the source of its pictures is lost
-        self._inspector: Inspector | None = None  # whether a run is under way
+        self._inspector: Inspector | None = None  # inspector of the running run
         self._run: _PendingEvent | None = None
         self._turn = 0  # number of acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
-        self._generation = 0  # generation of free running: an older one has ended
+        self._generation = 0  # count of free runs begun; timers of older ones stop
         if active is not None:
             self.job = self.find(active)
         self._begin_job()
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ properties
 
     @property
     def online(self) -> bool:
@@ -204,7 +204,7 @@ class InSightDevice:
             return self._begin_run(TRIGGER_EVENT, None, at_image=False)
 
     def load(self, job: str | int) -> None:
-        """Load a job by hand, at once and in either mode; a run under way ends without a result.
+        """Load a job by hand, at once and in either mode; a running run ends without a result.
 
         Raises:
             ConfigurationError: there is no such job, or another one is being loaded.
@@ -220,7 +220,7 @@ class InSightDevice:
     def set_blind(self, blind: bool) -> None:
         """Note that no pictures come, or that they come again.
 
-        Without pictures the run under way fails, and so does every trigger.
+        Without pictures the running run fails, and so does every trigger.
         """
         with self.around():
             self._blind = blind
@@ -240,7 +240,7 @@ class InSightDevice:
             self.set_online(running)
         return True
 
-    # ------------------------------------------------------------------ what clients ask for
+    # ------------------------------------------------------------------ requests
 
     def request_online(self, online: bool) -> StatusCode:
         """Go online or offline for a client (``SO``)."""
@@ -249,15 +249,15 @@ class InSightDevice:
         self._switch(wanted=online, allowed=self._allowed_online)
         return StatusCode.STILL_OFFLINE if online and not self.online else StatusCode.DONE
 
-    def request_job(self, job: str | int, told: Told) -> None:
-        """Load a job for a client (``LF``, ``SJ``); ``told`` gets the code at the end or now."""
+    def request_job(self, job: str | int, on_code: OnCode) -> None:
+        """Load a job for a client (``LF``, ``SJ``); ``on_code`` gets the code at the end or now."""
         try:
             found = self.find(job)
         except ConfigurationError:
-            told(StatusCode.FAILED)
+            on_code(StatusCode.FAILED)
             return
         if self.online or self._loading:
-            told(StatusCode.FAILED)
+            on_code(StatusCode.FAILED)
             return
         self._loading = True
 
@@ -265,18 +265,18 @@ class InSightDevice:
             self._loading = False
             self.job = found
             self._begin_job()
-            told(StatusCode.DONE)
+            on_code(StatusCode.DONE)
 
         self.after(found.load_time, loaded)
 
-    def request_event(self, event: int, told: Told, *, at_image: bool) -> None:
-        """Cause an event, 0 to 8, for a client; ``told`` gets the code.
+    def request_event(self, event: int, on_code: OnCode, *, at_image: bool) -> None:
+        """Cause an event, 0 to 8, for a client; ``on_code`` gets the code.
 
         It gets the code after the image was taken (``SE``), or after the cells were computed
         (``SW``).
         """
-        if not self._begin_run(event, told, at_image=at_image):
-            told(StatusCode.FAILED)
+        if not self._begin_run(event, on_code, at_image=at_image):
+            on_code(StatusCode.FAILED)
 
     def request_value(self, key: str, kind: str, value: CellValue) -> StatusCode:
         """Set a control of some kind for a client (``SI``, ``SF``, ``SS``)."""
@@ -307,12 +307,12 @@ class InSightDevice:
         else:
             self._break_run()
 
-    def _begin_run(self, event: int, told: Told | None, *, at_image: bool) -> bool:
+    def _begin_run(self, event: int, on_code: OnCode | None, *, at_image: bool) -> bool:
         job = _UNSAVED if self.job is None else self.job
         acquires = event == TRIGGER_EVENT
         if not self.online or self.busy or (acquires and (self._blind or not job.triggered)):
             return False
-        run = self._run = _PendingEvent(told)
+        run = self._run = _PendingEvent(on_code)
         if acquires and isinstance(job, InspectedJob):
             self._inspect(job, run, at_image=at_image)
             return True
@@ -321,7 +321,7 @@ class InSightDevice:
             if run.over:
                 return
             if at_image:
-                run.tell(StatusCode.DONE)
+                run.report(StatusCode.DONE)
             self.after(job.processing_time, done)
 
         def done() -> None:
@@ -336,12 +336,12 @@ class InSightDevice:
         return True
 
     def _inspect(self, job: InspectedJob, run: _PendingEvent, *, at_image: bool) -> None:
-        """Have a picture inspected for a run."""
+        """Start the inspection of a picture for a run."""
 
         def seen() -> None:
             with self.around():
                 if at_image and not run.over:
-                    run.tell(StatusCode.DONE)
+                    run.report(StatusCode.DONE)
 
         def done(found: Values | None) -> None:
             with self.around():
@@ -383,7 +383,7 @@ class InSightDevice:
                 return
             if not isinstance(job, InspectedJob):
                 self._finish_acquisition(job)
-            elif not (self.busy or self._blind):  # the last run came late, or there is no picture
+            elif not (self.busy or self._blind):  # unless the last run is late, or blind
                 run = self._run = _PendingEvent(None)
                 self._inspect(job, run, at_image=False)
             self.after(period, turn)

@@ -1,1 +1,1 @@
-"""An emulated camera as data, and what happens to it in the course of time."""
+"""An emulated camera as data, with the events that happen to it."""

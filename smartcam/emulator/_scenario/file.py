@@ -1,4 +1,4 @@
-"""Scenario files: read from YAML; a mistake is told with file, line and field."""
+"""Read scenario files from YAML; a mistake is reported with file, line and field."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
 
     Args:
         path: path of the file.
-        dialect: goes before what the file says.
+        dialect: dialect that overrides the file's.
 
     Raises:
-        ConfigurationError: as :func:`load_scenarios`, or there are several cameras in it.
+        ConfigurationError: as :func:`load_scenarios`, or the file has several cameras.
         MissingExtraError: PyYAML is not installed.
     """
     first, *others = load_scenarios(path, dialect=dialect)
@@ -38,7 +38,7 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
 
     Args:
         path: path of the file.
-        dialect: goes before what the file says.
+        dialect: dialect that overrides the file's.
 
     Raises:
         ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,

@@ -1,4 +1,4 @@
-"""Scenarios: emulated cameras as data; files of them are read by :mod:`.scenario_file`."""
+"""Scenarios: emulated cameras as data; :mod:`.scenario_file` reads files of them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MAX_CUES = 1000
-"""Cues of a timeline; every state that a camera enters is compared with those that wait for one."""
+"""Largest number of cues of a timeline; each state that a camera enters is compared with them."""
 
 
 T = TypeVar("T")
 
 Mistake: TypeAlias = tuple[tuple[str | int, ...], str]
-"""The place of a mistake in a scenario, and what is wrong."""
+"""The place of a mistake in a scenario, and its reason."""
 
 
 class Scenario(EmulatorData):
-    """One camera: its applications, how it stands at first, its quirks, and what happens to it."""
+    """One camera: its applications, its first state, its quirks, and its timeline."""
 
     name: str = Field(default="camera", min_length=1, max_length=200, description="name in logs")
     protocol: str = Field(
@@ -51,12 +51,12 @@ class Scenario(EmulatorData):
     builtins: bool = Field(
         default=True, description="have the built-in applications, as far as their ids are free"
     )
-    quirks: Quirks = Field(default=Quirks(), description="what is unknown of real cameras")
+    quirks: Quirks = Field(default=Quirks(), description="unknown behaviour of real cameras")
     seed: int = Field(default=0, description="seed of all chance: the scene's noise, the timeline")
     timeline: tuple[Cue, ...] = Field(
         default=(),
         max_length=MAX_CUES,
-        description="what happens to the camera by itself, and when",
+        description="events of the camera, and their times",
     )
 
     options: dict[str, Any] = Field(
@@ -70,7 +70,7 @@ class Scenario(EmulatorData):
         try:
             known = load_protocol(info.data.get("protocol", BVS.name)).dialects
         except ConfigurationError:
-            return value  # the protocol is what is wrong
+            return value  # the protocol's own check reports it
         if value not in known:
             raise ValueError(f"unknown; known are {', '.join(known)}")
         return value
@@ -97,12 +97,12 @@ class Scenario(EmulatorData):
 
     @property
     def is_random(self) -> bool:
-        """True if chance has a part in the timeline."""
+        """True if the timeline depends on chance."""
         return any(cue.is_random for cue in self.timeline)
 
     def mistake(self) -> Mistake | None:
-        """Return the place in it of what the camera cannot do, and why; None if all is well."""
-        from smartcam.emulator._makes import emulated_class  # stands on this module
+        """Return the place of something that the camera cannot do, and the reason; or None."""
+        from smartcam.emulator._makes import emulated_class  # it imports this module
 
         try:
             kind = emulated_class(self.protocol)
@@ -111,7 +111,7 @@ class Scenario(EmulatorData):
         return kind.mistake(self)
 
     def changed(self) -> set[str]:
-        """Return the names of the fields that are not as they are by default."""
+        """Return the names of the fields that do not have their default value."""
         fields = type(self).model_fields
         return {
             name
@@ -121,14 +121,14 @@ class Scenario(EmulatorData):
 
 
 class ScenarioFile(Scenario):
-    """A scenario file: one camera; or several, and the fields that they have in common."""
+    """A scenario file: one camera; or several, and their common fields."""
 
     cameras: tuple[Scenario, ...] = Field(
         default=(),
         max_length=1000,
         description=(
-            "several cameras: what stands beside this is what they have in common, and each adds "
-            "its own or puts it in the place of that"
+            "several cameras: the fields beside this one are common to all, and each camera adds "
+            "its own fields, or replaces common ones"
         ),
     )
 
@@ -143,7 +143,7 @@ class ScenarioFile(Scenario):
         return self
 
     def each(self) -> tuple[Scenario, ...]:
-        """Return the cameras, each with what it has in common with the others."""
+        """Return the cameras, each with the common fields."""
         common = {name: getattr(self, name) for name in self.model_fields_set - {"cameras"}}
         if not self.cameras:
             return (Scenario(**common),)
@@ -171,7 +171,7 @@ class ScenarioFile(Scenario):
         return Scenario(**merged)
 
     def place(self, index: int, place: tuple[str | int, ...]) -> tuple[str | int, ...]:
-        """Return the place in the file of something of a camera."""
+        """Return the place in the file of a place in one camera."""
         if not self.cameras:
             return place
         camera = self.cameras[index]
@@ -186,7 +186,7 @@ class ScenarioFile(Scenario):
 
 
 def _first_double(values: Iterable[T]) -> T | None:
-    """Return the first value that was there before; None if there is none."""
+    """Return the first value that occurred before; None without one."""
     seen: set[T] = set()
     for value in values:
         if value in seen:

@@ -49,7 +49,7 @@ MAX_AT_ONCE = 1000
 further one is dropped, with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
-"""Largest number of faults of one cue, far more than anybody writes."""
+"""Largest number of faults of one cue, far more than useful."""
 
 _MOMENTS = ("at", "entering", "command")
 

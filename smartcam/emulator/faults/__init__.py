@@ -1,25 +1,25 @@
 """Faults: exact misbehaviour of an emulated camera and its wire, as data.
 
-A fault says which message it waits for and what happens then. Give a list of them to
+A fault names the message that it waits for, and its effect. Give a list of faults to
 :class:`~smartcam.emulator.EmulatedCamera`, or inject them while it runs::
 
     EmulatedCamera(faults=[faults.Drop(on="QueryAnswer"), {"kind": "reset", "on": "Trigger"}])
 
 Which message: ``on`` names its type, or gives its id on the wire. Each fault counts the messages
-that fit, from the moment it was given and for itself alone: what other faults do to them does not
-change the count, and what faults insert or duplicate is not counted. It applies to the ``nth`` one
-and to those directly behind it, ``times`` in all. Where several apply to one message, they act in
-the order in which they were given, each on what the one before has left of it.
+that fit, from the moment it was given, independently of other faults: their effects do not
+change the count, and inserted or duplicated messages are not counted. The fault applies to the
+``nth`` message and to those directly after it, ``times`` in all. If several faults apply to one
+message, they act in the order in which they were given, each on the result of the one before.
 
-*Wire faults* change what passes the wire. Those on messages of the camera count what it says to a
-client, those on messages of a client count whole frames of any client, before the camera hears
-them. *Device faults* are things that happen to the camera. They count what its device handles: a
-Connect, and the messages of the session.
+*Wire faults* change the messages on the wire. Those on messages of the camera count its messages
+to a client, those on messages of a client count whole frames of any client, before the camera
+receives them. *Device faults* are events of the camera. They count the messages that its device
+handles: a Connect, and the messages of the session.
 
-There is no chance in any of it: the same list and the same messages give the same bytes.
+Nothing depends on chance: the same list and the same messages give the same bytes.
 
 A fault that is new is a class here, with a ``kind``, in ``__all__`` and in one of the unions below.
-What it does is a row: of ``_CHANGES`` (what it makes of a message) or ``_REBUILDS`` (of all that go
+The effect is a row: of ``_CHANGES`` (of one message) or ``_REBUILDS`` (of all that go
 together) in ``_wire_effects.py``, or of ``_ACTIONS`` in ``_device_effects.py``. The tests then ask
 for the schema (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the docstrings.
 """
@@ -98,7 +98,7 @@ MAX_FAULTS = 10_000
 """Largest number of faults that wait at one time, as every message is compared with all of them."""
 
 MAX_FIRED = 1000
-"""Largest number of records kept of faults that have happened; the oldest go first."""
+"""Largest number of records kept of faults that have happened; the oldest are dropped first."""
 
 
 # ---------------------------------------------------------------------- on the wire
@@ -107,7 +107,7 @@ MAX_FIRED = 1000
 class Delay(WireFault):
     """The message comes later.
 
-    On TCP everything behind it waits too, unless ``overtaken``. On UDP it is this datagram alone.
+    On TCP everything after it waits too, unless ``overtaken``. On UDP only this datagram waits.
     """
 
     kind: Literal["delay"] = "delay"
@@ -142,7 +142,7 @@ class Split(CameraWireFault):
 
 
 class Coalesce(CameraWireFault):
-    """The message waits for those behind it; they come in one write, or one datagram.
+    """The message waits for those after it; they come in one write, or one datagram.
 
     Source: several messages may come in one TCP segment (newest SC manual p. 40, published).
     """
@@ -155,7 +155,7 @@ class Coalesce(CameraWireFault):
 
 
 class Truncate(CameraWireFault):
-    """Only the message's beginning comes."""
+    """Only the beginning of the message comes."""
 
     kind: Literal["truncate"] = "truncate"
     keep: int = Field(
@@ -172,7 +172,7 @@ class Truncate(CameraWireFault):
 
 
 class Corrupt(WireFault):
-    """One byte of the message is another; exactly one of ``xor`` and ``value`` says which."""
+    """One byte of the message is changed; exactly one of ``xor`` and ``value`` is given."""
 
     kind: Literal["corrupt"] = "corrupt"
     offset: int = Field(
@@ -189,7 +189,7 @@ class Corrupt(WireFault):
     @model_validator(mode="after")
     def _check_change(self) -> Corrupt:
         if (self.xor is None) is (self.value is None):
-            raise ValueError("exactly one of xor and value says what stands there")
+            raise ValueError("expected exactly one of xor and value")
         return self
 
 
@@ -203,17 +203,17 @@ class Drop(WireFault):
 
 
 class Duplicate(WireFault):
-    """The message comes more than once, one right behind the other."""
+    """The message comes more than once, one right after the other."""
 
     kind: Literal["duplicate"] = "duplicate"
     copies: int = Field(default=1, ge=1, le=100, description="How many more times.")
 
 
 class Insert(CameraWireFault):
-    """Something that the camera did not say; exactly one of ``data`` and ``message`` is it.
+    """A message or bytes that the camera did not send: exactly one of ``message`` and ``data``.
 
-    Faults behind it in the list leave what stands before or after the message alone; what stands
-    instead of it counts as the message.
+    Later faults in the list do not change an insertion before or after the message; an insertion
+    instead of the message counts as the message.
     """
 
     kind: Literal["insert"] = "insert"
@@ -228,7 +228,7 @@ class Insert(CameraWireFault):
         description="The message's fields: all without a default; `data` as hex digits.",
     )
     where: Literal["before", "after", "instead"] = Field(
-        default="before", description="Where it stands: beside the message or in place of it."
+        default="before", description="Its place: beside the message or in place of it."
     )
 
     @field_validator("message")
@@ -294,11 +294,11 @@ def _build(name: str, fields: Mapping[str, int | str]) -> m.Message:
 
 
 class HalfOpen(EndingFault):
-    """From that message on nothing is sent and nothing is read on this connection.
+    """From this message on nothing is sent and nothing is read on the connection.
 
-    It stays open, as when a cable is pulled; the session stays with it until another client
+    The connection stays open, as when a cable is pulled; it keeps the session until another client
     connects. It ends with a reset after ``seconds``, when the emulator stops or when the faults are
-    cleared; so long it counts among the connections, of which there are 32 at most. On UDP
+    cleared; until then it counts among the connections, of which there are 32 at most. On UDP
     datagrams in both directions are lost for that time.
     """
 
@@ -309,16 +309,16 @@ class HalfOpen(EndingFault):
 
 
 class Reset(EndingFault):
-    """The connection ends by a reset (RST). On UDP the camera forgets the session in silence.
+    """The connection ends by a reset (RST). On UDP the camera forgets the session silently.
 
-    What the client has not read when the reset comes may be lost to it.
+    The client may lose bytes that it has not read when the reset comes.
     """
 
     kind: Literal["reset"] = "reset"
 
 
 class Close(EndingFault):
-    """The connection ends in order (FIN). On UDP the camera forgets the session in silence."""
+    """The connection ends in order (FIN). On UDP the camera forgets the session silently."""
 
     kind: Literal["close"] = "close"
 
@@ -329,10 +329,10 @@ Place = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
 
 class Refuse(DeviceFault):
-    """The port is closed: who connects is refused. Connections that are open stay.
+    """The port is closed: new connections are refused. Open connections stay.
 
     On UDP the session stays, and datagrams in both directions are lost; the client's system may be
-    told that nobody listens.
+    told that the port is closed.
     """
 
     kind: Literal["refuse"] = "refuse"
@@ -340,7 +340,7 @@ class Refuse(DeviceFault):
 
 
 class BusyForEver(DeviceFault):
-    """BUSY is set and stays, and no inspection begins; everything else goes on as ever."""
+    """BUSY is set and stays, and no inspection begins; everything else continues as usual."""
 
     kind: Literal["busy_for_ever"] = "busy_for_ever"
     seconds: Seconds | None = Field(
@@ -350,7 +350,7 @@ class BusyForEver(DeviceFault):
 
 
 class Overtrigger(DeviceFault):
-    """Triggers are dropped as if the last image were still analysed: Overtriggered rises.
+    """Triggers are dropped as if the last image were still being analysed: Overtriggered is set.
 
     Source: SC manual p. 30 (published for a trigger during an inspection).
     """
@@ -362,9 +362,9 @@ class Overtrigger(DeviceFault):
 class SecondClient(DeviceFault):
     """Another client connects and gets the session by the camera's own rules.
 
-    On TCP the first one's connection is closed, unless the quirk ``second_client`` refuses
-    newcomers; on UDP it is told nothing. The camera talks to the other one until a client connects,
-    or until the faults are cleared.
+    On TCP the first client's connection is closed, unless the quirk ``second_client`` refuses
+    newcomers; on UDP the first client is not informed. The camera sends to the second client until
+    another client connects, or until the faults are cleared.
 
     Source: the newcomer wins (SC manual p. 28, published for UDP; inferred for TCP).
     """
@@ -382,7 +382,7 @@ class PowerCycle(DeviceFault):
 
 
 class OperatorSwitch(DeviceFault):
-    """An operator loads another application behind the client's back."""
+    """An operator loads another application without the client's knowledge."""
 
     kind: Literal["switch_application"] = "switch_application"
     application: int = Field(ge=1, le=0xFFFFFFFF, description="Id of the application.")
@@ -402,7 +402,7 @@ class OperatorStart(DeviceFault):
 
 
 class Condition(DeviceFault):
-    """System Error or Overheat comes or goes.
+    """System Error or Overheat is set or cleared.
 
     Source: SC manual p. 30 and p. 33 (published).
     """
@@ -413,20 +413,20 @@ class Condition(DeviceFault):
 
 
 class LateResult(DeviceFault):
-    """An inspection takes longer: the one under way, else the next that begins."""
+    """An inspection takes longer: the running one, or else the next."""
 
     kind: Literal["late_result"] = "late_result"
     seconds: Seconds = Field(description="How much longer the inspection takes, s.")
 
 
 class NoResult(DeviceFault):
-    """An inspection sends nothing: the one under way, else the next that begins."""
+    """An inspection sends nothing: the running one, or else the next."""
 
     kind: Literal["no_result"] = "no_result"
 
 
 class ExtraResult(DeviceFault):
-    """An inspection sends its container more than once: the one under way, else the next.
+    """An inspection sends its container more than once: the running one, or else the next.
 
     Source: a program may have several "send results" tools (inferred).
     """
@@ -451,7 +451,7 @@ class ChangeByteOrder(DeviceFault):
 
 
 class MovePart(DeviceFault):
-    """A part of the scene lies somewhere else; a new name is a new part."""
+    """A part of the scene moves; a new name adds a part."""
 
     kind: Literal["move_part"] = "move_part"
     part: str = Field(min_length=1, max_length=200, description="Name of the part.")
@@ -461,19 +461,19 @@ class MovePart(DeviceFault):
 
 
 class RemovePart(DeviceFault):
-    """A part is taken from the scene."""
+    """A part is removed from the scene."""
 
     kind: Literal["remove_part"] = "remove_part"
     part: str = Field(min_length=1, max_length=200, description="Name of the part.")
 
 
 class ClearFaults(DeviceFault):
-    """Faults that wait are forgotten and those that last end, as by ``clear_faults()``."""
+    """Waiting faults are forgotten and lasting ones end, as by ``clear_faults()``."""
 
     kind: Literal["clear_faults"] = "clear_faults"
 
 
-# ---------------------------------------------------------------------- any of them
+# ---------------------------------------------------------------------- all faults
 
 _OnMessage: TypeAlias = Delay | Split | Coalesce | Truncate | Corrupt | Drop | Duplicate | Insert
 _OnConnection: TypeAlias = HalfOpen | Reset | Close
@@ -504,8 +504,8 @@ class FiredFault(NamedTuple):
     Attributes:
         time: seconds of the emulator's clock.
         fault: the fault, as it was given.
-        message: the message that the fault applied to, as its sender meant it; None if it waited
-            for none.
+        message: the message that the fault applied to, as its sender meant it; None if the fault
+            waited for none.
     """
 
     time: float
@@ -514,11 +514,11 @@ class FiredFault(NamedTuple):
 
 
 def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, ...]:
-    """Return faults; mappings are made to them by their ``kind``.
+    """Return faults; mappings become faults by their ``kind``.
 
     Raises:
-        ConfigurationError: one of the faults is wrong; the text says which, counted from 1, and
-            names the field.
+        ConfigurationError: one of the faults is wrong; the text gives its number, from 1, and
+            the field.
     """
     made: list[Fault] = []
     faults = check_all(given, "faults", "a list of faults", "emulator")

@@ -33,7 +33,7 @@ _SENDERS = {sender.value: sender for sender in m.Sender}
 
 
 def message_name(value: object) -> object:
-    """Return the name of a message class, and anything else as it is."""
+    """Return the name of a message class; anything else unchanged."""
     if isinstance(value, bool):
         raise ValueError("a message's name or id")  # noqa: TRY004  pydantic wants a ValueError
     return value.__name__ if isinstance(value, type) else value
@@ -43,7 +43,7 @@ def known_name(value: str) -> str:
     """Return the name of a message.
 
     Raises:
-        ValueError: no message is called so.
+        ValueError: no message has this name.
     """
     if value not in MESSAGE_NAMES:
         raise ValueError(f"no message is called {value!r}; there are {', '.join(MESSAGE_NAMES)}")
@@ -81,11 +81,11 @@ class BaseFault(EmulatorData):
     """Base of all faults: the choice of the message that a fault waits for."""
 
     default_sender: ClassVar[m.Sender]
-    """Sender that is assumed where neither ``on`` nor ``sender`` names one."""
+    """Sender if neither ``on`` nor ``sender`` names one."""
     senders: ClassVar[frozenset[m.Sender]] = frozenset(m.Sender)
     """Senders whose messages the fault can wait for."""
     can_act_at_once: ClassVar[bool]
-    """True if the fault acts at once when it has no message to wait for."""
+    """True if the fault acts at once if it has no message to wait for."""
 
     on: On = Field(
         default=None,
@@ -97,7 +97,7 @@ class BaseFault(EmulatorData):
     sender: Literal["camera", "client"] | None = Field(
         default=None,
         description=(
-            "Who sends that message, where a message id or nothing stands in `on`. Default: the "
+            "Sender of that message, if a message id or nothing stands in `on`. Default: the "
             "camera for wire faults, the client for device faults."
         ),
     )
@@ -187,8 +187,8 @@ class EndingFault(WireFault):
     when: Literal["before", "after"] = Field(
         default="before",
         description=(
-            "`before`: in place of the message, which does not pass. `after`: right behind it; a "
-            "message of the client is then heard, and what the camera says to it at once goes out."
+            "`before`: in place of the message, which does not pass. `after`: right after it; a "
+            "message of the client is then received, and the camera's first answer is sent."
         ),
     )
 
@@ -203,6 +203,6 @@ class DeviceFault(BaseFault):
         default="before",
         description=(
             "Before the device handles the client's message, or after it did. On a message of the "
-            "camera: what the camera says because of the fault goes out before it, or behind it."
+            "camera: messages that the fault causes are sent before it, or after it."
         ),
     )

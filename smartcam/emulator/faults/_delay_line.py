@@ -1,7 +1,7 @@
-"""Transmissions on their way: in order, each when it is time. It knows no socket and no fault.
+"""Send transmissions in order, each at its time. It knows no socket and no fault.
 
-It is the engine of everything that holds back what passes a link: the emulator's faults give it
-messages, the link proxy gives it bytes of a stream or datagrams.
+Everything that delays messages on a link uses it: the emulator's faults give it messages, the link
+proxy gives it bytes of a stream or datagrams.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Ending(NamedTuple):
 
     # event; ``eof`` means that the sender has ended
     how: Literal["close", "reset", "stall", "half_open", "eof"]
-    cause: str  # kind of the fault, or name of the rule, behind it
+    cause: str  # kind of the fault, or name of the rule
     # seconds that a half-open connection stays; None: as long as possible
     seconds: float | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Transmission:
-    """Something that passes a link, and how."""
+    """Bytes that pass a link, with their delays and pauses."""
 
     parts: list[bytes]  # bytes still to pass; each part is one write
     _: KW_ONLY
@@ -39,7 +39,7 @@ class Transmission:
     )  # seconds before each part but the first
     delay: float = 0.0  # seconds before the first part
     overtaken: bool = False  # whether later parts may pass this one while it waits
-    # number of following parts that it waits for, and the most seconds
+    # number of following parts to wait for, and the most seconds to wait
     gather: tuple[int, float] | None = None
     # without an order: whether it goes after those parts and not together with them
     behind: bool = False
@@ -54,7 +54,7 @@ class Transmission:
         return sum(map(len, self.parts))
 
     def take(self) -> bytes:
-        """Take the next part away."""
+        """Remove and return the next part."""
         return self.parts.pop(0) if self.parts else b""
 
 
@@ -62,19 +62,19 @@ T = TypeVar("T", bound=Transmission)
 
 
 class _Waiting(Generic[T]):
-    """A transmission that has not passed yet; ``missing`` is how much it still waits for."""
+    """A transmission that has not passed yet; ``missing`` is the number it still waits for."""
 
     __slots__ = ("company", "due", "missing", "paused", "sent", "turns", "until")
 
     def __init__(self, sent: T, now: int) -> None:
         self.sent = sent
-        self.due = now + nanoseconds(sent.delay)  # when its next part may pass, nanoseconds
+        self.due = now + nanoseconds(sent.delay)  # instant when its next part may pass, nanoseconds
         self.missing, seconds = sent.gather or (0, 0.0)
-        # when it waits for that no longer, nanoseconds
+        # time until which it waits for others, nanoseconds
         self.until = self.due + nanoseconds(seconds)
-        self.company: list[T] = []  # parts that have come for it, without an order
-        self.paused = False  # whether a part has passed and the pause behind it has not begun
-        self.turns = 0  # how often the timer has to go off before it passes
+        self.company: list[T] = []  # parts that it waited for, without an order
+        self.paused = False  # a part has passed, and its pause has not begun
+        self.turns = 0  # turns of the timer before it passes
 
     @property
     def when(self) -> int:
@@ -92,19 +92,19 @@ class _Waiting(Generic[T]):
 class DelayLine(Generic[T]):
     """One direction of one link.
 
-    :meth:`put` what is to pass, then :meth:`run`. What passes is handed to ``carry``.
+    :meth:`put` transmissions, then call :meth:`run`. Passing bytes go to ``carry``.
     """
 
     clock: Clock
     _: KW_ONLY
-    # nothing passes what waits before it, unless it may be overtaken; what passes at one time is
-    # carried together (TCP). Otherwise each part goes for itself (UDP)
+    # with an order (TCP), nothing passes a waiting transmission unless it may be overtaken, and
+    # all that pass at one time are carried together; without it (UDP) each part goes by itself
     ordered: bool
-    wake: Callable[[], None]  # called when it is time to run()
-    # takes what passes, in one write: transmissions and the bytes of each; it may stop() the line
+    wake: Callable[[], None]  # called when run() is due
+    # gets passing transmissions and the bytes of each, for one write; it may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
-    end: Callable[[Ending], None]  # does to the connection what a transmission says
-    lost: Callable[[T], None]  # told of each one that was under way when the line was closed
+    end: Callable[[Ending], None]  # ends the connection after a transmission
+    lost: Callable[[T], None]  # called with each transmission that was dropped by close()
     turns: int = 0  # turns of the event loop that a pause of no time takes
 
     def __post_init__(self) -> None:
@@ -119,9 +119,9 @@ class DelayLine(Generic[T]):
         return len(self._queue) + len(self._loose)
 
     def put(self, sent: Iterable[T], amount: int = 1) -> None:
-        """Take what a message has become; :meth:`run` next.
+        """Add the transmissions of a message; call :meth:`run` next.
 
-        It counts as ``amount`` for those that wait for what follows.
+        They count as ``amount`` for transmissions that wait for following ones.
         """
         now = self._now
         gatherer = self._count(amount, now)
@@ -135,7 +135,7 @@ class DelayLine(Generic[T]):
                 self._loose.append(_Waiting(one, now))
 
     def run(self) -> None:
-        """Let everything pass for which it is time."""
+        """Let all transmissions pass whose time has come."""
         if self._running or self.stopped:
             return
         self._running = True
@@ -147,17 +147,17 @@ class DelayLine(Generic[T]):
         self._arm()
 
     def stop(self) -> None:
-        """Let nothing pass, for the time being."""
+        """Let nothing pass until :meth:`go_on`."""
         self.stopped = True
         self._timer.set(None)
 
     def go_on(self) -> None:
-        """Let pass what waits, as :meth:`run`, also where it was stopped."""
+        """Let waiting transmissions pass, as :meth:`run`, also if the line was stopped."""
         self.stopped = False
         self.run()
 
     def close(self) -> None:
-        """Drop what is on it. Harmless when called twice."""
+        """Drop all transmissions. Harmless when called twice."""
         self._timer.set(None)
         self.size = 0
         left = [*self._queue, *self._loose]
@@ -172,7 +172,7 @@ class DelayLine(Generic[T]):
         return nanoseconds(self.clock.now)
 
     def _count(self, amount: int, now: int) -> _Waiting[T] | None:
-        """Count what comes for those that wait for it; return the one that it goes with."""
+        """Count new transmissions for those that wait; return the one to join."""
         waiting = [one for one in (*self._queue, *self._loose) if one.missing > 0]
         for one in waiting:
             one.missing -= amount
@@ -182,7 +182,7 @@ class DelayLine(Generic[T]):
         return together[0] if together else None
 
     def _run_loose(self) -> None:
-        """Let pass what may be overtaken: behind the queue, or at once where there is no order."""
+        """Pass transmissions that may be overtaken, and all without an order."""
         now = self._now
         due = [one for one in self._loose if one.when <= now]
         for one in sorted(due, key=lambda one: (one.when, one.sent.behind)):
@@ -195,7 +195,7 @@ class DelayLine(Generic[T]):
                 self._pass_datagrams(one)
 
     def _pass_datagrams(self, one: _Waiting[T]) -> None:
-        """Let the parts pass that are due, one datagram each; with company all are one."""
+        """Pass the due parts, one datagram each; joined parts are one datagram."""
         sent = one.sent
         if sent.gather is not None and not sent.behind:
             self._loose.remove(one)
@@ -231,7 +231,7 @@ class DelayLine(Generic[T]):
             self._queue.popleft()
             if sent.end is not None:
                 batch = self._hand_over(batch)
-                if self.stopped:  # what stands before the end has not passed yet
+                if self.stopped:  # bytes before the end have not passed yet
                     self._queue.appendleft(one)
                 else:
                     self._finish(sent)
@@ -255,7 +255,7 @@ class DelayLine(Generic[T]):
             self.end(sent.end)
 
     def _arm(self) -> None:
-        """Set the timer for what passes next."""
+        """Set the timer for the next transmission."""
         waiting = [*list(self._queue)[:1], *self._loose]
         when = min((one.when for one in waiting), default=None)
         self._timer.set(None if self.stopped else when)

@@ -1,4 +1,4 @@
-"""Do to the camera's device what device faults say."""
+"""Apply device faults to the camera's device."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ _NEEDS: Mapping[type[DeviceFault], str] = {
     f.MovePart: "scene",
     f.RemovePart: "scene",
 }
-"""Methods that a device must have for a fault, by name; faults that are not here do without any."""
+"""Methods that a device needs for a fault, by name; other faults need no methods."""
 
 
 def kinds_of(device: object) -> frozenset[str]:
-    """Return the kinds of faults that a camera with such a device can do."""
+    """Return the kinds of faults that a camera with such a device supports."""
     return frozenset(
         kind
         for kind, fault in f.FAULTS.items()
@@ -92,5 +92,5 @@ def kinds_of(device: object) -> frozenset[str]:
 
 
 def act(stage: Stage, fault: DeviceFault) -> None:
-    """Let a device fault happen."""
+    """Apply a device fault."""
     _ACTIONS[type(fault)](stage, fault)

@@ -1,4 +1,4 @@
-"""Match faults with messages: which wait, which a message brings about, which have happened."""
+"""Match faults with messages: the waiting ones, those that a message triggers, the past ones."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Row:
 class FaultQueue:
     """The faults that wait, in the order in which they were given.
 
-    The lists of rows are always the same objects, so that it costs little to see that one is empty.
+    The lists of rows are always the same objects, so that it is cheap to see that a list is empty.
     """
 
     _dialect: WireCodec
@@ -68,10 +68,10 @@ class FaultQueue:
     _kinds: frozenset[str] = frozenset(FAULTS)  # kinds of faults that the camera can do
 
     def __post_init__(self) -> None:
-        self.said: list[Row] = []  # wire faults on messages of the camera
-        self.heard: list[Row] = []  # wire faults on messages of a client
-        self.device_said: list[Row] = []  # device faults on messages of the camera
-        self.device_heard: list[Row] = []  # device faults on messages of a client
+        self.on_camera: list[Row] = []  # wire faults on messages of the camera
+        self.on_client: list[Row] = []  # wire faults on messages of a client
+        self.device_on_camera: list[Row] = []  # device faults on messages of the camera
+        self.device_on_client: list[Row] = []  # device faults on messages of a client
         # the last faults that have happened, oldest first
         self.fired: deque[FiredFault] = deque(maxlen=MAX_FIRED)
         self._at_once: list[Row] = []
@@ -83,7 +83,7 @@ class FaultQueue:
         return [row.fault for row in self._all]
 
     def add(self, given: Iterable[BaseFault | Mapping[str, Any]]) -> None:
-        """Put faults behind those that wait.
+        """Add faults after those that wait.
 
         Raises:
             ConfigurationError: one of the faults is wrong, or too many would wait; none was added.
@@ -99,7 +99,7 @@ class FaultQueue:
             self._list_of(fault).append(row)
 
     def by_frame(self, rows: list[Row], frame: Frame) -> list[Fault]:
-        """Return the faults among ``rows`` that a client's frame brings about, in order."""
+        """Return the faults among ``rows`` that a client's frame triggers, in order."""
         if not rows:
             return []
         try:
@@ -110,9 +110,9 @@ class FaultQueue:
         return self._take(rows, name, frame.message_id, message)
 
     def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
-        """Return the faults among ``rows`` that a message brings about, as :meth:`by_frame`."""
+        """Return the faults among ``rows`` that a message triggers, as :meth:`by_frame`."""
         number = self._dialect.message_id(message)
-        unnamed = isinstance(message, m.UnknownMessage)  # a code that refuses, alone
+        unnamed = isinstance(message, m.UnknownMessage)  # a refusing code without a body
         kind = type(message) if unnamed else self._dialect.message_type(message.sender, number)
         return self._take(rows, kind.__name__, number, message)
 
@@ -123,7 +123,7 @@ class FaultQueue:
         return self._record([row.fault for row in rows], None)
 
     def clear(self) -> None:
-        """Forget all that wait."""
+        """Forget all waiting faults."""
         self._forget(list(self._all))
 
     def _take(self, rows: list[Row], name: str, message_id: int, message: m.Message) -> list[Fault]:
@@ -147,11 +147,11 @@ class FaultQueue:
         if speaker is None:
             return self._at_once
         if isinstance(fault, WireFault):
-            return self.said if speaker is m.Sender.CAMERA else self.heard
-        return self.device_said if speaker is m.Sender.CAMERA else self.device_heard
+            return self.on_camera if speaker is m.Sender.CAMERA else self.on_client
+        return self.device_on_camera if speaker is m.Sender.CAMERA else self.device_on_client
 
     def _check(self, number: int, fault: Fault) -> None:
-        """Refuse what this camera cannot do."""
+        """Refuse a fault that this camera does not support."""
         wrong = misfit(fault, self._dialect, self._applications, self._kinds)
         if wrong is not None:
             field, text = wrong
@@ -164,7 +164,7 @@ def misfit(
     applications: Container[int],
     kinds: Container[str] = FAULTS,
 ) -> tuple[str, str] | None:
-    """Return the field of a fault that a camera cannot do and why, None if it can do all."""
+    """Return the unsupported field of a fault and the reason, None if all is supported."""
     if fault.kind not in kinds:
         able = ", ".join(kind for kind in FAULTS if kind in kinds)
         return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"

@@ -1,4 +1,4 @@
-"""Make of one message the transmissions that faults say; pure."""
+"""Make the transmissions of one message as faults change them; pure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class WireFramer(Protocol):
-    """Cuts what came into frames."""
+    """Cuts received bytes into frames."""
 
     @property
     def pending(self) -> bytes:
@@ -26,23 +26,23 @@ class WireFramer(Protocol):
         ...
 
     def feed(self, data: bytes) -> None:
-        """Take bytes."""
+        """Add received bytes."""
 
     def next_frame(self) -> Frame | None:
-        """Return the next frame, None if it is not whole yet; FrameError: no frame begins there."""
+        """Return the next frame, None if it is incomplete; FrameError: no frame begins there."""
         ...
 
     def resync(self) -> int:
-        """Go on where a frame may begin; return how many bytes are left out."""
+        """Continue where a frame may begin; return the number of skipped bytes."""
         ...
 
 
 class WireCodec(Protocol):
-    """The words on a wire, as links, faults and the log know them; a framed dialect is one."""
+    """The messages of a wire, for links, faults and the log; a framed dialect is one."""
 
     @property
     def label(self) -> str:
-        """Its name, for people."""
+        """The codec's name, for people."""
         ...
 
     @property
@@ -69,7 +69,7 @@ class WireCodec(Protocol):
         ...
 
     def encode(self, message: m.Message) -> bytes:
-        """Return a message's bytes; UnsupportedError, LocalProtocolError: it has none."""
+        """Return a message's bytes; UnsupportedError, LocalProtocolError: it cannot be sent."""
         ...
 
     def encode_frame(self, frame: Frame) -> bytes:
@@ -85,22 +85,22 @@ class WireCodec(Protocol):
         ...
 
     def surplus(self, sender: m.Sender, frame: Frame) -> int:
-        """Return by how many bytes a frame is too long."""
+        """Return the number of bytes by which a frame is too long."""
         ...
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class WireMessage(Transmission):
-    """A message on its way, or something inserted."""
+    """A message on its way, or an insertion."""
 
-    what: Frame | bytes  # the frame that its sender meant; bytes where they make no frame
+    what: Frame | bytes  # the frame as its sender meant it; bytes that make no frame
     original: bytes  # original bytes of the message
     changeable: bool = True  # whether later faults act on the message
     passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
     def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
-        """Return a message that passes as it is."""
+        """Return a message that passes unchanged."""
         return cls([data], what=what, original=data)
 
     @property
@@ -109,19 +109,19 @@ class WireMessage(Transmission):
         return None if self.passed == self.original else bytes(self.passed)
 
     def place(self, offset: int) -> tuple[int, int]:
-        """Return the part in which the byte at ``offset`` is, and where in it."""
+        """Return the index of the part with the byte at ``offset``, and the place in that part."""
         ends = list(accumulate(map(len, self.parts)))
         index = next(number for number, end in enumerate(ends) if offset < end)
         return index, offset - (ends[index] - len(self.parts[index]))
 
     def drop(self) -> None:
-        """Let nothing of it pass; no later fault acts on it."""
+        """Drop all bytes of the message; later faults do not act on it."""
         self.parts.clear()
         self.pauses.clear()
         self.changeable = False
 
     def copy(self) -> WireMessage:
-        """Return another one like it."""
+        """Return a copy of the message."""
         return replace(
             self,
             parts=list(self.parts),
@@ -131,7 +131,7 @@ class WireMessage(Transmission):
         )
 
 
-# ---------------------------------------------------------------------- one for itself
+# ---------------------------------------------------------------------- single effects
 
 
 def _delay(fault: f.Delay, message: WireMessage) -> None:
@@ -143,7 +143,7 @@ def _split(fault: f.Split, message: WireMessage) -> None:
     if fault.after >= message.size:
         return
     index, inner = message.place(fault.after)
-    if inner:  # else it is cut there already
+    if inner:  # otherwise it is cut there already
         part = message.parts[index]
         message.parts[index : index + 1] = [part[:inner], part[inner:]]
         message.pauses.insert(index, fault.pause)
@@ -183,7 +183,7 @@ _CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
     f.Corrupt: _corrupt,
     f.Drop: lambda _, message: message.drop(),
 }
-"""Faults that act on each transmission of a message for itself."""
+"""Faults that act on each transmission of a message by itself."""
 
 
 # ---------------------------------------------------------------------- all together
@@ -255,9 +255,9 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
 
 
 def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
-    """Return the messages that are whole with these bytes: frames, and bytes between them.
+    """Return the messages that are complete with these bytes: frames, and bytes between them.
 
-    The framer keeps what is unfinished.
+    The framer keeps the unfinished rest.
     """
     framer.feed(data)
     messages: list[WireMessage] = []

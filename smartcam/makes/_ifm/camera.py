@@ -46,9 +46,9 @@ class IfmApplication:
         id: number, 1 to 99.
         parts: the values of each evaluation by the ids of elements; records are lists of mappings.
         processing_time: seconds of an evaluation.
-        trigger: what starts evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
-        images: pictures of an evaluation.
-        jpeg: path or bytes of a JPEG file for all pictures; none for grey levels.
+        trigger: trigger of evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
+        images: number of pictures of an evaluation.
+        jpeg: path or bytes of a JPEG file for all pictures; without it, grey levels.
     """
 
     id: int
@@ -88,12 +88,12 @@ class IfmClient(TicketedClient):
 
 
 class EmulatedIfm(EvaluatingCamera, TicketedCamera):
-    """An emulated sensor of ifm that evaluates the same parts over and over.
+    """An emulated sensor of ifm that evaluates the same parts again and again.
 
     Args:
         applications: numbers of its applications, or mappings of the fields of
             :class:`IfmApplication`.
-        active: number of the active one; None for the first one, 0 for none.
+        active: number of the active application; None for the first one, 0 for none.
         version: version of PCIC that sessions begin with, 1 to 4.
         defaults: fields of :class:`IfmApplication` for all applications.
         options: the options of :class:`~smartcam.emulator.LineCamera`.
@@ -153,7 +153,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return {"layouter": "flexible", "format": form, "elements": elements}
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Carry out a request; a long one is answered while the next ones are read."""
+        """Carry out a request; during a long one, further requests are read."""
         call = cast("IfmClient", client.keep())
         untold = call.dialect.tickets and not call.ticket
         call.answer("?") if untold else super().hear(call, line)
@@ -170,7 +170,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return self.application.processing_time
 
     def evaluated(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
-        """Answer with the result, and send it to all clients that have results switched on."""
+        """Answer with the result, and send it to all clients that have switched results on."""
         self.values = part
         self.results += 1
         self.good += bool(part.get("passed", True))
@@ -186,15 +186,15 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
             return "!"
 
     def voided(self, call: LineClient) -> None:
-        """Refuse a trigger whose evaluation is cut off by a switch."""
+        """Refuse a trigger whose evaluation is interrupted by a switch."""
         call.answer("!")
 
     def overrun(self) -> None:
-        """Tell that a trigger came too early."""
+        """Report that a trigger came too early."""
         self.tell(ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", lambda one: one.outputs & 2)
 
     def activate(self, application: int) -> None:
-        """Make another application the active one, and notify of it."""
+        """Make another application the active one, and report that."""
         super().activate(application)
         text = json.dumps({"Index": application})
         self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda one: one.outputs & 4)
@@ -213,7 +213,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"t")
     def _start(self, call: IfmClient) -> str:
-        """Start an evaluation; its result is sent to whoever has results switched on."""
+        """Start an evaluation; its result is sent to all clients that have switched results on."""
         if not self.takes_trigger:
             return "!"
         self.begin(None)
@@ -229,13 +229,13 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"p([0-7])")
     def _p(self, call: IfmClient, outputs: str) -> str:
-        """Switch results (1), errors (2) and notifications (4) of this session."""
+        """Switch results (1), errors (2) and notifications (4) of this session on."""
         call.session.outputs = int(outputs)
         return "*"
 
     @request(r"A\?")
     def _apps(self, call: IfmClient) -> str:
-        """Tell the count of applications, the active one, and all their numbers."""
+        """Return the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
         return "\t".join([*numbers, *(f"{one:02}" for one in self.applications)])
 
@@ -249,32 +249,32 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"E\?")
     def _error(self, call: IfmClient) -> str:
-        """Tell the present error as nine digits, all zeros for none."""
+        """Return the present error as nine digits, all zeros for none."""
         return f"{self.error:09}"
 
     @request(r"S\?")
     def _stats(self, call: IfmClient) -> str:
-        """Tell the counts of all results, of the good ones, and of the bad ones."""
+        """Return the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
         return "\t".join(f"{one:010}" for one in counts) if self.active else "!"
 
     @request(r"G\?")
     def _who(self, call: IfmClient) -> str:
-        """Tell maker, article, name, place, description, address, ports and time settings."""
+        """Return maker, article, name, place, description, address, ports and time settings."""
         return "\t".join(
             ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK)
         )
 
     @request(r"H\?")
     def _help(self, call: IfmClient) -> str:
-        """Tell this list."""
+        """Return this list."""
         words = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
         each = {words.sub("", form.pattern): one.__doc__ for form, one in self.requests.items()}
         return "\n".join(f"{form:<4} {text}" for form, text in each.items())
 
     @request(r"I(\d\d)\?")
     def _image(self, call: IfmClient, kind: str) -> str:
-        """Tell the last image: 01 as JPEG files, 02 as grey levels."""
+        """Return the last image: 01 as JPEG files, 02 as grey levels."""
         application, now = self.application, self.clock.now
         if kind != ("01" if application.jpeg else "02"):
             return "!"
@@ -284,7 +284,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"c(\d{9})(.*)")
     def _c(self, call: IfmClient, length: str, text: str) -> str:
-        """Take a layout for the results of this session, as JSON with its length."""
+        """Set the layout of this session's results, from JSON with its length."""
         if int(length) != len(text):
             return "!"
         try:
@@ -295,7 +295,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"C\?")
     def _layout(self, call: IfmClient) -> str:
-        """Tell the layout of this session with its length."""
+        """Return the layout of this session with its length."""
         return _counted(json.dumps(call.layout))
 
     @request(r"j(0\d)(\d{9})(.*)")
@@ -308,7 +308,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"J(0\d)\?")
     def _text(self, call: IfmClient, number: str) -> str:
-        """Tell the text in an input container, with its length."""
+        """Return the text in an input container, with its length."""
         return _counted(self.inputs[int(number)])
 
     @request(r"g[01]|d[01]\d{3}")
@@ -324,17 +324,17 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"O(0[1-4])\?")
     def _output(self, call: IfmClient, pin: str) -> str:
-        """Tell the state of an output."""
+        """Return the state of an output."""
         return pin + self._outputs.get(pin, "0")
 
     @request(r"L\?")
     def _session(self, call: IfmClient) -> str:
-        """Tell the number of this session."""
+        """Return the number of this session."""
         return f"{call.number:03}"
 
     @request(r"V\?")
     def _versions(self, call: IfmClient) -> str:
-        """Tell the version of the protocol, and those that can be set."""
+        """Return the version of the protocol, and the versions that can be set."""
         version = int(call.dialect.name[1:])
         return f"{version:02} 01 02 03" if version < 4 else "04 01 04"
 
@@ -346,7 +346,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"v\d\d|[jJoO]\d\d.*")
     def _no_such(self, call: IfmClient) -> str:
-        """Refuse a version, an input container or an output that the device has not."""
+        """Refuse a version, an input container or an output that the device does not have."""
         return "!"
 
 

@@ -12,7 +12,7 @@ JPEG, MONO8 = 260, 251
 
 HEADER = struct.Struct("<12i")
 """Type, size, size of the header, version, width, height, pixel format, microseconds, count,
-status, seconds and nanoseconds; JSON stands behind it, ended by a zero byte."""
+status, seconds and nanoseconds. JSON follows, ended by a zero byte."""
 
 LEAST_HEADER_SIZE, VERSION = 0x40, 3
 
@@ -21,7 +21,7 @@ class ImageChunk(NamedTuple):
     """One picture of a device.
 
     Attributes:
-        type: 260 for a JPEG file, 251 for grey levels, else what the device says.
+        type: 260 for a JPEG file, 251 for grey levels, or another number of the device.
         width: width in pixels.
         height: height in pixels.
         number: count of the picture since the device began.

@@ -1,6 +1,6 @@
 """PCIC, the process interface of ifm's sensors: each answer carries the ticket of its question.
 
-What is known of the devices, and who says so, stands in ``docs/ifm.md``.
+The known facts about the devices, with their sources, are in ``docs/ifm.md``.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
     from smartcam.layout import Layout
 
-    Told = m.Message | tuple[m.Message, ...]
-    Script = Generator[str, str, Told]
+    Reported = m.Message | tuple[m.Message, ...]
+    Script = Generator[str, str, Reported]
 
 DEFAULT_PORT = 50010
 TICKETS = range(1000, 10000)
 RESULTS, ERRORS, NOTIFICATIONS, DEBUG = "0000", "0001", "0010", "0020"
-"""Tickets of what a device says by itself."""
+"""Tickets of messages that a device sends unasked."""
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 
@@ -51,10 +51,10 @@ MAX_INPUT_BYTES = 256
 """Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
-"""Codes of our own for the answers of a single character."""
+"""Codes of this library for the answers of a single character."""
 
 NOT_NOW = 4
-"""Code of our own: a trigger that was answered with ``!``."""
+"""Code of this library for a trigger that was answered with ``!``."""
 
 _MEANINGS: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
@@ -99,7 +99,7 @@ def _status(answer: str) -> m.StatusReport:
 
 
 def _active(answer: str) -> int:
-    """Return the active application of ``count TAB active TAB ...``; -1 where none is."""
+    """Return the active application of ``count TAB active TAB ...``; -1 if there is none."""
     if answer == "!":
         return m.UNNAMED_APPLICATION
     count, active, *_ = answer.split("\t")
@@ -113,7 +113,7 @@ def _error(content: str) -> m.Notice:
 
 
 def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
-    """Return an error; an overrun also as the status of a dropped trigger, which may be ours."""
+    """Return an error; an overrun also as the status of a dropped trigger, maybe this client's."""
     notice = _error(content)
     if notice.code != OVERRUN:
         return (notice,)
@@ -134,7 +134,7 @@ def _reply(answer: str) -> LineReply:
 
 
 def _connect(dialect: PcicDialect, message: m.Connect) -> Script:
-    """Ask who it is, have it say results, errors and notifications, and give it the layout."""
+    """Ask for the device's maker, switch its messages on, and upload the layout."""
     who = yield "G?"
     if not who.upper().startswith("IFM"):
         raise FrameError(f"{who[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
@@ -154,7 +154,7 @@ def _switch(dialect: PcicDialect, message: m.SwitchApplication) -> Script:
     code = CODES[(yield f"a{message.application:02}")]
     active = _active((yield "A?"))
     if code == 0:
-        code = yield from _upload(dialect)  # which may be gone with the old application
+        code = yield from _upload(dialect)  # the layout may be lost with the old application
     return m.SwitchAnswer(code=code, application=active)
 
 
@@ -179,9 +179,9 @@ def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
 
 
 def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
-    """Return the rows; without lengths no pictures, without tickets nothing unasked."""
+    """Return the rows; without lengths, none for pictures; without tickets, none for messages."""
     error = _error if trigger.answer is m.ResultContainer else _error_or_overrun
-    said = (
+    unasked = (
         LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
         LineRow(None, "errors", m.Notice, error, word=ERRORS, also=(m.StatusReport,)),
         LineRow(
@@ -199,7 +199,7 @@ def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, .
         trigger,
         *((LineRow(m.ReadImage, "I01?", m.Image, unread, script=_image),) if lengths else ()),
         LineRow(m.SetInput, "j{data}", m.SetInputAnswer, unread, script=_input),
-        *(said if tickets else ()),
+        *(unasked if tickets else ()),
         LineRow(LineCommand, "{line}", LineReply, _reply),
     )
 
@@ -217,8 +217,8 @@ class PcicDialect(TicketedDialect):
     """One version of PCIC.
 
     Args:
-        layout: what the results of the session hold; None for the device's own.
-        container: the input container that input data goes to.
+        layout: layout of the session's results; None for the device's own.
+        container: number of the input container for input data.
     """
 
     layout: Layout | None = None
@@ -227,7 +227,7 @@ class PcicDialect(TicketedDialect):
     make: str = "ifm"
 
     def with_parameters(self, parameters: Mapping[str, str]) -> PcicDialect:
-        """Return the dialect with what a URL says.
+        """Return the dialect with the parameters of a URL.
 
         Raises:
             ConfigurationError: there is no such trigger or container.
@@ -244,8 +244,8 @@ class PcicDialect(TicketedDialect):
         """Return the dialect for a session that uploads a layout.
 
         Raises:
-            ConfigurationError: a device cannot give such results, or this version no binary ones,
-                or none that come by themselves.
+            ConfigurationError: a device cannot give such results, or this version has no binary
+                results, or none without a trigger.
         """
         row = self.row(m.Trigger)
         if not self.tickets and row is ASYNCHRONOUS:
@@ -260,18 +260,18 @@ class PcicDialect(TicketedDialect):
                 "or interpret_as='raw'"
             )
         layout_json(layout)
-        told = {
+        readers = {
             one: _read_with(layout, one) for one in self.rows if one.answer is m.ResultContainer
         }
-        rows = tuple(one._replace(read=told.get(one, one.read)) for one in self.rows)
+        rows = tuple(one._replace(read=readers.get(one, one.read)) for one in self.rows)
         return replace(self, layout=layout, rows=rows, split=None)
 
     def command(self, line: str) -> str:
-        """Return a command of one's own.
+        """Return a command of the user, checked.
 
         Raises:
-            ConfigurationError: the line is no command, or would end the session, as one that sets
-                the version or another layout than the session's.
+            ConfigurationError: the line is no command, or would end the session, such as one that
+                sets the version or another layout.
             UnsupportedError: its answer needs a length.
         """
         if line[:1] in {"I", "H"} and not self.digits:
@@ -291,10 +291,10 @@ class PcicDialect(TicketedDialect):
         return line
 
 
-def _read_with(layout: Layout, row: LineRow) -> Callable[[str], Told]:
-    """Return a reader of results of an uploaded layout, which have a mark in front."""
+def _read_with(layout: Layout, row: LineRow) -> Callable[[str], Reported]:
+    """Return a reader of results of an uploaded layout, which begin with a mark."""
 
-    def read(content: str) -> Told:
+    def read(content: str) -> Reported:
         if row.request is m.Trigger and content in CODES:
             return row.read(content)
         data = content.encode("latin-1")

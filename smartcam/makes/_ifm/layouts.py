@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from smartcam.layout import Field, Layout
 
 MARK = "smartcam;"
-"""The text in front of each result of an uploaded layout: so it can be no code, and no result of
-another layout."""
+"""The text before each result of an uploaded layout; other results and codes begin
+otherwise."""
 
 _TYPES: Mapping[str, tuple[str, str]] = {
     **{f"int{bits}": (f"int{bits}", code) for bits, code in ((8, "b"), (16, "h"), (32, "i"))},
@@ -30,21 +30,21 @@ _TYPES: Mapping[str, tuple[str, str]] = {
 _CODES: Mapping[str, str] = dict(_TYPES.values())
 
 MAX_DEPTH = 8
-"""Largest number of records in records that a layout may have."""
+"""Largest depth of nested records of a layout."""
 
 
 def layout_json(layout: Layout) -> str:
-    """Return the layout that a device is given, so that it sends what is declared, in binary.
+    """Return the layout for a device, which makes it send the declared fields in binary.
 
     Raises:
-        ConfigurationError: the device has no such type, or counts records by itself.
+        ConfigurationError: the device has no such type, or the layout has a number of records.
     """
     elements: list[dict[str, Any]] = [{"type": "string", "value": MARK, "id": "start_string"}]
     elements += map(_element, layout.head)
     fields = [_element(field) for field in layout.fields]
     if isinstance(layout.repeat, int):
         raise ConfigurationError(
-            f"ifm: a device sends as many records as there are, write ( ... )*: {layout.text}"
+            f"ifm: the number of records is not fixed, write ( ... )*: {layout.text}"
         )
     if layout.repeat is None:
         elements += fields
@@ -64,7 +64,7 @@ def _element(field: Field) -> dict[str, Any]:
 
 
 def with_bools(layout: Layout, data: bytes) -> bytes:
-    """Return a result's bytes with each bool as smartcam's layouts have it: 1 becomes 0xFF."""
+    """Return a result's bytes with the bools of smartcam's layouts: 1 becomes 0xFF."""
     if not any(field.type == "bool" for field in (*layout.head, *layout.fields)):
         return data
     begin, size = (sum(field.size for field in some) for some in (layout.head, layout.fields))
@@ -79,7 +79,7 @@ def with_bools(layout: Layout, data: bytes) -> bytes:
 
 
 def check_layout(text: str) -> dict[str, Any]:
-    """Return a layout that a client uploads; ValueError: a device would refuse it."""
+    """Return a layout that a client uploads; ValueError if a device would refuse it."""
     described = json.loads(text)
     if not isinstance(described, dict) or described.get("layouter") != "flexible":
         raise ValueError("no flexible layouter")
@@ -99,7 +99,7 @@ def _check(elements: object, depth: int) -> None:
 
 
 def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
-    """Return a result as a device sends it: values by ids of elements, records as lists of such."""
+    """Return a result as a device sends it; ``values`` by id of element, records as lists."""
     return b"".join(_encode(described["elements"], values, described.get("format", {})))
 
 

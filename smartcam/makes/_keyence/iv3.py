@@ -1,6 +1,6 @@
 """Keyence IV2 and IV3: sensors that answer each trigger with their judgement.
 
-What is known of them, and who says so, stands in ``docs/keyence.md``.
+The known facts about them, with their sources, are in ``docs/keyence.md``.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ CODES = {
     3: CodeMeaning("not now", Verdict.BUSY),
     22: CodeMeaning("wrong parameter", Verdict.REFUSED),
 }
-"""Codes behind ``ER,<command>``; those of other devices of the family (inferred)."""
+"""Codes after ``ER,<command>``; those of other devices of the family (inferred)."""
 
 
 def read_result(line: str) -> m.ResultContainer:
-    """Return the result that ``RT,count,OK|NG[,tool,OK|NG,rate]...`` tells, else ValueError."""
+    """Return the result in ``RT,count,OK|NG[,tool,OK|NG,rate]...``; ValueError for others."""
     word, count, judged, *tools = line.split(",")
     if word != "RT":
         raise ValueError(line)
@@ -77,7 +77,7 @@ def _triggered(line: str) -> tuple[m.Message, ...]:
 
 
 def _unasked(line: str) -> m.Notice:
-    """Return a result that nobody has asked for as a notice: no sensor is known to send any."""
+    """Return an unasked result as a notice: no sensor is known to send any."""
     return m.Notice("notification", 0, line)
 
 

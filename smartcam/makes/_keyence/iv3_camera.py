@@ -17,21 +17,21 @@ LAST_COUNT = 32_767
 """The largest count of triggers; the next one is 1."""
 
 LEAST_RATE = 70
-"""The rate from which on a tool says OK."""
+"""The least rate that a tool accepts as OK."""
 
 
 class EmulatedIv3(EvaluatingCamera):
-    """An emulated IV3 that judges the same parts over and over.
+    """An emulated IV3 that judges the same parts again and again.
 
     Args:
         programs: numbers of its programs, 0 to 127.
-        active: number of the active one; None for the first one.
-        parts: the rates of the tools of each part, of which 70 and more is OK.
+        active: number of the active program; None for the first one.
+        parts: the rates of the tools of each part; 70 and more is OK.
         processing_time: seconds of an inspection.
         options: the options of :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     protocol = IV3
@@ -59,7 +59,7 @@ class EmulatedIv3(EvaluatingCamera):
         return self.processing_time
 
     def evaluated(self, call: LineClient | None, part: Sequence[int]) -> None:
-        """Judge a part; tell who has asked for it, and nobody else."""
+        """Judge a part; send the result to the client that asked for it."""
         self.count = self.count % LAST_COUNT + 1
         rates = [check_integer(rate, "a rate", 0, 9_999_999) for rate in part]
         tools = [
@@ -72,7 +72,7 @@ class EmulatedIv3(EvaluatingCamera):
             call.answer(self.last)
 
     def voided(self, call: LineClient) -> None:
-        """Refuse a trigger that a switch at the sensor cuts off."""
+        """Refuse a trigger that is interrupted by a switch at the sensor."""
         call.answer("ER,T2,03")
 
     def unknown(self, line: str) -> str:
@@ -89,7 +89,7 @@ class EmulatedIv3(EvaluatingCamera):
 
     @request("T1")
     def _blind(self, client: LineClient) -> str:
-        """Inspect; the result can be asked for."""
+        """Inspect; the client asks for the result later."""
         if self.busy:
             return "ER,T1,03"
         self.begin(None)
@@ -97,12 +97,12 @@ class EmulatedIv3(EvaluatingCamera):
 
     @request("RT")
     def _result(self, client: LineClient) -> str:
-        """Tell the last result."""
+        """Return the last result."""
         return self.last
 
     @request("PR")
     def _program(self, client: LineClient) -> str:
-        """Tell the active program."""
+        """Return the active program."""
         return f"PR,{self.active:03}"
 
     @request("PW(?:,(.*))?")

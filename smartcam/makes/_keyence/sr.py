@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 DEFAULT_PORT = 9004
 LAST_BANK = 15
 NOTHING_READ = "ERROR"
-"""The line of a reader that has read nothing."""
+"""The line of a reader that has read no code."""
 
 CODES = {
     0: CodeMeaning("done", Verdict.DONE),

@@ -16,28 +16,28 @@ if TYPE_CHECKING:
 
 
 class SrDevice:
-    """The operator of an emulated camera: what is done at the device itself."""
+    """The operator of an emulated camera: actions at the device itself."""
 
     def __init__(self, camera: EmulatedSr) -> None:
         self._camera = camera
 
     def trigger(self) -> None:
-        """Trigger at the input; all clients are told what was read."""
+        """Trigger at the input; the reading is sent to all clients."""
         self._camera.tell_all()
 
 
 class EmulatedSr(LineCamera):
-    """An emulated SR reader that reads the same codes over and over.
+    """An emulated SR reader that reads the same codes again and again.
 
     Args:
-        codes: the code of each reading; None for one that cannot be read.
+        codes: the code of each reading; None for a code that cannot be read.
         reading_time: seconds from LON until a code is read.
-        answer_time: seconds from the reading's end until it is told.
-        waits_for_end: tell what was read at LOFF only, not when it is read.
+        answer_time: seconds from the reading's end until its line is sent.
+        waits_for_end: send the reading at LOFF, not when the code is read.
         options: the options of :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: an argument is wrong.
     """
 
     protocol = SR
@@ -58,13 +58,13 @@ class EmulatedSr(LineCamera):
         self.read: int = 0
         self.unread: int = 0
         self._reading: LineClient | None = None
-        self._code: str | None = None  # read, and to be told at the end
+        self._code: str | None = None  # code that was read, to be sent at the end
         self._run = 0
         self.device: Any = SrDevice(self)
         super().__init__(**options)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Answer a line; what is read is told later, and other lines are heard meanwhile."""
+        """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
         call = client.keep()
         word, _, rest = line.partition(",")
         bank = rest.isdecimal() and len(rest) == 2 and int(rest) <= LAST_BANK
@@ -78,17 +78,17 @@ class EmulatedSr(LineCamera):
     def answer(self, line: str) -> str:
         """Return the answer to a line that neither begins nor ends a reading."""
         word = line.partition(",")[0]
-        said = {
+        answers = {
             "BUSYSTAT": f"OK,BUSYSTAT,{'NONE' if self._reading is None else 'TRG'}",
             "ERRSTAT": "OK,ERRSTAT,NONE",
             "NUM": f"OK,NUM,{self.read},{self.unread}",
             "BCLR": "OK,BCLR",
             "RESET": "OK,RESET",
         }
-        return said.get(line, f"ER,{word},{'02' if word == 'LON' else '00'}")
+        return answers.get(line, f"ER,{word},{'02' if word == 'LON' else '00'}")
 
     def _ends(self) -> None:
-        """Forget the reading under way, as a reader does whose power is gone."""
+        """Forget the current reading, like a reader that loses power."""
         super()._ends()
         self._reading, self._code, self._run = None, None, self._run + 1
 
@@ -101,27 +101,27 @@ class EmulatedSr(LineCamera):
         self.after(self.reading_time, lambda: self._found(run))
 
     def _found(self, run: int) -> None:
-        """Read what is there, in the reading that is under way."""
+        """Read the present code, in the current reading."""
         if run != self._run or self._reading is None:
             return
         self._code = next(self.codes)
         if self._code is not None and not self.waits_for_end:
-            self._tell()
+            self._send_reading()
 
     def _end(self) -> None:
         if self._reading is not None:
-            self._tell()
+            self._send_reading()
 
-    def _tell(self) -> None:
+    def _send_reading(self) -> None:
         call, code = self._reading, self._code
         self._reading = self._code = None
         self.read, self.unread = self.read + (code is not None), self.unread + (code is None)
         if call is not None:
-            said = NOTHING_READ if code is None else code
-            self.after(self.answer_time, lambda: call.answer(said))
+            reading = NOTHING_READ if code is None else code
+            self.after(self.answer_time, lambda: call.answer(reading))
 
     def tell_all(self) -> None:
-        """Read a code and tell it to all clients."""
+        """Read a code and send it to all clients."""
         code = next(self.codes)
         row = next(number for number, one in enumerate(LINES.rows, 1) if one.line == "code")
         for client in list(self._clients.values()):

@@ -1,4 +1,4 @@
-"""The words that all of Keyence's lines have: ``ER,<command>,nn`` and ``OK,<command>``."""
+"""The common words of Keyence's lines: ``ER,<command>,nn`` and ``OK,<command>``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 LINE_END = b"\r"
 ENCODING = "latin-1"
-"""One byte for each character: what a code holds is not always text."""
+"""One byte for each character, since the content of a code is not always text."""
 
 MAX_LINE_BYTES = 8192
 """Largest number of bytes of a line: the longest two-dimensional codes have some 7,000
@@ -40,7 +40,7 @@ def asked_word(line: str, others: Mapping[str, str]) -> str:
 
     Args:
         line: the answer.
-        others: commands whose answers begin with another word than the command, and that word.
+        others: commands whose answers begin with another word, and that word.
     """
     first, _, rest = line.partition(",")
     word = rest.partition(",")[0] if first in {"OK", "ER"} and rest else first

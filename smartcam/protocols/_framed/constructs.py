@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols.messages import Sender
 
-# what a body is longer than documented
+# bytes by which a body is longer than documented
 _SURPLUS: Any = c.Default(c.RawCopy(c.GreedyBytes), {"value": b""})
 
 

@@ -86,8 +86,8 @@ class StatusBits:
     Attributes:
         named: bit on the wire to the status bit that means the same.
         without: bit on the wire to the status bit that means its absence.
-        always: status bits that no bit on the wire tells.
-        others: how many bits higher the rest of the wire's bits stand.
+        always: status bits that are always set, since no bit on the wire shows them.
+        others: number of bits by which all other bits of the wire are shifted up.
     """
 
     named: Mapping[int, Status] = field(default_factory=dict[int, Status])
@@ -96,7 +96,7 @@ class StatusBits:
     others: int = 0
 
     def read(self, word: int) -> Status:
-        """Return the status that a word on the wire is."""
+        """Return the status for a word on the wire."""
         if not self.others:
             return as_status(word)
         status, rest = int(self.always), word
@@ -109,7 +109,7 @@ class StatusBits:
         return Status(status | rest << self.others)
 
     def write(self, status: Status) -> int:
-        """Return the word on the wire; bits that it has no place for are left out."""
+        """Return the word on the wire; bits without a place there are left out."""
         if not self.others:
             return int(status)
         bits = int(status)
@@ -122,14 +122,13 @@ class StatusBits:
 
 
 MAX_KNOWN = 256
-"""Largest number of messages kept of each kind; statuses and answers are few, and a peer could send
-any."""
+"""Largest number of messages kept of each kind. Statuses and answers are few, but a peer could send
+any number."""
 
 
 MAX_SURPLUS_BYTES = 1 << 12
-"""Largest number of bytes that a body may be longer than documented, where that is a matter of a
-fixed length: newer firmware may append fields, which are a few words. More is a length that is
-wrong."""
+"""Largest number of bytes that a body of fixed length may be longer than documented. Newer firmware
+may append a few words; a larger number means a wrong length."""
 
 
 class Codec:
@@ -164,14 +163,14 @@ class Codec:
         )
         self.size: int = self._body.size
         self.has_data: bool = self._data is not None
-        # where each answer begins with a code, one that refuses may have nothing else; but two
+        # if each answer begins with a code, a refusing answer may be only that; but two
         # bytes in answer to Connect are the version in another dialect
         answers = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
         coded = answers and dialect.coded and "code" in self._fields
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
-        self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
-        # what fills the slots of a frozen message, in half the time of its own constructor
+        self._known: dict[bytes, Message] = {}  # received bodies; messages are immutable
+        # fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [_filler(row.type, name) for name in self.names]
         self._omitted = [
             (_filler(row.type, one.name), one.default)
@@ -181,7 +180,7 @@ class Codec:
 
     @property
     def may_be_a_code(self) -> bool:
-        """True if a result code that refuses may come alone."""
+        """True if a refusing result code may come alone."""
         return self._code is not None and self._code.size < self.size
 
     @property
@@ -212,7 +211,7 @@ class Codec:
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
         """Return the message whose body is at a place; bytes after it are ignored.
 
-        An answer that is nothing but a refusing code is taken as such: the rest is 0. Raises
+        An answer that is only a refusing code is accepted; its other fields are 0. Raises
         MessageError: the body is shorter than its message.
         """
         if end - begin < self.size:
@@ -241,9 +240,9 @@ class Codec:
         return message
 
     def spell(self, body: bytes) -> dict[str, Any]:
-        """Return the fields of a body with data, which is long enough, as JSON has them.
+        """Return the fields of a body with data, which is long enough, as JSON values.
 
-        Its other fields are plain numbers: results are many, and need no message for that.
+        Its other fields are plain numbers. No message is made, since results are many.
         """
         fields: dict[str, Any] = dict(zip(self.names, self._body.unpack_from(body), strict=False))
         fields[self.names[-1]] = body[self.size :].hex()
@@ -301,7 +300,7 @@ class WireQuirk(NamedTuple):
         about: one line for people.
         source: document that describes the dialect, with its grade.
         rows: the messages that look different.
-        codes: what result codes mean, where that differs.
+        codes: meanings of result codes that differ.
     """
 
     about: str
@@ -311,7 +310,7 @@ class WireQuirk(NamedTuple):
 
 
 SHOWS_TRIGGERS = "shows_triggers"
-"""Parameter of a URL: ``no`` for a camera whose status does not tell of each trigger it takes."""
+"""Parameter of a URL: ``no`` for a camera whose status does not show each accepted trigger."""
 
 _ABILITIES: Mapping[str, type[Message]] = {
     "switch": m.SwitchApplication,
@@ -332,7 +331,8 @@ SWITCH_CODES: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
     1: CodeMeaning("id invalid", Verdict.REFUSED),
 }
-"""Meanings of the answer to a switch where no other has a code (SC manual p. 34, published)."""
+"""Meanings of the answer to a switch, if no other answer has a code (SC manual p. 34,
+published)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -359,7 +359,7 @@ class FramedDialect(Dialect):
     status_by_itself: bool = True
     wire_quirks: Mapping[str, WireQuirk] = field(default_factory=dict[str, WireQuirk])
 
-    # made at their first use, which most dialects of a protocol never see
+    # made at their first use; most dialects of a protocol are never used
 
     @cached_property
     def _encoders(self) -> dict[type[Message], Codec]:
@@ -403,7 +403,7 @@ class FramedDialect(Dialect):
         return {}
 
     def with_quirks(self, names: Iterable[str]) -> FramedDialect:
-        """Return the dialect with these deviations, always the same one for the same names.
+        """Return the dialect with these deviations; the same object for the same names.
 
         Raises:
             ConfigurationError: the dialect knows no such deviation.
@@ -428,19 +428,19 @@ class FramedDialect(Dialect):
                 codes=codes[0] if codes else self.codes,
                 quirks=key,
             )
-            vars(variant)["_variants"] = self._variants  # one for all of them
+            vars(variant)["_variants"] = self._variants  # shared by all variants
         return variant
 
     def with_parameters(self, parameters: Mapping[str, str]) -> FramedDialect:
-        """Return the dialect with what a URL says of ``shows_triggers``, always the same one.
+        """Return the dialect with the URL's ``shows_triggers``; always the same object.
 
         Raises:
             ConfigurationError: the value is neither ``yes`` nor ``no``.
         """
-        said = parameters.get(SHOWS_TRIGGERS, "yes")
-        if said not in {"yes", "no"}:
-            raise ConfigurationError(f"{SHOWS_TRIGGERS}: yes or no, not {said!r}")
-        if said == "yes" or not self.shows_triggers:
+        value = parameters.get(SHOWS_TRIGGERS, "yes")
+        if value not in {"yes", "no"}:
+            raise ConfigurationError(f"{SHOWS_TRIGGERS}: yes or no, not {value!r}")
+        if value == "yes" or not self.shows_triggers:
             return self
         key = (*self.quirks, f"?{SHOWS_TRIGGERS}=no")
         variant = self._variants.get(key)
@@ -474,7 +474,7 @@ class FramedDialect(Dialect):
         return range(1, 1 << 8 * struct.calcsize("<" + self.word))
 
     def code(self, code: int, request: type[Message] | None = None) -> CodeMeaning:
-        """Return the meaning of a result code; one that is not documented refuses."""
+        """Return the meaning of a result code; an undocumented code is a refusal."""
         return self.codes.get(code, UNDOCUMENTED)
 
     def has(self, message_type: type[Message]) -> bool:
@@ -497,7 +497,7 @@ class FramedDialect(Dialect):
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status that another dialect has read as this one reads it."""
+        """Return a status, which another dialect has read, as this dialect reads it."""
         if not isinstance(reader, FramedDialect):
             return report
         word = reader.status_bits.write(report.status)
@@ -508,7 +508,7 @@ class FramedDialect(Dialect):
         return codec.size if codec is not None and codec.has_data else None
 
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
-        """Return a frame in words, for a trace; it never raises."""
+        """Return a frame in readable form, for a trace; it never raises."""
         fields: dict[str, Any] | None = None
         codec = self.decoders(sender).get(frame.message_id)
         if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
@@ -522,7 +522,7 @@ class FramedDialect(Dialect):
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for users who know it better than the table.
+        """Return any request by its id, for users who know more than the table.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.
@@ -542,7 +542,7 @@ class FramedDialect(Dialect):
         )
 
     def _as_named(self, frame: Frame) -> Message:
-        """Return the message that a frame is; an unnamed one where that would change its bytes."""
+        """Return a frame's message; an unnamed message if a named one would change its bytes."""
         with contextlib.suppress(RemoteProtocolError):
             message = self.decode(Sender.CLIENT, frame)
             if self.to_frame(message) == frame:

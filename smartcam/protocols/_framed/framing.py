@@ -1,9 +1,9 @@
 """Cut frames out of bytes, by the length field only.
 
 A frame is a header (a magic number in some dialects, a length, a message id) and a payload. The
-form of the header is data: :class:`HeaderLayout`. A length above the limit, or above what its
-message may have, is refused as soon as the header is there, so no more than one header and one
-payload of the permitted size is ever kept.
+form of the header is data: :class:`HeaderLayout`. A length above the limit, or above the limit of
+its message, is refused as soon as the header is there, so no more than one header and one payload
+of the permitted size is ever kept.
 
 A chunk is not copied: frames are found in it by offset. The rest of a large frame has a buffer of
 its own, into which the transport may write.
@@ -37,22 +37,21 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 
 
 FIRST_READ_BYTES = 1 << 12
-"""Largest number of bytes that one read takes at first. It doubles each time that a read took so
-many."""
+"""Largest number of bytes that the first reads take. It doubles after each read that was full."""
 
 MAX_READ_BYTES = 1 << 15
-"""Largest number of bytes that one read takes in the end; right after a large frame, as many as
-that had. This many bytes of results fit into a subscriber's queue if each has 16 bytes or more, so
-that a subscriber that keeps up loses nothing."""
+"""Largest number of bytes that one read takes in the end, or the size of the frame after a large
+one. This many bytes of results fit into a subscriber's queue if each has 16 bytes or more, so a
+subscriber that keeps up loses nothing."""
 
 
 MIN_READ_BYTES = 1 << 10
-"""Least number of bytes that one read takes where the frames are many and small."""
+"""Least number of bytes that one read takes while frames are many and small."""
 
 
 MAX_ALIKE_FRAMES = 16
-"""Largest number of frames that are cut at once where they begin with the same bytes, the length
-among them."""
+"""Largest number of frames that are cut at once if they begin with the same bytes, including the
+length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +62,8 @@ class HeaderLayout:
         magic: the magic number's bytes on the wire, empty for a dialect without one.
         code: ``struct`` code of length and message id: ``I`` or ``H``.
         order: order of length and message id on the wire.
-        length_includes: bytes that the length field counts beside the payload (4 where it counts
-            the message id).
+        length_includes: bytes that the length field counts beside the payload: 4 if it counts
+            the message id.
     """
 
     magic: bytes = b""
@@ -129,10 +128,10 @@ class Framer:
         self._header = header
         self._max_length = max_length
         self._lengths: Mapping[int, range] = {}
-        self._always = max_length  # length that every message may have
+        self._always = max_length  # length that any message may have
         self._read = header.reader()
         self.buffer: Buffer = (
-            b""  # a chunk as it came, or one large frame; cut() returns offsets in it
+            b""  # a received chunk, or one large frame; cut() returns offsets in it
         )
         self.start: int = 0  # offset of the next frame
         self._large: memoryview | None = None  # whole size of an unfinished large frame
@@ -143,10 +142,9 @@ class Framer:
         self._most = MAX_READ_BYTES  # largest size of a read
 
     def expect(self, lengths: Mapping[int, range]) -> None:
-        """Refuse a payload that is longer than its message may have, even if it is not too long.
+        """Refuse a payload that is longer than its message allows, even if it is below the limit.
 
-        ``lengths``: largest number of bytes of a message's payload, by its id; others are not
-        limited.
+        ``lengths``: allowed lengths of a message's payload, by its id; others are not limited.
         """
         self._lengths = lengths
         self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
@@ -164,7 +162,7 @@ class Framer:
         return bytes(self.buffer[self.start :])
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Take bytes; call :meth:`cut` or :meth:`next_frame` until it returns None."""
+        """Add received bytes; call :meth:`cut` or :meth:`next_frame` until it returns None."""
         large = self._large
         if large is None:
             buffer, start = self.buffer, self.start
@@ -181,8 +179,8 @@ class Framer:
     def room(self) -> memoryview:
         """Return the buffer for a transport's next bytes; call :meth:`filled` next.
 
-        It is the rest of a large frame, or a buffer that grows while it is filled each time: so an
-        idle camera has a small buffer, and a fast one few reads.
+        The buffer is the rest of a large frame, or one that grows whenever it is filled: so an
+        idle camera has a small buffer, and a fast camera needs few reads.
         """
         if self._large is not None:
             return self._large[self._filled :]
@@ -191,9 +189,9 @@ class Framer:
         return self._window
 
     def filled(self, count: int) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`, like :meth:`feed`.
+        """Accept ``count`` bytes that were written into :meth:`room`, like :meth:`feed`.
 
-        Returns False if a large frame goes on, so that there is nothing to cut yet.
+        Returns False if a large frame is unfinished, so that there is nothing to cut yet.
         """
         if self._large is not None:
             self._fill(count)
@@ -227,7 +225,7 @@ class Framer:
         """Return the id and the payload's place of the next whole frame, or None for "more bytes".
 
         :meth:`take` returns the bytes at this place, before the next :meth:`feed`. Raises
-        FrameError: wrong magic, or a length that is impossible or above the limit; nothing is
+        FrameError: wrong magic, or a length that is impossible or above the limit; no bytes are
         consumed.
         """
         if self._large is not None:
@@ -263,11 +261,11 @@ class Framer:
         return bytes(self.buffer[begin:end])
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
-        """Return the payloads of the whole frames that come next and are of the same kind.
+        """Return the payloads of the next whole frames that are of the same kind.
 
         They must have the id and the first ``size`` bytes of payload of the frame that begins at
         ``like``; their other bytes are returned. The first frame that differs, or is wrong, ends
-        the list. ``read``: a header's reader with ``size`` bytes more.
+        the list. ``read``: reader of a header and ``size`` more bytes.
         """
         header, buffer, start = self._header, self.buffer, self.start
         found: list[bytes] = []
@@ -305,9 +303,9 @@ class Framer:
         return found
 
     def unfinished(self) -> tuple[int, int] | None:
-        """Return message id and size, header included, of a frame of which only a part is there.
+        """Return message id and size, header included, of a frame that is only partly received.
 
-        None if not even the header is there. To be asked when :meth:`cut` has returned None.
+        None if its header is incomplete. Call it when :meth:`cut` has returned None.
         """
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         if self.buffered < self._header.size:
@@ -316,11 +314,11 @@ class Framer:
         return message_id, self._header.size + size
 
     def header_within(self, begin: int) -> int | None:
-        """Return the place of another header in what is there of a frame, None for none.
+        """Return the place of another header in the received part of a frame; None without one.
 
-        It has the magic number, the id of a message that is expected, and a length that this may
-        have. Dialects without a magic number have none. ``begin``: of the frame's bytes, where to
-        begin.
+        The header has the magic number, an expected message id and a length allowed for it.
+        Dialects without a magic number have none. ``begin``: place in the frame where the search
+        begins.
         """
         header = self._header
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
@@ -345,13 +343,13 @@ class Framer:
     def resync(self) -> int:
         """Skip to the next magic number after the present place; return the skipped bytes.
 
-        Without one in the buffer, only the bytes that may begin one are kept. A dialect without a
-        magic number has no such place: everything is dropped.
+        Without one in the buffer, only bytes that may begin one are kept. A dialect without a
+        magic number drops everything.
         """
         magic = self._header.magic
         if self._large is not None:
             self.buffer, self.start, self._large = self.pending, 0, None
-        self._keep(self.start)  # a view would be copied for each place
+        self._keep(self.start)  # a view would be copied at each place
         begin = self.start
         found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
@@ -367,14 +365,14 @@ class Framer:
         self.buffer, self.start, self._large = b"", 0, None
 
     def _fill(self, count: int) -> None:
-        """Count bytes of a large frame that came, and finish it if it is whole."""
+        """Count received bytes of a large frame, and finish it if it is complete."""
         self._filled += count
         large = self._large
         if large is not None and self._filled == len(large):
             self.buffer, self.start, self._large = large, 0, None
 
     def _header_at(self, buffer: Buffer, at: int) -> tuple[int, int]:
-        """Return message id and bytes of payload that the header at a place announces."""
+        """Return message id and payload size from the header at a place."""
         _, message_id, length = self._read(buffer, at)
         if not self._header.id_first:
             message_id, length = length, message_id
@@ -386,7 +384,7 @@ class Framer:
             self.buffer, self.start = bytes(self.buffer[start:]), 0
 
     def _collect(self, size: int) -> None:
-        """Collect the rest of a large frame of ``size`` bytes in all where a transport writes."""
+        """Collect the rest of a large frame of ``size`` bytes in the transport's buffer."""
         begun = self.buffer[self.start :]
         in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
         if len(self._store) < size:
@@ -423,10 +421,10 @@ class Framer:
 
 
 def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[bytes]) -> int:
-    """Cut frames of ``length`` bytes that begin with ``head``, in which that length is told.
+    """Cut frames of ``length`` bytes that begin with ``head``, which includes that length.
 
     Sixteen are cut at a time, or none of them: the first that differs may have another length, so
-    anything after it would be no frame. The bytes after the heads are added to ``found``.
+    bytes after it would be no frame. The bytes after the heads are added to ``found``.
 
     Returns:
         The place of the next frame.
@@ -444,5 +442,5 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[
 
 @functools.lru_cache(maxsize=64)
 def _cutter(count: int, head: int, rest: int) -> Read:
-    """Return a function that unpacks ``count`` frames into their headers and bodies, by turns."""
+    """Return a function that unpacks ``count`` frames into alternating headers and bodies."""
     return struct.Struct(f"{head}s{rest}s" * count).unpack_from

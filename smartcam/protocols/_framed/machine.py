@@ -1,9 +1,9 @@
 """The state machine of one link, in either role.
 
-Bytes go in, events come out; it imports no socket, loop or clock. Two rules: what is not in
-:data:`TRANSITIONS` is illegal, and bad input never raises out of ``receive_*``: by the role's
-:class:`~smartcam.protocols._base.Policy` it ends the link with a :class:`LinkFailed` event, or is
-dropped and counted.
+Bytes go in, events come out; it imports no socket, loop or clock. Two rules: a transition outside
+:data:`TRANSITIONS` is illegal, and ``receive_*`` never raises for bad input. The role's
+:class:`~smartcam.protocols._base.Policy` says whether bad input ends the link with a
+:class:`LinkFailed` event, or is dropped and counted.
 """
 
 from __future__ import annotations
@@ -40,36 +40,35 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 MANY_EVENTS = 64
-"""Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
-messages of them, must not hold up other cameras."""
+"""Number of events of one read above which the next read takes fewer bytes: cutting frames, and
+making messages of them, must not delay other cameras."""
 
 MANY_FRAMES = 512
-"""Frames of one read beyond which it is the same, though they be one burst of results: more than
-the receive task takes in a turn, so that reading would have to pause after each."""
+"""Number of frames of one read with the same effect, even if all are one burst of results: more
+than the receive task handles in a turn, so that reading would have to pause after each read."""
 
 
 MAX_FAMILIAR = 64
-"""Largest number of messages of a kind that are known by their frames: of statuses and answers a
-camera has a handful each, and a peer could send any."""
+"""Largest number of messages of a kind that are recognized by their frames. A camera has a handful
+of statuses and answers, but a peer could send any number."""
 
 MAX_KNOWN_CHUNKS = 16
-"""Largest number of chunks that a camera's machine knows as a whole: a client has a handful of
+"""Largest number of whole chunks that a camera's machine recognizes; a client has a handful of
 short requests."""
 
 MAX_KNOWN_CHUNK_BYTES = 64
-"""Largest number of bytes of the longest of these chunks: a Query, a sequence number and a Trigger
-have 40."""
+"""Largest number of bytes of such a chunk: a Query, a sequence number and a Trigger have 40."""
 
 MAX_KNOWN_DELIVERIES = 64
-"""Largest number of deliveries that a client's machine looks at, to know the next one like them, in
-one state."""
+"""Largest number of deliveries that a client's machine stores in one state, to recognize similar
+ones."""
 
 MAX_KNOWN_DELIVERY_BYTES = 1 << 12
-"""Largest number of bytes of one of these: the answers to a trigger, with a result of ordinary
+"""Largest number of bytes of such a delivery: the answers to a trigger, with a result of ordinary
 size."""
 
 MAX_KNOWN_DELIVERY_FRAMES = 8
-"""Largest number of frames of one of these: a trigger's five, and more statuses around them."""
+"""Largest number of frames of such a delivery: a trigger's five, and more statuses around them."""
 
 
 _SESSION_REQUESTS = (
@@ -99,7 +98,7 @@ _SESSION_REPORTS = (
 )
 
 
-# What the camera sends unasked. A Disconnect may be answered or not, and nobody waits for it.
+# Messages that the camera sends unasked. A Disconnect may be answered or not; nothing waits for it.
 _BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
 
 
@@ -107,13 +106,13 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
     client, camera = m.Sender.CLIENT, m.Sender.CAMERA
     idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
     table: dict[tuple[State, m.Sender, type[Message]], State] = {
-        # without a session it is harmless, and it ends one that a dead client left behind
+        # without a session it is harmless, and it ends a session that a dead client left
         (idle, client, m.Disconnect): idle,
         (idle, client, m.Connect): connecting,
         (connecting, client, m.Disconnect): State.DISCONNECTED,
         (connecting, client, m.Connect): connecting,
         (connecting, camera, m.ConnectAnswer): connected,
-        # what was asked before it in the same bytes is still answered
+        # requests before it in the same bytes are still answered
         (connected, client, m.Connect): connected,
         (connected, client, m.Disconnect): State.DISCONNECTED,
         (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
@@ -123,11 +122,11 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
         (connected, camera, m.ConnectAnswer): connected,
     }
     for state in (idle, connecting, connected, State.DISCONNECTED):
-        # to the Disconnect that went before a Connect, or ended the session
+        # answers to the Disconnect that was sent before a Connect, or that ended the session
         table[state, camera, m.DisconnectAnswer] = state
     for request in (*_SESSION_REQUESTS, m.UnknownMessage, m.MalformedMessage):
         table[connected, client, request] = connected
-        # right behind a Connect, before its answer is out: it is answered after that
+        # sent right after a Connect, before its answer: it is answered after that
         table[connecting, client, request] = connecting
     for report in (*_SESSION_REPORTS, m.UnknownMessage):
         table[connected, camera, report] = connected
@@ -136,10 +135,10 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
 
 
 TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transitions()
-"""``{(state, sender, message type): next state}``, for both roles. What is not here is illegal."""
+"""``{(state, sender, message type): next state}``, for both roles. All other cases are illegal."""
 
 
-_SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
+_NEXT_STATES: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
     (state, sender): {
         kind: following
         for (before, who, kind), following in TRANSITIONS.items()
@@ -152,22 +151,22 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 
 
 _Made: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
-"""Bytes of a frame, its id and that of its answer; the frame."""
+"""Bytes of a frame, its id and the id of its answer; the frame."""
 
 
 class _Delivery(NamedTuple):
-    """A delivery of whole frames that each came before, with one result at most.
+    """A delivery of whole frames that were all seen before, with one result at most.
 
     Attributes:
-        head: bytes in front of the result's data; all bytes where it has no result.
+        head: bytes before the result's data; all bytes if there is no result.
         begin: place where the data begins.
-        tail: bytes behind that data.
+        tail: bytes after the data.
         end: place where the data ends.
-        owed: ids of the answers that were owed when it came, and of those owed twice.
-        left: ids of those that were owed behind it, and of those owed twice.
-        before: messages in front of the result; all messages where it has no result.
+        pending: ids of the answers that were pending before it, and of those pending twice.
+        pending_after: ids of the answers that were pending after it, and of those pending twice.
+        before: messages before the result; all messages if there is no result.
         make: function that makes the result of its data.
-        behind: messages behind the result.
+        behind: messages after the result.
         frames: number of its frames.
     """
 
@@ -175,8 +174,8 @@ class _Delivery(NamedTuple):
     begin: int
     tail: bytes
     end: int
-    owed: tuple[set[int], set[int]]
-    left: tuple[set[int], set[int]]
+    pending: tuple[set[int], set[int]]
+    pending_after: tuple[set[int], set[int]]
     before: list[Message]
     make: Callable[[bytes], Message] | None
     behind: list[Message]
@@ -184,28 +183,28 @@ class _Delivery(NamedTuple):
 
 
 class _Volley(NamedTuple):
-    """Messages that were said together.
+    """Messages that were sent together.
 
     Attributes:
-        messages: messages; the same tuple is the same again.
+        messages: messages; the same tuple is recognized.
         frames: frames of these messages.
         size: number of bytes of all frames.
-        owed: ids of the answers that were owed before, and of those owed twice.
-        left: ids of those that were owed behind them, and of those owed twice.
+        pending: ids of the answers that were pending before, and of those pending twice.
+        pending_after: ids of the answers that were pending afterwards, and of those pending twice.
     """
 
     messages: tuple[Message, ...]
     frames: list[bytes]
     size: int
-    owed: tuple[set[int], set[int]]
-    left: tuple[set[int], set[int]]
+    pending: tuple[set[int], set[int]]
+    pending_after: tuple[set[int], set[int]]
 
 
 class Machine:
     """One link's protocol: bytes to events and messages to bytes.
 
-    Feed what the socket gives to :meth:`receive_data`, take :meth:`events`; give what is to be said
-    to :meth:`send` and write :meth:`data_to_send`.
+    Feed received bytes to :meth:`receive_data` and take :meth:`events`; give messages to
+    :meth:`send` and write :meth:`data_to_send`.
 
     Args:
         dialect: the wire variant.
@@ -215,12 +214,12 @@ class Machine:
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: function that is called with the sender and each whole frame, in both directions, and
             with the error for bytes that make no frame.
-        kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
-            that the answer to Connect does not fit are left out when it comes; where several are
-            left, :meth:`adopt` decides.
+        kin: dialects that begin a session alike, of which the camera speaks one, ``dialect`` first.
+            Dialects that the answer to Connect does not fit are left out when it comes; if several
+            are left, :meth:`adopt` decides.
 
     Attributes:
-        transitions: the next state by state, sender and type of message; what is not in it is
+        transitions: the next state by state, sender and type of message; all other messages are
             illegal.
     """
 
@@ -248,38 +247,38 @@ class Machine:
         self._bounded = self._policy.bounded
         self._header_size = dialect.header.size
         self._framer = Framer(dialect.header, max_length)
-        self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, when it was seen
+        self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, and its time
         self._unfinished = frame_age.Unfinished()
         self._trace = trace
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
-        self._open: set[int] = set()  # ids of the answers the camera owes (client role)
-        # ids of which it owes two: of what was sent ``again``
+        self._open: set[int] = set()  # ids of the pending answers (client role)
+        # ids of which two answers are pending: of requests sent ``again``
         self._open_twice: set[int] = set()
         self._sender, self._says = role.receives, role.sends
         self._asks = role is Role.CLIENT
         self._plain = self._asks and trace is None
         self._decoders: dict[int, Codec] = {}
-        # by ids: whole frames that came before, and what they are; of this state only
+        # by ids: whole frames seen before, and their messages; in this state only
         self._familiar: dict[int, dict[bytes, Message]] = {}
-        self._statuses: dict[bytes, Message] = {}  # those of statuses
-        # by what stands in front of the data: bytes of the frame, what makes the message
+        self._statuses: dict[bytes, Message] = {}  # messages of statuses, by their frames
+        # by the bytes before the data: bytes of the frame, function that makes the message
         self._results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
-        # of a client, by their sizes; how many more are looked at
+        # of a client: deliveries by their sizes; how many more are stored
         self._deliveries: dict[int, _Delivery] = {}
         self._unknown_deliveries = MAX_KNOWN_DELIVERIES
-        self._volley: _Volley | None = None  # of a client: the last messages said together
-        # of a camera, by chunks that came before in this state: their messages and frames
+        self._volley: _Volley | None = None  # of a client: the last messages sent together
+        # of a camera, by chunks seen before in this state: their messages and frames
         self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
-        # of a camera, by the id of a message object that it said before: the message and its frame
-        self._said: dict[int, tuple[Message, _Made]] = {}
-        self._said_data = 0  # the key of the last one with data
+        # of a camera, by the id of a message object sent before: the message and its frame
+        self._sent_frames: dict[int, tuple[Message, _Made]] = {}
+        self._sent_data_key = 0  # the key of the last message with data
         self._status_id = self._status_size = 0
         self.state = State.IDLE
         self._take_up(dialect)
 
     def adopt(self, dialect: Dialect) -> None:
-        """Speak this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
+        """Speak this dialect of :attr:`kin`; statuses returned before are not read again.
 
         Raises:
             LocalProtocolError: the dialect is not in :attr:`kin`.
@@ -303,7 +302,7 @@ class Machine:
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
         self._takes_bursts = self._asks and result.size > 0
-        self._said = {}
+        self._sent_frames = {}
         self._forget_familiar()
 
     @property
@@ -316,26 +315,26 @@ class Machine:
         self._state = state
         self._deaf = state is State.FAILED or state is State.CLOSED
         self._narrows = state is State.CONNECTING
-        self._may_come = _SAID[state, self._sender]
-        self._may_go = _SAID[state, self._says]
+        self._may_come = _NEXT_STATES[state, self._sender]
+        self._may_go = _NEXT_STATES[state, self._says]
         self._forget_familiar()
 
     # ------------------------------------------------------------------ bytes in
 
     @property
     def buffered(self) -> int:
-        """Bytes of an unfinished frame that are kept; at most one header and one payload."""
+        """Bytes of an unfinished frame; at most one header and one payload."""
         return self._framer.buffered
 
     @property
     def pending(self) -> bytes:
-        """Copy of the bytes that wait for more."""
+        """Copy of the bytes of an unfinished frame."""
         return self._framer.pending
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> None:
-        """Take bytes from a stream, or one whole datagram; call :meth:`events` next.
+        """Add bytes of a stream, or one whole datagram; call :meth:`events` next.
 
-        Never raises for what is in the bytes. In state FAILED or CLOSED they are dropped.
+        Never raises for bad bytes. In state FAILED or CLOSED they are dropped.
         """
         if self._deaf:
             return
@@ -367,10 +366,10 @@ class Machine:
             self._receive_frames()
 
     def _receive_chunk(self, data: bytes) -> None:
-        """Take a short chunk where no frame is unfinished; know it from now on if it is plain.
+        """Read a short chunk while no frame is unfinished; store it if it is plain.
 
-        That is one of whole frames which leave the state as it is, and whose bytes are those that
-        the messages made of them have: then there is nothing more to see in it.
+        A plain chunk has whole frames that leave the state as it is, and its messages have exactly
+        its bytes: so it can be recognized next time without being read.
         """
         state, before = self._state, len(self._events)
         self._receive(data)
@@ -387,16 +386,16 @@ class Machine:
         return self._framer.room()
 
     def filled(self, count: int, now: float = 0.0) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
+        """Accept ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
 
-        A frame that does not become whole in time is broken, as the policy says.
+        A frame that is not complete in time is broken, if the policy bounds frames.
 
         Args:
             count: number of the bytes.
-            now: when they came, in seconds since any beginning.
+            now: time at which they came, seconds of any clock.
 
         Returns:
-            False where a large frame goes on, so that there are no events yet.
+                False if a large frame is unfinished, so that there are no events yet.
         """
         if self._deaf:
             return False
@@ -419,7 +418,7 @@ class Machine:
         return cut
 
     def receive_eof(self) -> None:
-        """Take note that the peer will send no more; call :meth:`events` next."""
+        """Note that the peer will send no more; call :meth:`events` next."""
         if self._deaf:
             return
         self._events.append(LinkEnded(pending=self._framer.buffered))
@@ -434,19 +433,19 @@ class Machine:
     # ------------------------------------------------------------------ messages out
 
     def send(self, message: Message, *, answered: bool | None = None, again: bool = False) -> None:
-        """Say something; write :meth:`data_to_send` next.
+        """Send a message; write :meth:`data_to_send` next.
 
         Args:
-            message: what to say.
+            message: the message.
             answered: True if an answer is expected to an
-                :class:`~smartcam.protocols.messages.UnknownMessage`; the default is what the table
+                :class:`~smartcam.protocols.messages.UnknownMessage`; by default as the table
                 says, and True for an unknown id.
             again: True if another request of the same kind may still wait for its answer: the
                 answers come in the order of the requests.
 
         Raises:
             LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
-                the same id is still owed (answers carry no correlation). Nothing has changed.
+                the same id is pending (answers carry no request number). Nothing has changed.
         """
         kind = type(message)
         following = self._may_go.get(kind)
@@ -457,18 +456,18 @@ class Machine:
             )
         constant, frame = self._constant.get(kind), None
         if constant is None:
-            known = self._said.get(id(message))
+            known = self._sent_frames.get(id(message))
             constant, frame = self._made_of(message) if known is None else known[1]
-        data, message_id, owed = constant
+        data, message_id, pending = constant
         if answered is not None:
-            owed = message_id if answered else None
-        if owed is not None and self._asks:
-            if owed in (self._open_twice if again else self._open):
+            pending = message_id if answered else None
+        if pending is not None and self._asks:
+            if pending in (self._open_twice if again else self._open):
                 raise LocalProtocolError(
                     f"an answer to message {message_id:#04x} is still owed; one request of an id "
                     "can be open"
                 )
-            (self._open_twice if owed in self._open else self._open).add(owed)
+            (self._open_twice if pending in self._open else self._open).add(pending)
         if following is not self._state:
             self.state = following
         self._outbox.append(data)
@@ -481,28 +480,30 @@ class Machine:
             self._trace(self._says, frame)
 
     def send_all(self, messages: Sequence[Message]) -> None:
-        """Say messages together, as :func:`~smartcam.protocols._machine.send_each` does.
+        """Send messages together, as :func:`~smartcam.protocols._machine.send_each` does.
 
-        The same tuple said again where the same is owed gives the same frames, and owes the same.
+        The same tuple, sent again with the same pending answers, gives the same frames.
 
         Raises:
-            LocalProtocolError: the state forbids one; those before it are said.
+            LocalProtocolError: the state forbids a message; those before it are sent.
         """
         volley = self._volley
         if volley is not None:
-            known, frames, size, owed, left = volley
-            if known is messages and owed[0] == self._open and owed[1] == self._open_twice:
-                self._open, self._open_twice = left[0].copy(), left[1].copy()
+            known, frames, size, pending, pending_after = volley
+            if known is messages and pending[0] == self._open and pending[1] == self._open_twice:
+                self._open, self._open_twice = pending_after[0].copy(), pending_after[1].copy()
                 self._outbox += frames
                 counters = self.counters
                 counters.frames_sent += len(frames)
                 counters.bytes_sent += size
                 return
-        owed, state, said = self._owed(), self._state, len(self._outbox)
+        pending, state, sent = self._pending_answers(), self._state, len(self._outbox)
         send_each(self, messages)
         if self._plain and state is self._state and isinstance(messages, tuple):
-            frames = self._outbox[said:]
-            self._volley = _Volley(messages, frames, sum(map(len, frames)), owed, self._owed())
+            frames = self._outbox[sent:]
+            self._volley = _Volley(
+                messages, frames, sum(map(len, frames)), pending, self._pending_answers()
+            )
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -514,7 +515,7 @@ class Machine:
     def _made_of(self, message: Message) -> _Made:
         """Return the frame of a message with a body; a camera's machine keeps it by the object.
 
-        Of those with data, such as results, only the last one's frame is kept.
+        Of messages with data, such as results, only the last frame is kept.
         """
         dialect = self.dialect
         message_id = dialect.message_id(message)
@@ -522,14 +523,14 @@ class Machine:
         made = (dialect.encode_frame(frame), message_id, dialect.answer_id(message_id)), frame
         if not self._asks and dialect.has(type(message)):
             if dialect.encoder(type(message)).has_data:
-                self._said.pop(self._said_data, None)
-                self._said_data = id(message)
-            if len(self._said) < MAX_FAMILIAR:
-                self._said[id(message)] = message, made
+                self._sent_frames.pop(self._sent_data_key, None)
+                self._sent_data_key = id(message)
+            if len(self._sent_frames) < MAX_FAMILIAR:
+                self._sent_frames[id(message)] = message, made
         return made
 
     def _receive_frames(self) -> bool:
-        """Make events of the whole frames that are there; return whether a part of one is left."""
+        """Make events of the whole received frames; return whether part of a frame is left."""
         framer = self._framer
         self._receive_familiar()
         while framer.start < len(framer.buffer):
@@ -551,31 +552,31 @@ class Machine:
         return False
 
     def _receive_familiar(self) -> None:
-        """Take the messages that come next and came before.
+        """Read the next messages as long as they were seen before.
 
-        A camera has few statuses, and sends two around each result. Statuses, and answers that are
-        owed, are known byte for byte; results by all that stands in front of their data.
+        A camera has few statuses, and sends two around each result. Statuses and pending answers
+        are recognized byte for byte, results by all bytes before their data.
         """
         framer, events = self._framer, self._events
         buffer, start = framer.buffer, framer.start
         if not self._plain or isinstance(buffer, memoryview):
             return
-        known, size, owed = self._statuses.get, self._status_size, self._open
+        known, size, pending = self._statuses.get, self._status_size, self._open
         before, available = len(events), len(buffer)
         looks = self._unknown_deliveries and available <= MAX_KNOWN_DELIVERY_BYTES
-        were = self._owed() if looks and not start and not before else None
+        were = self._pending_answers() if looks and not start and not before else None
         while start < available:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
                 found = self._find_result(buffer, start)
-                if found is None and owed:
+                if found is None and pending:
                     found = self._find_answer(buffer, start)
                 if found is None:
                     break
                 message, end = found
-            elif owed:
-                owed.discard(self._status_id)
+            elif pending:
+                pending.discard(self._status_id)
             events.append(message)
             start = end
         framer.start = start
@@ -583,17 +584,17 @@ class Machine:
         if were is not None and 0 < start == available:
             self._note_delivery(buffer, were)
 
-    def _owed(self) -> tuple[set[int], set[int]]:
+    def _pending_answers(self) -> tuple[set[int], set[int]]:
         return set(self._open), set(self._open_twice)
 
-    def _note_delivery(self, buffer: bytes, owed: tuple[set[int], set[int]]) -> None:
-        """Know a delivery that was taken as a whole from familiar frames, each of them an event."""
+    def _note_delivery(self, buffer: bytes, pending: tuple[set[int], set[int]]) -> None:
+        """Store a delivery that consisted of familiar frames only, each of them an event."""
         framer, events = self._framer, [one for one in self._events if isinstance(one, m.Message)]
         results = [at for at, one in enumerate(events) if isinstance(one, m.ResultContainer)]
         self._unknown_deliveries -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
             return
-        at, begin, end = len(events), len(buffer), len(buffer)  # of the result's data
+        at, begin, end = len(events), len(buffer), len(buffer)  # place of the result's data
         make = None
         framer.start = 0
         for number in range(len(events)):
@@ -606,8 +607,8 @@ class Machine:
             begin,
             buffer[end:],
             end,
-            owed,
-            self._owed(),
+            pending,
+            self._pending_answers(),
             events[:at],
             make,
             events[at + 1 :],
@@ -615,9 +616,9 @@ class Machine:
         )
 
     def _receive_known(self) -> bool:
-        """Take a delivery that is like one before, in all bytes but its result's data.
+        """Read a delivery that equals an earlier one in all bytes but its result's data.
 
-        Cut and read again it would give the same, with other data in the result.
+        To cut and read it again would give the same messages, with other data in the result.
         """
         framer, events = self._framer, self._events
         buffer = framer.buffer
@@ -625,12 +626,12 @@ class Machine:
         known = self._deliveries.get(size)
         if known is None or events or framer.start or type(buffer) is not bytes:
             return False
-        head, begin, tail, end, owed, left, before, make, behind, frames = known
+        head, begin, tail, end, pending, pending_after, before, make, behind, frames = known
         if buffer[:begin] != head or buffer[end:] != tail:
             return False
-        if owed[0] != self._open or owed[1] != self._open_twice:
+        if pending[0] != self._open or pending[1] != self._open_twice:
             return False
-        self._open, self._open_twice = left[0].copy(), left[1].copy()
+        self._open, self._open_twice = pending_after[0].copy(), pending_after[1].copy()
         events += before
         if make is not None:
             events.append(make(buffer[begin:end]))
@@ -640,10 +641,10 @@ class Machine:
         return True
 
     def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
-        """Return the next message and its end if it is a result as there was one before.
+        """Return the next message and its end if it is a result like an earlier one.
 
-        That is one of the same application with as many bytes. Only in front of a known status, or
-        at the end: in front of another one it may begin a burst.
+        It has the same application and as many bytes, and comes right before a known status, or
+        at the end: before another message it may begin a burst.
         """
         data = start + self._result_head
         known = self._results.get(buffer[start:data])
@@ -658,7 +659,7 @@ class Machine:
         return make(buffer[data:end]), end
 
     def _find_answer(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
-        """Return the next message and its end if it came before, is an answer and owed."""
+        """Return the next message and its end if it is a pending answer that was seen before."""
         for message_id in self._open:
             frames = self._familiar.get(message_id)
             if frames:
@@ -670,7 +671,7 @@ class Machine:
         return None
 
     def _is_overdue(self, now: float) -> bool:
-        """Return True if the unfinished frame will not become whole; reject that frame."""
+        """Return True if the unfinished frame will never be complete; reject that frame."""
         framer, begun = self._framer, self._unfinished
         age = begun.age(self._begun, self._begun_at, now)
         if age < frame_age.HINT_TIME:
@@ -706,7 +707,7 @@ class Machine:
         framer.clear()
 
     def _receive_frame(self, message_id: int, begin: int, end: int) -> Message | None:
-        """Make a message of a frame whose payload is at a place of the framer's; None: dropped."""
+        """Make a message of a frame whose payload is at a place of the framer; None: dropped."""
         counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
         if self._narrows and len(self.kin) > 1:
@@ -738,7 +739,7 @@ class Machine:
         elif self._plain and codec is not None and surplus == 0:
             self._note_familiar(codec, message, begin, end)
         if kind in _BY_ITSELF:
-            if self._open:  # asked for, in a dialect or by a raw request
+            if self._open:  # answers a request, perhaps a raw one
                 self._open.discard(message_id)
         elif self._asks and not self._wanted(message_id, known=codec is not None):
             return None
@@ -750,7 +751,7 @@ class Machine:
     ) -> tuple[Message, int]:
         """Return the message of a frame without a name, or of another length than documented.
 
-        And the bytes that it is too long, where that is accepted.
+        Also return the number of surplus bytes, if the policy accepts them.
 
         Raises:
             MessageError: the body is too short, or too long.
@@ -768,7 +769,7 @@ class Machine:
         return codec.decode(payload, 0, len(payload)), surplus
 
     def _note_familiar(self, codec: Codec, message: Message, begin: int, end: int) -> None:
-        """Know a message by its frame, as long as this state lasts; here is its payload."""
+        """Store a message by its frame, for this state only; ``begin``: place of its payload."""
         frame = begin - self._header_size
         if type(message) is m.ResultContainer:
             if self._takes_bursts and len(self._results) < MAX_FAMILIAR:
@@ -781,13 +782,13 @@ class Machine:
                 frames[self._framer.take(frame, end)] = message
 
     def _forget_familiar(self) -> None:
-        """Look at each message again, since it may mean another thing or may be no message now."""
+        """Read each message anew from now on, since it may have another meaning or none."""
         self._statuses, self._results, self._chunks, self._deliveries = {}, {}, {}, {}
         self._unknown_deliveries, self._volley = MAX_KNOWN_DELIVERIES, None
         self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:
-        """Leave out the kin that have no such message, or another length of it."""
+        """Leave out the kin without such a message, or with another length of it."""
         decoders = [dialect.decoders(self._sender).get(message_id) for dialect in self.kin]
         fitting = tuple(
             dialect
@@ -799,9 +800,9 @@ class Machine:
             self._take_up(fitting[0])
 
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
-        """Take the result containers of the same application that come next.
+        """Read the next result containers, as long as they are of the same application.
 
-        ``begin``: of the payload of the first, which is the last event.
+        ``begin``: place of the payload of the first, which is the last event.
         """
         framer, head = self._framer, self._header_size + self._burst_size
         start = framer.start
@@ -818,7 +819,7 @@ class Machine:
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
-        """Return True if the client sees a message; an answer to no request is counted only."""
+        """Return True if the client gets a message; an answer to no request is only counted."""
         self.counters.unknown_ids += not known
         if message_id in self._open:
             self._close(message_id)
@@ -827,11 +828,11 @@ class Machine:
         return not known
 
     def _close(self, message_id: int) -> None:
-        """Note that one answer which is owed has come."""
+        """Note that a pending answer has come."""
         (self._open_twice if message_id in self._open_twice else self._open).remove(message_id)
 
     def _reject(self, error: RemoteProtocolError) -> bool:
-        """Fail the link (True) or drop and count, as the policy says."""
+        """Fail the link (return True), or drop and count the input, as the policy says."""
         if self._trace is not None:
             self._trace(self._sender, error)
         if not isinstance(error, self._policy.fatal):

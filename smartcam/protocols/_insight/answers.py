@@ -1,4 +1,4 @@
-"""Answers of In-Sight native mode: a status code, and data whose form the command says."""
+"""Answers of In-Sight native mode: a status code, and data in a form that the command sets."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
 MAX_IMAGE_BYTES = 1 << 26
-"""Largest number of bytes of an image that are accepted: 20 million pixels of three bytes, and then
-some."""
+"""Largest number of bytes of an image that is accepted: 20 million pixels of three bytes, and some
+more."""
 
 _BMP_MAGIC = b"BM"
-_BMP_SIZE_AT = slice(2, 6)  # of the file, UINT32 little endian
+_BMP_SIZE_AT = slice(2, 6)  # place of the file's size, UINT32 little endian
 
 
 class CommandAnswer(NamedTuple):
@@ -46,14 +46,14 @@ class CommandAnswer(NamedTuple):
 
 
 class AnswerReader(LineReader):
-    """Cuts answers from a stream; each has the form that its command says.
+    """Cuts answers from a stream; the command sets the form of its answer.
 
-    The machine that feeds it reads until nothing is left; then no more than a line waits.
+    The machine that feeds it reads until nothing is left, so at most one line waits.
 
     Args:
-        max_length: longest text of an answer that says its length, bytes.
-        on_pieces: function that is called with pieces that came, and whether a line end stood
-            behind each.
+        max_length: longest text of an answer that gives its length, bytes.
+        on_pieces: function that is called with received pieces, and whether a line end followed
+            each.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class AnswerReader(LineReader):
     def next_answer(self) -> CommandAnswer | None:
         """Return the expected answer, None if it is not all there yet.
 
-        Raises FrameError: what came is no such answer; the stream cannot be read on.
+        Raises FrameError: the bytes are no such answer; the stream cannot be read on.
         """
         if self._reading is None:
             return None
@@ -84,14 +84,14 @@ class AnswerReader(LineReader):
         return None
 
     def next_line(self) -> str | None:
-        """Return the next line as :meth:`LineReader.next_line`, and tell of it."""
+        """Return the next line as :meth:`LineReader.next_line`, and report it."""
         line = super().next_line()
         if line is not None:
             self._on_pieces((line.encode(ENCODING),), True)
         return line
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Take a prompt as :meth:`LineReader.take_prompt`, and tell of it."""
+        """Remove a prompt as :meth:`LineReader.take_prompt`, and report it."""
         taken = super().take_prompt(prompt)
         if taken:
             self._on_pieces((prompt,), False)
@@ -129,11 +129,11 @@ class AnswerReader(LineReader):
             yield
         self._on_pieces((data,), False)
         if end := (yield from self._line()):
-            raise FrameError(f"{end[:64]!r} came behind a text of {size} bytes, its end was due")
+            raise FrameError(f"{end[:64]!r} came after a text of {size} bytes, its end was due")
         return data.decode(ENCODING)
 
     def _image(self) -> Generator[None, None, bytes]:
-        """Read a bitmap; its own header says how long it is, the size may count digits."""
+        """Read a bitmap. Its own header has its length; the size before it may count digits."""
         _number((yield from self._line()), "an image's size")
         data = bytearray()
         size, check, regular = 0, "", True
@@ -150,9 +150,9 @@ class AnswerReader(LineReader):
                 size = _bitmap_size(data)
         if len(data) > size:
             raise FrameError(f"{len(data)} bytes of a bitmap of {size} bytes came")
-        told = yield from self._line()
-        if told.strip().upper() != check:
-            raise FrameError(f"the image's checksum is {told[:16]!r}, {check} was expected")
+        sent = yield from self._line()
+        if sent.strip().upper() != check:
+            raise FrameError(f"the image's checksum is {sent[:16]!r}, {check} was expected")
         return bytes(data)
 
     def _hex_line(self) -> Generator[None, None, bytes]:
@@ -164,10 +164,10 @@ class AnswerReader(LineReader):
         return data
 
     def _take_hex(self, most: int) -> bytes | None:
-        """Take all lines of an image that are there, ``most`` digits of it: there are thousands.
+        """Return all whole lines of an image that are there, up to ``most`` digits, as bytes.
 
-        Returns what they say, nothing if no whole one is there. None: one of them is broken, and
-        all are left to be read line by line, which tells which one, and what came before it.
+        There are thousands of lines. Nothing if no whole line is there. None if a line is broken:
+        then all are left to be read one by one, which finds the broken line.
         """
         end = self._buffer.rfind(LINE_END)
         if end < 0:
@@ -210,7 +210,7 @@ def _number(line: str, what: str) -> int:
 
 
 def unexpected(line: str, expected: str) -> FrameError:
-    """Return the error of a line that came where something else was expected."""
+    """Return the error of a line in place of the expected one."""
     return FrameError(
         f"{line[:64]!r} came, {expected} was expected", data=line.encode(ENCODING, "replace")
     )

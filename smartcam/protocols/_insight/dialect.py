@@ -1,9 +1,8 @@
 """The native mode of Cognex In-Sight cameras: text over telnet.
 
-What the library says (:mod:`smartcam.protocols.messages`) becomes command lines, one after the
-other, each answered before the next is sent; what comes back becomes the library's messages. So the
-client knows nothing of commands. What is known of the camera, and who says so, stands in
-``docs/insight.md``.
+The library's messages (:mod:`smartcam.protocols.messages`) become command lines, each answered
+before the next is sent; the answers become the library's messages. So the client knows nothing of
+commands. The facts about the camera, with their sources, stand in ``docs/insight.md``.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ _MNEMONICS: Mapping[type[m.Message], str] = {
     m.Trigger: "SW",
     m.ReadImage: "RI",
 }
-"""The command behind each of the library's requests."""
+"""The command for each of the library's requests."""
 
 _REQUESTS = frozenset({m.Connect, m.Disconnect, Command, *_MNEMONICS})
 _REPORTS = frozenset(
@@ -84,7 +83,7 @@ class InSightDialect(Dialect):
 
     Args:
         name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
-        user: name of the user who logs in.
+        user: name of the user to log in.
         password: password of that user.
         cells: cells that are read after each trigger, in order, as commands name them.
         counter: a cell that counts runs, read before and after them; "" for none.
@@ -121,7 +120,7 @@ class InSightDialect(Dialect):
 
     @property
     def remark(self) -> str:
-        """Text which says that a result is empty if no cells are asked for."""
+        """Text for users: a result is empty if no cells are named."""
         if self.cells:
             return ""
         return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
@@ -169,7 +168,7 @@ class InSightDialect(Dialect):
         return f"{kind.__name__} ({command[:32]})"
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
-        """Return a line in words; the password is not shown."""
+        """Return a line in readable form; the password is not shown."""
         text = frame.payload.decode(ENCODING)
         if frame.message_id == Piece.PASSWORD:
             return Spelled(None, "password", {"text": "***"}, b"")
@@ -179,7 +178,7 @@ class InSightDialect(Dialect):
         return Spelled(None, what, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a command of one's own, such as ``GVA001``; the payload stands behind it.
+        """Return a command of the user, such as ``GVA001``; the payload follows it.
 
         Raises:
             UnsupportedError: the form of its answer is not known.
@@ -194,21 +193,21 @@ class InSightDialect(Dialect):
         return RawRequest(Command(line=line), Reply, answered=True, known=True)
 
     def body(self, answer: m.Message) -> bytes:
-        """Return the data behind the code.
+        """Return the data after the code.
 
         Raises:
-            UnsupportedError: the code says that the camera does not know the command.
-            CommandRejectedError: the code says that the command was not done.
+            UnsupportedError: by its code, the camera does not know the command.
+            CommandRejectedError: by its code, the camera did not carry out the command.
         """
         if not isinstance(answer, Reply):
             raise LocalProtocolError(f"{type(answer).__name__} is no answer to a command")
         if answer.code == StatusCode.DONE:
             return answer.data
-        said = f"{answer.line}: the camera answered {answer.code}"
-        said = f"{said}: {code_text(answer.line, answer.code)}"
+        refusal = f"{answer.line}: the camera answered {answer.code}"
+        refusal = f"{refusal}: {code_text(answer.line, answer.code)}"
         if answer.code == StatusCode.UNRECOGNIZED:
-            raise UnsupportedError(said)
-        raise CommandRejectedError(said, code=answer.code)
+            raise UnsupportedError(refusal)
+        raise CommandRejectedError(refusal, code=answer.code)
 
 
 def _cell_names(text: str) -> list[str]:
@@ -230,7 +229,7 @@ def _cell_names(text: str) -> list[str]:
 
 NATIVE = InSightDialect(
     name="native",
-    about="native mode: text over telnet; ?cells= names what is read after a trigger",
+    about="native mode: text over telnet; ?cells= names the cells to read after a trigger",
     source="docs/insight.md, published and derived",
 )
 
@@ -242,10 +241,10 @@ INSIGHT = Protocol(
     dialects={NATIVE.name: NATIVE},
     machine=InSightMachine,
     parameters={
-        "user": "who logs in; default admin",
+        "user": "user to log in; default admin",
         "password": "the user's; default none",
         "cells": "cells that are a result's values, such as B2,C2,D4:F6",
-        "counter": "a cell that counts runs: values of several runs are told by it",
+        "counter": "a cell that counts runs, which shows whether values are of one run",
     },
     emulator="smartcam.emulator._insight.camera:EmulatedInSight",
     greeting=WELCOME.encode(ENCODING),

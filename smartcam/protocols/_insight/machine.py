@@ -1,8 +1,8 @@
 """One connection to an In-Sight camera, as a link sees it: the client's side of native mode.
 
-Commands have no numbers and answers do not name them, so one is sent when the one before it is
-answered. What the library asks for is a script (:class:`InSightMachine`): the commands that it
-takes, one after the other, and the messages that come of their answers.
+Commands have no numbers and answers do not name them, so a command is sent when the one before it
+is answered. A request of the library is a script (:class:`InSightMachine`): it sends its commands
+one after the other, and makes messages of their answers.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ if TYPE_CHECKING:
     from smartcam.protocols._insight.dialect import InSightDialect
 
     Script = Generator[str, CommandAnswer, None]
-    """Yields command lines and is sent their answers; what it finds out it tells as messages."""
+    """Yields command lines and receives their answers, which become messages."""
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
-"""Status of a camera that is online and takes event 8; no other state is told."""
+"""Status of a camera that is online and accepts event 8; the camera shows no other state."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
 
 
 class Piece(enum.IntEnum):
-    """The kind of a frame in a trace; it stands where other protocols have the message id."""
+    """The kind of a frame in a trace, in place of a message id."""
 
     LINE = 0
     """A line, without its end."""
@@ -68,7 +68,7 @@ class Piece(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply(m.Acknowledgement):
-    """The answer to a :class:`Command`: its code, and the data behind it."""
+    """The answer to a :class:`Command`: its code, and the data after it."""
 
     line: str
     data: bytes = b""
@@ -76,7 +76,7 @@ class Reply(m.Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command(m.Request):
-    """A command line of any kind that the library knows the answer's form of.
+    """A command line of any kind whose answer has a known form.
 
     Raises:
         ConfigurationError: the line is not valid, or it cannot be sent.
@@ -102,25 +102,25 @@ def unsendable(text: str, limit: int) -> str | None:
 
 
 class _PendingRequest(NamedTuple):
-    """A request under way, or in line."""
+    """A request that is running, or waits for its turn."""
 
     kind: type[m.Message]
     script: Script
 
 
 class InSightMachine:
-    """One connection's native mode, in the client's role; what a link needs.
+    """One connection in native mode, in the client's role, as a link needs it.
 
-    See :class:`~smartcam.protocols.LinkMachine`. An answer belongs to the command
-    before it, and nothing else may come: a line that nothing was asked for ends the link.
+    See :class:`~smartcam.protocols.LinkMachine`. An answer belongs to the command before it. A line
+    that no command asked for ends the link.
 
     Args:
         dialect: user, password and cells.
         role: the client's.
         transport: TCP.
-        max_length: longest data of an answer, bytes; of an image 64 MiB.
+        max_length: longest data of an answer, bytes; an image may have 64 MiB.
         trace: function that is called with each piece in both directions, see :class:`Piece`, and
-            with the error for what broke the protocol; never with the password.
+            with the error of bytes that broke the protocol; never with the password.
         kin: unused, there is one dialect.
 
     Raises:
@@ -174,12 +174,12 @@ class InSightMachine:
 
     @property
     def buffered(self) -> int:
-        """Bytes that wait for more: of a line, or of a counted text."""
+        """Bytes of an unfinished line, or of a counted text."""
         return len(self._reader)
 
     @property
     def pending(self) -> bytes:
-        """Copy of the bytes that wait for more."""
+        """Copy of the bytes of an unfinished line or text."""
         return self._reader.pending
 
     def room(self) -> memoryview:
@@ -187,12 +187,12 @@ class InSightMachine:
         return self._store
 
     def filled(self, count: int, now: float = 0.0) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`."""
+        """Accept ``count`` bytes that were written into :meth:`room`."""
         self.receive_data(bytes(self._store[:count]))
         return True
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes; call :meth:`events` next. Never raises for what is in them.
+        """Add received bytes; call :meth:`events` next. Never raises for bad bytes.
 
         After Disconnect, and in state FAILED or CLOSED, they are dropped.
         """
@@ -204,7 +204,7 @@ class InSightMachine:
             self._read()
 
     def receive_eof(self) -> None:
-        """Take note that the camera will send no more; call :meth:`events` next."""
+        """Note that the camera will send no more; call :meth:`events` next."""
         if self.state in {State.FAILED, State.CLOSED}:
             return
         self._events.append(LinkEnded(pending=self.buffered))
@@ -240,7 +240,7 @@ class InSightMachine:
             raise FrameError(f"{line[:64]!r} came, nothing was asked", data=line.encode(ENCODING))
 
     def _end(self, state: State) -> None:
-        """Say and read nothing more."""
+        """Send and read nothing more."""
         self.state = state
         self._job = None
         self._waiting.clear()
@@ -261,10 +261,10 @@ class InSightMachine:
         """Put a request in line; write :meth:`data_to_send` next.
 
         A Get status that is in line already is not repeated: its answer is new enough. Disconnect
-        sends nothing: the connection ends, and what is in line is dropped.
+        sends nothing: the connection ends, and waiting requests are dropped.
 
         Raises:
-            LocalProtocolError: there is no session, or an answer of the same kind is still owed.
+            LocalProtocolError: there is no session, or an answer of the same kind is pending.
             UnsupportedError: the dialect has no such message.
             ConfigurationError: a file's name cannot be sent.
         """
@@ -308,10 +308,10 @@ class InSightMachine:
         self._read()  # the greeting may be there
 
     def _log_in(self) -> Iterator[None]:
-        """Answer each prompt once, and hear whether the camera lets us in.
+        """Answer each prompt once, and read whether the camera accepts the login.
 
-        The greeting differs from model to model. A camera that asks for something again refuses by
-        that.
+        The greeting differs from model to model. A camera that repeats a prompt has refused the
+        login.
         """
         prompts = {
             USER_PROMPT: (self.dialect.user, Piece.LINE),
@@ -323,16 +323,16 @@ class InSightMachine:
                 self._write(*prompts.pop(prompt))
                 continue
             line = INVALID_PASSWORD if prompt is not None else self._reader.next_line()
-            said = "" if line is None else line.strip()
-            if said in {LOGGED_IN, INVALID_PASSWORD}:
-                code = StatusCode.DONE if said == LOGGED_IN else StatusCode.NO_ACCESS
+            line_text = "" if line is None else line.strip()
+            if line_text in {LOGGED_IN, INVALID_PASSWORD}:
+                code = StatusCode.DONE if line_text == LOGGED_IN else StatusCode.NO_ACCESS
                 self.state = State.CONNECTED
-                self._tell(m.ConnectAnswer(code=code, version=1))
+                self._report(m.ConnectAnswer(code=code, version=1))
                 return
             if line is None:
                 yield
-            elif said and not said.startswith(WELCOME):
-                raise unexpected(said, "the greeting or the login of an In-Sight camera")
+            elif line_text and not line_text.startswith(WELCOME):
+                raise unexpected(line_text, "the greeting or the login of an In-Sight camera")
 
     # ------------------------------------------------------------------ scripts
 
@@ -342,7 +342,7 @@ class InSightMachine:
             self._go_on(self._job, None)
 
     def _go_on(self, job: _PendingRequest, answer: CommandAnswer | None) -> None:
-        """Let a script take an answer; write its next line, or begin the next script."""
+        """Pass an answer to a script; write its next line, or begin the next script."""
         try:
             line = next(job.script) if answer is None else job.script.send(answer)
         except StopIteration:
@@ -352,31 +352,31 @@ class InSightMachine:
         self._reader.expect(COMMANDS[line[:2].upper()].form)
         self._write(line)
 
-    def _tell(self, message: m.Message) -> None:
-        self._events.append(message)  # of the list that is there behind a yield
+    def _report(self, message: m.Message) -> None:
+        self._events.append(message)  # the list may be a new one after a yield
 
     def _get_status(self, _message: m.Message | None = None) -> Script:
         online = (yield "GO").text.strip()
         if online not in {"0", "1"}:
             raise unexpected(online, "0 (offline) or 1 (online)")
-        self._tell(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
+        self._report(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
 
     def _name_job(self) -> Generator[str, CommandAnswer, int]:
         """Return the active job's id.
 
-        A job without a number in its name has no id, nor has a job that the camera does not name.
+        A job without a number in its name has no id, nor does a job without a name.
         """
         code, text, _ = yield "GJ"
         if code != StatusCode.DONE:
             return m.UNNAMED_APPLICATION
-        said = text.strip()
-        if not said.isdecimal() or len(said) > 9 or int(said) > LAST_JOB_ID:
-            raise unexpected(said, "the id of a job")
-        return int(said)
+        number = text.strip()
+        if not number.isdecimal() or len(number) > 9 or int(number) > LAST_JOB_ID:
+            raise unexpected(number, "the id of a job")
+        return int(number)
 
     def _query(self, _message: m.Message) -> Script:
         job = yield from self._name_job()
-        self._tell(m.QueryAnswer(code=StatusCode.DONE, application=job))
+        self._report(m.QueryAnswer(code=StatusCode.DONE, application=job))
 
     def _load_id(self, message: m.SwitchApplication) -> Script:
         return self._load(Command(line=f"SJ{message.application}"))
@@ -387,34 +387,34 @@ class InSightMachine:
     def _load(self, command: Command) -> Script:
         code = (yield command.line).code
         job = yield from self._name_job()
-        self._tell(m.SwitchAnswer(code=code, application=job))
+        self._report(m.SwitchAnswer(code=code, application=job))
 
     def _start(self, _message: m.Message) -> Script:
-        self._tell(m.StartAnswer(code=(yield "SO1").code))
+        self._report(m.StartAnswer(code=(yield "SO1").code))
 
     def _stop(self, _message: m.Message) -> Script:
-        self._tell(m.StopAnswer(code=(yield "SO0").code))
+        self._report(m.StopAnswer(code=(yield "SO0").code))
 
     def _trigger(self, _message: m.Message) -> Script:
-        """Trigger, and when the cells are up to date, read them.
+        """Trigger, and read the cells when they are up to date.
 
-        Where the camera took no trigger, its status is told first, since that may say why.
+        If the camera accepted no trigger, its status is reported first, which may have the reason.
         """
         code = (yield f"SW{TRIGGER_EVENT}").code
         if code == StatusCode.FAILED:
             yield from self._get_status()
-        self._tell(m.TriggerAnswer(code=code))
+        self._report(m.TriggerAnswer(code=code))
         if code != StatusCode.DONE:
             return
         job = yield from self._name_job()
         counter = self.dialect.counter
         before = (yield from self._value(counter)) if counter else None
-        said: dict[str, str | None] = {}
+        values: dict[str, str | None] = {}
         for cell in self.dialect.cells:
-            said[cell] = yield from self._value(cell)
+            values[cell] = yield from self._value(cell)
         after = (yield from self._value(counter)) if counter else None
         cells = [
-            m.CellValue(cell, None if said[cell] == ERROR_VALUE else said[cell])
+            m.CellValue(cell, None if values[cell] == ERROR_VALUE else values[cell])
             for cell in self.dialect.cells
         ]
         fault, now = None, (yield from self._name_job()) if cells else job
@@ -425,9 +425,9 @@ class InSightMachine:
                 f"cell {counter}, which counts runs, went from {before} to {after} while the cells "
                 "were read: they may be of more than one run"
             )
-        self._tell(
+        self._report(
             m.ResultContainer(
-                application=job, data=json.dumps(said).encode(), cells=tuple(cells), fault=fault
+                application=job, data=json.dumps(values).encode(), cells=tuple(cells), fault=fault
             )
         )
 
@@ -440,9 +440,9 @@ class InSightMachine:
         answer = yield "RI"
         if answer.code == StatusCode.UNRECOGNIZED:
             answer = yield "RB"
-        self._tell(m.Image(code=answer.code, data=answer.data))
+        self._report(m.Image(code=answer.code, data=answer.data))
 
     def _command(self, message: Command) -> Script:
         answer = yield message.line
         data = answer.data or answer.text.encode(ENCODING)
-        self._tell(Reply(line=message.line, code=answer.code, data=data))
+        self._report(Reply(line=message.line, code=answer.code, data=data))

@@ -1,11 +1,11 @@
 """Words of Cognex In-Sight native mode, for both ends: lines, commands, status codes, cell names.
 
 Native mode is text over telnet (TCP port 23). The client sends one command a line, the camera
-answers with a status code on a line of its own and, where the command asks for something, with data
-behind it. Nothing in this module does input or output.
+answers with a status code on a line of its own and, for some commands, data after it. Nothing in
+this module does input or output.
 
-Where a fact comes from stands in ``docs/insight.md``: *manual* is the maker's published help,
-*clients* is what public clients and records of their traffic show (derived).
+``docs/insight.md`` has the sources of the facts: *manual* is the maker's published help,
+*clients* are public clients and records of their traffic (derived).
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ PASSWORD_PROMPT = b"Password: "
 """The prompt for the password, which no line end follows (clients, derived)."""
 
 LOGGED_IN = "User Logged In"
-"""The line that says that commands are taken from now on (clients, derived)."""
+"""The line after which the camera accepts commands (clients, derived)."""
 
 INVALID_PASSWORD = "Invalid Password"  # noqa: S105 - the camera's words
 """The line that refuses a login (clients, derived)."""
 
 MAX_LINE_BYTES = 4096
-"""Largest number of bytes of a line, its end not counted, that either side takes. The longest
-regular ones are values of cells; the camera's own bound is not published."""
+"""Largest number of bytes of a line, without its end, that either side accepts. The longest
+regular lines are values of cells; the camera's own bound is not published."""
 
 LAST_COLUMN = "Z"
 """The last column of the spreadsheet; the first one is A (manual, published)."""
@@ -56,8 +56,8 @@ LAST_ROW = 399
 """The last row of the spreadsheet; the first one is 0 (manual, published)."""
 
 MAX_CELLS = 1024
-"""Largest number of cells that a range, or a result, may have; ranges are of this library: each
-cell is asked for on its own, which takes a round trip."""
+"""Largest number of cells that a range, or a result, may have. Ranges are an addition of this
+library: each cell is read by a command of its own, which takes a round trip."""
 
 LAST_JOB_ID = 999
 """The largest id of a job; the first one is 0 (manual, published)."""
@@ -73,9 +73,9 @@ HEX_WIDTH = 80
 
 
 class StatusCode(enum.IntEnum):
-    """The number that begins an answer (manual, published). What it means depends on the command.
+    """The number that begins an answer (manual, published). Its meaning depends on the command.
 
-    :func:`code_text` says it for a command.
+    :func:`code_text` returns the meaning for a command.
     """
 
     DONE = 1
@@ -106,7 +106,7 @@ class AnswerForm(enum.Enum):
 
 
 class CommandMode(enum.Enum):
-    """In which mode of the camera a command is possible."""
+    """The mode of the camera that a command needs."""
 
     ANY = "any"
     ONLINE = "online"
@@ -284,7 +284,7 @@ _GENERAL_TEXTS = {
     -5: "accepted, but an operator or an input holds the camera offline",
     **_NO_ACCESS,
 }
-"""Meanings of the codes where the command is not named."""
+"""Meanings of the codes without a command."""
 
 
 def code_text(command: str, code: int) -> str:
@@ -313,7 +313,7 @@ class Cell(NamedTuple):
 
     @property
     def wire(self) -> str:
-        """As commands name it: the letter and three digits (manual, published)."""
+        """The cell as commands name it: the letter and three digits (manual, published)."""
         return f"{self.column}{self.row:03d}"
 
     def __str__(self) -> str:
@@ -328,7 +328,7 @@ _JOB_NUMBER = re.compile(r"([0-9]{1,3})(?![0-9])", re.ASCII)
 
 
 def parse_cell(text: str) -> Cell:
-    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: it is no cell."""
+    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: no such cell."""
     match = _CELL.fullmatch(text)
     if match is None or int(match[2]) > LAST_ROW:
         raise ConfigurationError(
@@ -340,8 +340,8 @@ def parse_cell(text: str) -> Cell:
 def parse_cells(text: str) -> list[Cell]:
     """Read a cell or a rectangle of cells, such as ``B2:D4``: row by row, each from left to right.
 
-    Raises ConfigurationError: it is neither, its corners are not top left and bottom right, or it
-    has more than 1024 cells.
+    Raises ConfigurationError: the text is neither, its corners are not top left and bottom right,
+    or it has more than 1024 cells.
     """
     first_text, colon, last_text = text.partition(":")
     first = parse_cell(first_text)
@@ -360,7 +360,7 @@ def parse_cells(text: str) -> list[Cell]:
 def parse_wire_cell(text: str) -> tuple[Cell, str] | None:
     """Read the cell at the beginning of a command's argument: a letter and exactly three digits.
 
-    Returns the cell and what stands behind it; None if no cell stands there.
+    Returns the cell and the text after it; None if no cell stands there.
     """
     match = _WIRE_CELL.match(text)
     if match is None or int(match[2]) > LAST_ROW:
@@ -371,8 +371,8 @@ def parse_wire_cell(text: str) -> tuple[Cell, str] | None:
 def parse_tag(text: str) -> str:
     """Read a cell's name: letters, digits, underscores and dots, at most 127 (manual, published).
 
-    Two names that differ in case only are the same (manual, published), so it is returned in lower
-    case. Raises ConfigurationError: it is not valid, or it has the form of a cell.
+    Two names that differ only in case are the same (manual, published), so the name is returned in
+    lower case. Raises ConfigurationError: the name is not valid, or has the form of a cell.
     """
     if not _TAG.fullmatch(text) or _CELL_LIKE.fullmatch(text):
         raise ConfigurationError(
@@ -397,8 +397,8 @@ def job_id(file: str) -> int | None:
 def checksum(digits: bytes, before: str = "") -> str:
     """Return the checksum of hexadecimal data: CRC-16 with polynomial 0x1021, first value 0.
 
-    It is made of the digits' characters in upper case, without line ends (manual, published).
-    ``before``: that of the digits in front of these.
+    The characters of the digits count, in upper case, without line ends (manual, published).
+    ``before``: checksum of the preceding digits.
     """
     return f"{binascii.crc_hqx(digits, int(before or '0', 16)):04X}"
 
@@ -406,13 +406,13 @@ def checksum(digits: bytes, before: str = "") -> str:
 def hex_lines(data: bytes) -> tuple[int, bytes]:
     """Write data as the camera sends it.
 
-    Returns the number of hexadecimal digits, and the lines: 80 digits each, then the checksum's.
+    Returns the number of hexadecimal digits, and the lines: 80 digits each, then the checksum.
     """
     digits = binascii.hexlify(data).upper()
     # negative: the short line is the last one
     lines = binascii.hexlify(data, b"\n", -HEX_WIDTH // 2).upper().replace(b"\n", LINE_END)
-    told = checksum(digits).encode("ascii") + LINE_END
-    return len(digits), lines + LINE_END * bool(lines) + told
+    found = checksum(digits).encode("ascii") + LINE_END
+    return len(digits), lines + LINE_END * bool(lines) + found
 
 
 # ---------------------------------------------------------------------- lines

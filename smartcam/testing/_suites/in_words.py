@@ -1,4 +1,4 @@
-"""Failures of the suites, in words: a check's name and text say what was expected."""
+"""Failures of the suites as text: a check's name and docstring give the expectation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class SaysWhatWasExpected:
-    """Base of the suites: a check that fails says what it expects, before what was compared."""
+    """Base of the suites: a failed check shows its expectation before the comparison."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -21,7 +21,7 @@ class SaysWhatWasExpected:
 
 
 def _in_words(check: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a check whose failure begins with what was expected."""
+    """Return a check whose failure begins with its expectation."""
     what = check.__name__.removeprefix("test_").replace("_", " ")
     text = " ".join((check.__doc__ or "").split())
 

@@ -10,8 +10,8 @@
             ContainerSample(b"", {}),
         )
 
-An interpreter is called as the client calls it, except that the client makes an InterpretationError
-of whatever an interpreter raises; here another error is a mistake.
+An interpreter is called as the client calls it, except that the client turns any error of an
+interpreter into an InterpretationError; here any other error is a mistake.
 """
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 
     from smartcam.interpreters import Spec
 
-MAX_ERROR_TEXT = 500
-"""Characters of an error's text: a container's bytes are in it, 64 of them at most."""
+MAX_ERROR_LENGTH = 500
+"""Largest number of characters of an error's text, which has at most 64 of a container's bytes."""
 
 MAX_PLACES = 256
-"""Largest number of places of a container at which one thing is tried."""
+"""Largest number of places of a container at which one variation is tried."""
 
 TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
-"""Bytes that may stand behind a container."""
+"""Bytes that may follow a container."""
 
 NOT_FINITE = tuple(
     struct.pack(order + code, number)
@@ -62,7 +62,7 @@ NOT_FINITE = tuple(
 """Bytes of numbers that are not valid, in each size and order."""
 
 LAYOUTS = ("x: int8", "x: real32 mm, y: real32 mm, theta: real32 deg", "(name: string[3])*")
-"""Layouts that a user may write behind an interpreter's name."""
+"""Layouts that a user may write after an interpreter's name."""
 
 _AT = datetime(2024, 2, 29, 23, 59, 30, tzinfo=UTC)
 _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
@@ -70,15 +70,15 @@ _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
 
 @dataclass(frozen=True)
 class ContainerSample:
-    """A container and the value that it stands for.
+    """A container and its value.
 
     Attributes:
-        data: bytes of the container behind the application id, with little-endian numbers.
-        value: value that the interpreter returns; for an array its ``tolist()`` will do.
-        layout: text that the user writes behind the interpreter's name, None for nothing.
-        big: bytes of the container with big-endian numbers, equal to ``data`` where it has no
-            numbers. It may be left out where the interpreter has a layout, which says where
-            numbers stand.
+        data: bytes of the container after the application id, with little-endian numbers.
+        value: value that the interpreter returns; for an array its ``tolist()`` suffices.
+        layout: text that the user writes after the interpreter's name, None without one.
+        big: bytes of the container with big-endian numbers, equal to ``data`` if it has no
+            numbers. It may be left out if the interpreter has a layout, which gives the places
+            of numbers.
         sequence: sequence number of the container.
         name: name of the sample for people.
     """
@@ -95,8 +95,8 @@ class InterpreterSuite(SaysWhatWasExpected):
     """The tests that every interpreter has to pass.
 
     Attributes:
-        spec: the interpreter as ``interpret_as`` takes it: a function, a class, an object, a name.
-        samples: containers and what they mean; each layout of interest has one.
+        spec: the interpreter as a value of ``interpret_as``: a function, a class or a name.
+        samples: containers and their values; at least one for each layout of interest.
         name: name of its entry point, "" without one.
     """
 
@@ -120,12 +120,12 @@ class InterpreterSuite(SaysWhatWasExpected):
         metafunc.parametrize("sample", self.samples, ids=labels)
 
     def make(self, layout: str | None = None) -> Interpreter:
-        """Return a new interpreter, with what a user would write behind its name.
+        """Return a new interpreter, with the text that a user would write after its name.
 
         Raises:
             ConfigurationError: the interpreter takes no layout, needs one, or not this one.
         """
-        spec = type(self).spec  # of an object a function would be a method
+        spec = type(self).spec  # from the object, a function would be a method
         if layout is None:
             return resolve(spec)
         if isinstance(spec, str):
@@ -141,14 +141,14 @@ class InterpreterSuite(SaysWhatWasExpected):
     # ------------------------------------------------------------------ values
 
     def test_value_is_as_expected(self, sample: ContainerSample) -> None:
-        """And so is the value of the same bytes that come a second time."""
+        """Check the value, and that the same bytes give it a second time."""
         interpreter = self.make(sample.layout)
         for _ in range(2):
             value = interpret(interpreter, sample.data)
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """Check that it is that of the layout's field, or None, or an error."""
+        """Check that the number is that of the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
         found = interpreter.sequence(reader)
@@ -162,7 +162,7 @@ class InterpreterSuite(SaysWhatWasExpected):
                 assert number is None or isinstance(number, int), f"{data!r}: number {number!r}"
 
     def test_value_is_the_same_each_time(self, sample: ContainerSample) -> None:
-        """Whatever came in between, and of a new interpreter too; values share nothing."""
+        """Check this after other containers, and with a new interpreter; values share nothing."""
         interpreter = self.make(sample.layout)
         first = interpret(interpreter, sample.data)
         between = [one for one in self.samples if one.layout == sample.layout]
@@ -176,9 +176,9 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert _same(other, first), f"first {first!r}, of another interpreter {other!r}"
 
     def test_nothing_is_kept(self, sample: ContainerSample) -> None:
-        """Neither bytes nor anything else; the bytes stay what they are."""
+        """Keeps neither bytes nor anything else; the bytes stay unchanged."""
         interpreter = self.make(sample.layout)
-        outcome(interpreter, sample.data)  # what it finds out at first it may keep
+        outcome(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
         kept, before = repr(vars(interpreter)), sys.getrefcount(data)
         for _ in range(3):
@@ -191,7 +191,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert sys.getrefcount(data) <= before or len(data) < 2, "the container's bytes are kept"
 
     def test_value_can_be_written_as_json(self, sample: ContainerSample) -> None:
-        """``--json`` and monitoring tools write it."""
+        """Check the value's JSON, which ``--json`` and monitoring tools write."""
         value = interpret(self.make(sample.layout), sample.data)
         text = json.dumps(jsonable(value), allow_nan=False)
         nameless = _ADDRESS.search(text)
@@ -210,10 +210,10 @@ class InterpreterSuite(SaysWhatWasExpected):
         value = interpret(interpreter, big, byte_order="big")
         assert _like(value, sample.value), f"{big!r}: expected {sample.value!r}, got {value!r}"
 
-    # ------------------------------------------------------------------ what does not fit
+    # ------------------------------------------------------------------ bytes that do not fit
 
     def test_cut_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
-        """At each length: a value, or an InterpretationError that says what was expected."""
+        """Check each length: it gives a value, or an InterpretationError with the expectation."""
         interpreter = self.make(sample.layout)
         for data in (b"", *_cuts(sample.data)):
             see(interpreter, data)
@@ -239,7 +239,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         strategies.each_drawn(check)
 
     def test_poses_are_of_finite_numbers(self, sample: ContainerSample) -> None:
-        """NaN or infinity, wherever they come, are an error where a robot would move to them."""
+        """NaN or infinity at any place are an error if a robot would move to them."""
         interpreter = self.make(sample.layout)
         size = len(sample.data)
         for number in NOT_FINITE:
@@ -250,7 +250,7 @@ class InterpreterSuite(SaysWhatWasExpected):
                     see(interpreter, data, byte_order=order)
 
     def test_any_context_is_borne(self, sample: ContainerSample) -> None:
-        """Names, numbers and options of the client's."""
+        """Check unusual names, numbers and options of the client."""
         interpreter = self.make(sample.layout)
         for options in (
             {"camera": "é " * 100, "application": -1, "number": 1 << 40, "received_at": _AT},
@@ -260,7 +260,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             for data in (sample.data, sample.data[:-1], b"\x01" * len(sample.data)):
                 see(interpreter, data, **options)
 
-    # ------------------------------------------------------------------ what it says of itself
+    # ------------------------------------------------------------------ self-description
 
     def test_containers_of_a_burst_are_read_as_one_by_one(self, sample: ContainerSample) -> None:
         """Check that a PlainInterpreter's ``read_all`` and ``interpret`` do what ``read`` does."""
@@ -282,7 +282,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert context.empty_slots == empty, f"empty_slots: {context.empty_slots}, not {empty}"
 
     def test_layout_is_taken_or_refused(self, sample: ContainerSample) -> None:
-        """Whatever the user writes behind the name, or if nothing: a ConfigurationError at most."""
+        """Any text after the name, or none, raises a ConfigurationError at most."""
         for layout in (None, *LAYOUTS):
             try:
                 interpreter = self.make(layout)
@@ -292,7 +292,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             see(interpreter, sample.data)
 
     def test_entry_point_gives_the_interpreter(self, sample: ContainerSample) -> None:
-        """``interpret_as="name"`` finds it: the package is installed."""
+        """Check that ``interpret_as="name"`` finds the interpreter: its package is installed."""
         if not self.name:
             pytest.skip(f"{type(self).__name__}.name is empty: it has no entry point")
         try:
@@ -312,7 +312,7 @@ def _reader(interpreter: Interpreter, data: bytes, **context: Any) -> Reader:
 
 
 def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
-    """Return an interpreter's value; whatever it raises comes out as it is."""
+    """Return an interpreter's value; errors are not changed."""
     return interpreter.interpret(_reader(interpreter, data, **context))
 
 
@@ -325,10 +325,10 @@ def outcome(interpreter: Interpreter, data: bytes) -> object:
 
 
 def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
-    """See that bytes give a value without nonsense, or the right kind of error.
+    """Check that bytes give a sensible value, or the right kind of error.
 
     Raises:
-        AssertionError: the bytes do not.
+        AssertionError: the bytes give neither.
     """
     where = f"{len(data)} bytes {data[:64]!r}, {context}"
     try:
@@ -345,22 +345,22 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
 
 
 def see_error(error: InterpretationError, data: bytes) -> None:
-    """See that an error says what was expected where, in a few words, and survives pickle.
+    """Check that an error is short, says what was expected at which place, and survives pickle.
 
     Raises:
-        AssertionError: the error does not.
+        AssertionError: the error fails.
     """
     where = f"{len(data)} bytes {data[:64]!r}: {error!r:.300}"
     assert str(error), f"{where}: it says nothing"
-    assert len(str(error)) <= MAX_ERROR_TEXT, f"{where}: a text of {len(str(error))} characters"
+    assert len(str(error)) <= MAX_ERROR_LENGTH, f"{where}: a text of {len(str(error))} characters"
     assert error.field or error.expected is not None, f"{where}: neither field nor expected"
     assert error.offset >= 0, f"{where}: offset {error.offset}"
     try:
         copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
     except Exception as exc:
         raise AssertionError(f"{where}: it does not survive pickle: {exc!r}") from exc
-    said = (type(error), str(error), error.field, error.offset)
-    assert (type(copy), str(copy), copy.field, copy.offset) == said, f"{where}: a copy is {copy!r}"
+    same = (type(error), str(error), error.field, error.offset)
+    assert (type(copy), str(copy), copy.field, copy.offset) == same, f"{where}: a copy is {copy!r}"
 
 
 def _cuts(data: bytes) -> Iterator[bytes]:
@@ -421,12 +421,12 @@ def _is_open(value: object) -> bool:
 
 
 def _is_array(value: object) -> bool:
-    numpy = sys.modules.get("numpy")  # only who has arrays has it
+    numpy = sys.modules.get("numpy")  # without numpy imported there are no arrays
     return numpy is not None and isinstance(value, numpy.ndarray)
 
 
 def _like(value: Any, expected: Any) -> bool:
-    """Return True if a value is what an author wrote down."""
+    """Return True if a value equals the author's value."""
     if _is_array(value):
         return _same(value, expected) if _is_array(expected) else value.tolist() == expected
     if isinstance(value, float) and isinstance(expected, float):
@@ -435,7 +435,7 @@ def _like(value: Any, expected: Any) -> bool:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Return True if two values are alike, types and NaN included."""
+    """Return True if two values are equal, including types and NaN."""
     if type(one) is not type(other):
         return False
     if _is_array(one):

@@ -1,7 +1,7 @@
 """Hypothesis strategies for the suites: bytes, and places to cut them.
 
-A check is called with each drawing by :func:`each_drawn`, which makes a test of its own of it: a
-method that several classes inherit cannot be one. The number of examples is the profile's.
+:func:`each_drawn` calls a check with each drawing, and makes a test of its own for that, since a
+method that several classes inherit cannot be one. The profile sets the number of examples.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def each_drawn(check: Callable[[DataObject], None]) -> None:
     """Call a check with one drawing after the other; the smallest that fails is shown.
 
     Raises:
-        AssertionError: what the check raises, with the drawing as a note.
+        AssertionError: the check's error, with the drawing as a note.
     """
     quiet = [HealthCheck.too_slow, HealthCheck.data_too_large]
 

@@ -1,4 +1,4 @@
-"""A link that breaks as told: it stands between a client and a camera and works on the bytes."""
+"""A faulty link on demand: a proxy between a client and a camera that changes their bytes."""
 
 from __future__ import annotations
 

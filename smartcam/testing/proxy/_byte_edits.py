@@ -1,4 +1,4 @@
-"""From one direction's bytes and rules to what passes, and what is done in between. Pure."""
+"""Apply rules to one direction's bytes: the passing bytes, and the actions between them. Pure."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BOTH_STALL = Ending("half_open", Stall.name)
 
 @dataclass(slots=True, eq=False)
 class Edit(Transmission):
-    """Bytes that pass, or what is done between them."""
+    """Bytes that pass, or an action between them."""
 
     at: int = 0  # place in the stream at which the rule named by ``faults`` acts
 
@@ -44,7 +44,7 @@ def _gap(seconds: float) -> Edit:
 
 
 class _Boundary(NamedTuple):
-    """A place where something begins or ends; they are taken in this order."""
+    """A place where a rule begins or ends; places are handled in this order."""
 
     offset: int
     order: int
@@ -53,10 +53,10 @@ class _Boundary(NamedTuple):
 
 
 class Editor:
-    """One direction of one connection, and the rules that concern it."""
+    """One direction of one connection, and the rules for it."""
 
     def __init__(self, rules: Iterable[Rule]) -> None:
-        self.position: int = 0  # bytes that have come
+        self.position: int = 0  # number of received bytes
         self._marks: deque[_Boundary] = deque()
         self._rules = 0
         self._active: dict[int, RangeRule] = {}  # active rules by their index in the list of rules
@@ -67,7 +67,7 @@ class Editor:
         self.add(rules)
 
     def add(self, rules: Iterable[Rule]) -> None:
-        """Put rules behind the others; those for places that are past do nothing."""
+        """Add rules after the others; rules for places that have passed do nothing."""
         marks = list(self._marks)
         for order, rule in enumerate(rules, self._rules):
             self._rules = order + 1
@@ -78,9 +78,9 @@ class Editor:
         self._marks = deque(sorted(marks, key=lambda mark: mark[:3]))
 
     def feed(self, data: bytes) -> list[Edit]:
-        """Return the edits that bytes cause; with none, those at the very beginning.
+        """Return the edits that bytes cause; without bytes, the edits at the very beginning.
 
-        Behind a cut or a reset there is no more.
+        After a cut or a reset there are no more.
         """
         rest = memoryview(data)
         self._reach_marks()
@@ -104,7 +104,7 @@ class Editor:
             elif begins:
                 if isinstance(rule, Drip):
                     self._flush()
-                    self._edits.append(_gap(0.0))  # its first byte stands alone too
+                    self._edits.append(_gap(0.0))  # its first byte is written alone, too
                 self._active[order] = rule
                 self._active = dict(sorted(self._active.items()))
             else:

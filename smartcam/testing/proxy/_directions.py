@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._tcp import ProxiedConnection
 
 CHUNK = 1 << 16
-"""Bytes read at once."""
+"""Size of one read in bytes."""
 
 MAX_HELD_BYTES = 1 << 18
-"""Largest number of bytes that wait in one direction before the proxy reads no more: one chunk
-behind the limit and what rules insert come on top. It leaves room for what a rule may hold back."""
+"""Largest number of bytes that wait in one direction before the proxy stops reading; one more chunk
+and inserted bytes may be added. It leaves room for the bytes that a rule may hold back."""
 
 WRITE_INTERVAL = 0.01
-"""Seconds between two writes where the rate is limited."""
+"""Seconds between two writes if the rate is limited."""
 
 TURNS = 2
-"""Turns of the event loop between two writes that are to come apart: the first hands what was
-written to a receiver on this loop, but behind us."""
+"""Turns of the event loop between two writes that have to arrive separately: in the first, a
+receiver on this loop gets the written bytes, but after this callback."""
 
 
 class Pipe:
@@ -50,7 +50,7 @@ class Pipe:
     ) -> None:
         self.source = source
         self.target = target
-        self.finished: bool = False  # the sender's end has come and was passed on
+        self.finished: bool = False  # whether the sender's end was passed on
         self._connection = connection
         self._direction: Direction = direction
         self._editor = Editor(rules)
@@ -67,25 +67,25 @@ class Pipe:
         self._rate: Rate | None = None
         self._set_pace(rules)
         self._loop = asyncio.get_running_loop()
-        self._unsent = bytearray()  # what has passed the line and waits for socket or rate
-        self._free_at = 0.0  # nothing is written before
+        self._unsent = bytearray()  # bytes after the delay line that wait for socket or rate
+        self._free_at = 0.0  # time before which nothing is written
         self._timer: asyncio.TimerHandle | None = None
         self._reading = self._writing = self._eof = self._closed = False
 
     def start(self) -> None:
-        """Begin to read; what stands at offset 0 is done first."""
+        """Begin to read; rules at offset 0 act first."""
         self._take(self._editor.feed(b""))
         self.run()
 
     def add(self, rules: Sequence[Rule]) -> None:
-        """Put rules behind the others; their places count from here."""
+        """Add rules after the others; their places count from here."""
         self._set_pace(rules)
         self._editor.add([rule.ahead(self._editor.position) for rule in rules])
         self._take(self._editor.feed(b""))
         self.run()
 
     def run(self) -> None:
-        """Do what can be done now."""
+        """Do all actions that are possible now."""
         self._stop_waiting()
         if self._stopped or not self._write_out():
             self._line.stop()
@@ -94,7 +94,7 @@ class Pipe:
         self._read_on()
 
     def close(self) -> None:
-        """Let go of both sockets; nothing is written any more."""
+        """Release both sockets; nothing is written any more."""
         self._closed = True
         self._line.close()
         self.run()
@@ -123,7 +123,7 @@ class Pipe:
         self._read_on()
 
     def _set_pace(self, rules: Sequence[Rule]) -> None:
-        """Take up the last rule of each kind."""
+        """Apply the last rule of each kind."""
         for rule in rules:
             if isinstance(rule, Rate):
                 self._rate = rule
@@ -160,7 +160,7 @@ class Pipe:
             self._line.stop()
 
     def _write_out(self) -> bool:
-        """Write what waits; whether all is written and the next may be, else :meth:`run` comes."""
+        """Write waiting bytes; return whether all is written, else :meth:`run` will be called."""
         while self._free_at <= self._loop.time():
             if not self._unsent:
                 return True
@@ -177,7 +177,7 @@ class Pipe:
         return False
 
     def _write(self, data: bytearray) -> int:
-        """Write once; at 0 the socket is full and :meth:`run` is called when it is not."""
+        """Write once; at 0 the socket is full, and :meth:`run` is called when it is writable."""
         try:
             written = self.target.send(data)
         except (BlockingIOError, InterruptedError):
@@ -200,7 +200,7 @@ class Pipe:
             self._connection.reset()
         elif ending.how == "close":
             self._connection.cut()
-        else:  # the sender's
+        else:  # end of the sender
             self._connection.note("eof", self._direction, self._editor.position)
             self.finished = True
             end_sending(self.target)
@@ -220,6 +220,6 @@ class Pipe:
 
 
 def end_sending(sock: socket.socket) -> None:
-    """Send FIN, where the peer is still there."""
+    """Send FIN, if the peer is still there."""
     with contextlib.suppress(OSError):  # the peer is gone already
         sock.shutdown(socket.SHUT_WR)

@@ -1,4 +1,4 @@
-"""The log of what a link proxy really did, and its counts."""
+"""The log of a link proxy's actions, and their counts."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import NamedTuple
 from smartcam.emulator._inside import Tally
 
 MAX_ENTRIES = 10_000
-"""Largest number of entries kept; the oldest go first. The counts go on."""
+"""Largest number of entries kept; the oldest are dropped. The counts continue."""
 
 
 class Entry(NamedTuple):
-    """One thing that happened.
+    """One event.
 
     Attributes:
         what: a rule's name in lower case, or ``connect``, ``eof`` (a side sends no more), ``lost``
             (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
             ``resume``, ``full`` and ``refused`` (a datagram that did not go out).
-        connection: number of the connection, from 1; 0 where the entry is about none.
-        direction: ``up`` or ``down``; empty if the entry is about both.
-        at: offset in the sender's stream, or number of the datagram; None for what the proxy was
-            told while it ran.
+        connection: number of the connection, from 1; 0 for an entry without one.
+        direction: ``up`` or ``down``; empty for an entry about both.
+        at: offset in the sender's stream, or number of the datagram; None for an action that the
+            program asked for.
     """
 
     what: str
@@ -35,8 +35,8 @@ class LinkLog:
 
     Attributes:
         log: the last entries, the oldest first.
-        counts: how often each thing happened.
-        passed: what left the proxy, by direction: bytes on TCP, datagrams on UDP.
+        counts: number of entries by ``what``.
+        passed: output of the proxy, by direction: bytes on TCP, datagrams on UDP.
     """
 
     def __init__(self) -> None:

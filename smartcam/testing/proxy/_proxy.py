@@ -1,7 +1,7 @@
-"""A link that breaks as told: it stands between a client and a camera and works on the bytes.
+"""A proxy between a client and a camera that changes their bytes by rules.
 
-It knows nothing of messages. Both sides are real sockets, so both see what a bad network would show
-them: segments, resets, silence, a full send buffer.
+It knows no messages. Both sides are real sockets, so both see the effects of a bad network:
+segments, resets, silence, a full send buffer.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ RELAYS: dict[str, type[StreamRelay | DatagramRelay]] = {"tcp": StreamRelay, "udp
 
 
 class LinkProxy:
-    """Stands between clients and a camera; an asynchronous context manager.
+    """A proxy between clients and a camera; an asynchronous context manager.
 
-    It needs an event loop that watches sockets (``add_reader``): every one of asyncio's but the
+    It needs an event loop that watches sockets (``add_reader``): every loop of asyncio except the
     proactor of Windows. The methods may be called at any time while it is open; they act at once.
 
     Args:
         target_host: name or address of the camera.
         target_port: port of the camera.
         transport: ``tcp`` or ``udp``.
-        rules: what to do, see :mod:`smartcam.testing.proxy._rules`. They are looked at when a
+        rules: rules to apply, see :mod:`smartcam.testing.proxy._rules`. They are read when a
             connection is made.
 
     Raises:
         ConfigurationError: an argument cannot work.
 
     Attributes:
-        rules: the list; changes hold for connections to come.
-        host: where the proxy listens.
+        rules: the list of rules; changes apply to new connections.
+        host: address that the proxy listens on.
         port: port that the proxy listens on, 0 until it is open.
-        log: what happened, the oldest first; bounded.
-        counts: how often each thing in the log happened, all of them counted.
-        passed: what the proxy sent, by direction: bytes on TCP, datagrams on UDP.
+        log: the events, the oldest first; bounded.
+        counts: number of all events, by the name of the entry.
+        passed: output of the proxy, by direction: bytes on TCP, datagrams on UDP.
     """
 
     def __init__(
@@ -90,25 +90,25 @@ class LinkProxy:
     async def __aexit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
     ) -> None:
-        """Shut the port and reset every connection that is still open, at once."""
+        """Close the port and reset every open connection, at once."""
         self._relay.close()
 
     def url(self, of: str) -> str:
         """Return a camera's URL with the proxy's address in place of its own."""
         return urlunsplit(urlsplit(of)._replace(netloc=f"{self.host}:{self.port}"))
 
-    # ------------------------------------------------------------------ what happened
+    # ------------------------------------------------------------------ events
 
     @property
     def open_connections(self) -> int:
-        """Connections that are open; on UDP, client addresses that were heard."""
+        """Number of open connections; on UDP, of known client addresses."""
         return len(self._relay.members)
 
     async def wait_for(self, what: str, count: int = 1, *, timeout: float = 5.0) -> None:
-        """Wait until something stands in the log ``count`` times, counted from the beginning.
+        """Wait until an entry is in the log ``count`` times, counted from the beginning.
 
         Raises:
-            TimeoutError: the entry did not in ``timeout`` seconds.
+            TimeoutError: the entry is missing after ``timeout`` seconds.
 
         Cancellation: safe.
         """
@@ -118,22 +118,22 @@ class LinkProxy:
         """Wait until the proxy sent ``amount`` bytes, or datagrams, in a direction.
 
         Raises:
-            TimeoutError: the proxy did not in ``timeout`` seconds.
+            TimeoutError: fewer were sent within ``timeout`` seconds.
 
         Cancellation: safe.
         """
         await self._log.passed.wait(direction, amount, timeout)
 
-    # ------------------------------------------------------------------ what is done to it
+    # ------------------------------------------------------------------ actions
 
     def from_now(self, *rules: Rule) -> None:
-        """Let rules hold on the connections that are open, behind those they have.
+        """Apply rules to the open connections, after their present rules.
 
-        Offsets and numbers count from what has come so far: ``Cut(at=0)`` cuts at once,
-        ``Split(at=12)`` splits behind the next 12 bytes. Connections to come are not concerned.
+        Offsets and numbers count from now: ``Cut(at=0)`` cuts at once, ``Split(at=12)`` splits
+        after the next 12 bytes. New connections are not affected.
 
         Raises:
-            ConfigurationError: a rule of the other transport.
+            ConfigurationError: a rule is for the other transport.
         """
         check_rules(rules, self._relay.rule_kind, self._transport)
         self._relay.add(rules)
@@ -154,8 +154,8 @@ class LinkProxy:
         Bytes stay in the system's buffers until :meth:`resume`; datagrams are lost.
 
         Args:
-            direction: one of them; None is both.
-            connection: this one alone; None is all, those to come as well. On UDP only None.
+            direction: the direction to stall; None is both.
+            connection: number of the connection; None is all, including new ones. On UDP only None.
 
         Raises:
             ConfigurationError: there is no such direction, or one connection on UDP.
@@ -171,14 +171,14 @@ class LinkProxy:
         self._relay.resume()
 
     def refuse(self, refused: bool = True) -> None:
-        """Close the port for new connections, or open it again; those that are open stay.
+        """Close the port for new connections, or open it again; open connections stay.
 
         A client gets the system's own "connection refused".
         """
         self._relay.refuse(refused)
 
     def kill(self) -> None:
-        """Reset every connection and refuse new ones: a camera whose program dies."""
+        """Reset every connection and refuse new ones, like a camera whose program dies."""
         self.refuse()
         self.reset()
 

@@ -1,4 +1,4 @@
-"""The part that the link proxy's TCP and UDP halves share: a port, and who is connected."""
+"""The common part of the link proxy's TCP and UDP halves: a port and its clients."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ class Proxied(ABC):
     """The traffic of one client with the target."""
 
     def __init__(self, relay: Relay[Any], number: int) -> None:
-        self.number = number  # of the connection, from 1
+        self.number = number  # number of the connection, from 1
         self.log: LinkLog = relay.log
         self._loop = asyncio.get_running_loop()
 
     def note(self, what: str, direction: str = "", at: int | None = None) -> None:
-        """Log something."""
+        """Log an event."""
         self.log.note(what, self.number, direction, at)
 
     @abstractmethod
     def add(self, rules: Sequence[Rule]) -> None:
-        """Let rules hold from here on."""
+        """Apply rules from here on."""
 
     @abstractmethod
     def cut(self) -> None:
-        """End in order."""
+        """End the traffic in order."""
 
     @abstractmethod
     def reset(self) -> None:
-        """End hard."""
+        """End the traffic hard."""
 
 
 C = TypeVar("C", bound=Proxied)
@@ -51,14 +51,14 @@ class Relay(ABC, Generic[C]):
     rule_kind: ClassVar[type[Rule]]
 
     def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
-        self.rules = rules  # looked at when a connection is made
+        self.rules = rules  # read when a connection is made
         self.log = log
         # address family of the target, set by open()
         self.family: socket.AddressFamily = socket.AF_INET
         self.target: Any = None  # address of the target, set by open()
-        # directions in which nothing passes, on connections to come as well
+        # directions in which nothing passes, also for new connections
         self.stalled: set[Direction] = set()
-        self.members: dict[Any, C] = {}  # who is connected
+        self.members: dict[Any, C] = {}  # connected clients
         self._socket: socket.socket | None = None
         self._address: Any = None
         self._refusing = False
@@ -72,21 +72,21 @@ class Relay(ABC, Generic[C]):
         return int(self._address[1])
 
     def chosen(self, connection: int | None) -> list[C]:
-        """Return one connection, where it is open, or all."""
+        """Return one connection, if it is open, or all."""
         return [one for one in self.members.values() if connection in {None, one.number}]
 
     def add(self, rules: Sequence[Rule]) -> None:
-        """Let rules hold from here on."""
+        """Apply rules from here on."""
         for one in self.chosen(None):
             one.add(rules)
 
     def cut(self, connection: int | None) -> None:
-        """End in order."""
+        """End connections in order."""
         for one in self.chosen(connection):
             one.cut()
 
     def reset(self, connection: int | None) -> None:
-        """End hard."""
+        """End connections hard."""
         for one in self.chosen(connection):
             one.reset()
 
@@ -100,7 +100,7 @@ class Relay(ABC, Generic[C]):
         self.stalled.clear()
 
     def refuse(self, refused: bool) -> None:
-        """Close the port for what comes, or open it again; it stays ours all the time."""
+        """Close the port for new clients, or open it again; the port stays reserved."""
         if refused == self._refusing:
             return
         self._refusing = refused
@@ -112,7 +112,7 @@ class Relay(ABC, Generic[C]):
             self._take_again()
 
     def close(self) -> None:
-        """Shut the port and end what is open, at once."""
+        """Close the port and end all connections, at once."""
         self._shut()
         self.reset(None)
 
@@ -140,15 +140,15 @@ class Relay(ABC, Generic[C]):
 
     @abstractmethod
     def _watch(self, sock: socket.socket) -> None:
-        """Take what comes to the port from now on."""
+        """Accept traffic on the port from now on."""
 
     @abstractmethod
     def _unwatch(self, sock: socket.socket) -> None:
-        """Take nothing more."""
+        """Accept nothing more."""
 
     def _turn_away(self) -> None:
-        """Have the system refuse what comes to the port."""
+        """Make the system refuse traffic to the port."""
 
     def _take_again(self) -> None:
-        """Take again what comes to the port."""
+        """Accept traffic to the port again."""
         self._listen()

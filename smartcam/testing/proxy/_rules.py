@@ -1,17 +1,17 @@
-"""The rules of a link proxy for what passes it: small values, in one list.
+"""The rules of a link proxy: small values, in one list.
 
 A rule is for one direction, ``up`` from client to camera or ``down`` from camera to client, and for
 one connection or for every one. On TCP there are two kinds of place:
 
 - A *point* is reached as soon as ``at`` bytes have come from the sender: 0 is reached when the
-  connection is made, a message's size right behind its last byte.
+  connection is made, a message's size right after its last byte.
 - A *range* begins with byte ``at``, counted from 0, and is ``count`` bytes long.
 
-Offsets count what the sender sent, whatever other rules make of it. Rules at one place act in the
+Offsets count the sender's bytes, before the effects of other rules. Rules at one place act in the
 order of the list. On UDP a rule picks datagrams: one by its number, or each with a probability.
 
-The emulator's :mod:`~smartcam.emulator.faults` act on messages; these know none. Where a fault has
-the same verb, the rule says what it acts on.
+The emulator's :mod:`~smartcam.emulator.faults` act on messages; rules know none. If a fault has
+the same verb, the rule's name includes its object.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Direction = Literal["up", "down"]
 DIRECTIONS: tuple[Direction, Direction] = ("up", "down")
 
 MAX_COPY_BYTES = 1 << 20
-"""Largest number of bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
+"""Largest number of bytes that one rule may insert or duplicate: the proxy keeps them in memory."""
 
 MAX_HOLD_BYTES = 1 << 16
 """Largest number of bytes that one rule may hold back: fewer than the proxy keeps before it stops
@@ -40,7 +40,7 @@ reading."""
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
-"""Text on what a value must be, and the function that checks it."""
+"""Text on the allowed values, and the function that checks a value."""
 
 _BOUNDS: Mapping[str, _Bound] = {
     "direction": ("direction must be 'up' or 'down'", lambda way: way in DIRECTIONS),
@@ -77,8 +77,7 @@ class Rule:
     Args:
         direction: direction of the data that the rule applies to.
         connection: number of the connection that the rule is for, from 1; None is every one. On
-            UDP each
-            client address is a connection.
+            UDP each client address is a connection.
     """
 
     direction: Direction = "down"
@@ -150,7 +149,7 @@ class RangeRule(PlacedRule):
 
     @property
     def end(self) -> int | None:
-        """The place behind its last byte, None if it has none."""
+        """The place after its last byte, None for a range without an end."""
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
@@ -159,9 +158,9 @@ class RangeRule(PlacedRule):
 
 
 class Cut(PointRule):
-    """End the connection in order: FIN to both sides, behind what has passed.
+    """End the connection in order: FIN to both sides, after the bytes that have passed.
 
-    What comes later is read and dropped, so that no reset overtakes the end.
+    Later bytes are read and dropped, so that no reset overtakes the end.
     """
 
 
@@ -174,10 +173,11 @@ class ResetConnection(PointRule, name="reset"):
 
 @dataclass(frozen=True, kw_only=True)
 class Stall(PointRule):
-    """Keep both sides open and pass nothing any more, until the proxy is told to resume.
+    """Keep both sides open and pass nothing any more, until ``resume`` is called.
 
     Args:
-        both: stop the other direction too: a dead peer. Ends of the stalled sides are not noticed.
+        both: stop the other direction, too, like a dead peer. Ends of the stalled sides are not
+            noticed.
     """
 
     both: bool = False
@@ -188,9 +188,9 @@ class SplitBytes(PointRule, name="split"):
     """Begin a new segment at ``at``.
 
     Args:
-        pause: seconds before what follows is written. At 0 it is two turns of the event loop, and
-            a receiver on the same loop gets both parts apart unless the system is slow to deliver;
-            give it a pause where a test depends on that.
+        pause: seconds before the following bytes are written. At 0 the pause is two turns of the
+            event loop; a receiver on the same loop gets both parts separately unless the system is
+            slow. Use a pause in a test that depends on that.
     """
 
     pause: float = 0.0
@@ -198,11 +198,11 @@ class SplitBytes(PointRule, name="split"):
 
 @dataclass(frozen=True, kw_only=True)
 class CoalesceBytes(PointRule, name="coalesce"):
-    """Hold back what follows ``at`` and pass it in one write.
+    """Hold back the bytes after ``at`` and pass them in one write.
 
     Args:
-        size: bytes to wait for; what came with them goes in the same write.
-        seconds: the longest wait. The sender's end and a rule that acts in between end it too.
+        size: bytes to wait for; bytes that came with them are in the same write.
+        seconds: the longest wait. The sender's end and a rule that acts in between end it, too.
     """
 
     size: int
@@ -212,7 +212,7 @@ class CoalesceBytes(PointRule, name="coalesce"):
 
 @dataclass(frozen=True, kw_only=True)
 class InsertBytes(PointRule, name="insert"):
-    """Put bytes of the proxy's own in."""
+    """Insert bytes of the proxy's own."""
 
     data: bytes
 
@@ -241,7 +241,7 @@ class DropBytes(RangeRule, name="drop"):
 
 
 class DuplicateBytes(RangeRule, name="duplicate"):
-    """Send a range again, right behind its end, as other rules left it."""
+    """Send a range again, right after its end, as other rules left it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -265,16 +265,16 @@ class Drip(RangeRule):
 
 
 class Pace(StreamRule):
-    """A rule about time that holds for the whole connection."""
+    """A rule about time for the whole connection."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DelayBytes(Pace, name="delay"):
-    """Pass everything later; the order stays, the end of the stream comes later too.
+    """Pass everything later; the order stays, and the end of the stream comes later, too.
 
     Args:
-        seconds: seconds for everything.
-        jitter: seconds; up to so much more, evenly spread, for each piece that comes.
+        seconds: delay of everything.
+        jitter: seconds; largest additional delay, evenly distributed, for each received piece.
         seed: seed of the jitter.
     """
 
@@ -285,7 +285,7 @@ class DelayBytes(Pace, name="delay"):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate(Pace):
-    """Pass so many bytes per second and not more."""
+    """Pass at most so many bytes per second."""
 
     bytes_per_second: float
 
@@ -301,7 +301,7 @@ class DatagramRule(Rule):
         number: number of the datagram in its direction and connection, from 1; None lets the
             probability decide.
         probability: probability for each datagram, 0 to 1.
-        seed: seed of the chance; the same seed picks the same datagrams.
+        seed: seed of the random numbers; the same seed picks the same datagrams.
     """
 
     number: int | None = None
@@ -328,7 +328,7 @@ class Repeat(DatagramRule):
     """Send the datagram more than once.
 
     Args:
-        copies: how many more.
+        copies: number of additional copies.
     """
 
     copies: int = 1
@@ -339,8 +339,8 @@ class Late(DatagramRule):
     """Send the datagram later; others overtake it.
 
     Args:
-        seconds: how much.
-        jitter: seconds; up to so much more.
+        seconds: delay of the datagram.
+        jitter: seconds; largest additional delay.
     """
 
     seconds: float
@@ -349,10 +349,10 @@ class Late(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(DatagramRule):
-    """Send the datagram after the ones that follow.
+    """Send the datagram after those that follow it.
 
     Args:
-        behind: how many of the same direction and connection overtake it.
+        behind: number of datagrams of the same direction and connection that overtake it.
         seconds: the longest wait for them.
     """
 

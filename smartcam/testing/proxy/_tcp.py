@@ -1,7 +1,7 @@
 """The TCP half of the link proxy: a listening socket, and a pair of sockets for each connection.
 
 It works on bare sockets, not on transports: one write is one ``send()``, an end is exactly the FIN
-or RST asked for, and nothing is closed later than at once. Everything runs in callbacks of the loop
+or RST of the rule, and a socket is closed at once. Everything runs in callbacks of the loop
 and there is no task; a connection owns at most one timer, and so does each of its pipes.
 """
 
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.testing")
 
 MAX_CONNECTIONS = 64
-"""Largest number of connections open at once; the one that was not answered for longest makes
+"""Largest number of connections open at once; the connection without an answer for longest makes
 room."""
 
 CONNECT_TIMEOUT = 5.0
-"""Seconds that the target has to take a connection."""
+"""Seconds that the target has to accept a connection."""
 
 LINGER = 1.0
 """Seconds that a cut connection is still read after its FIN, so that it does not end in a RST."""
 
 CALLING = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
-"""Results of ``connect_ex`` for a call that may succeed."""
+"""Results of ``connect_ex`` for a connection that may succeed."""
 
 HARD_END = struct.pack("ii", 1, 0)
-"""SO_LINGER of no time: closing sends RST."""
+"""SO_LINGER of no time, with which closing sends RST."""
 
 
 class ProxiedConnection(Proxied):
@@ -64,22 +64,22 @@ class ProxiedConnection(Proxied):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def connect(self) -> None:
-        """Call the target."""
+        """Connect to the target."""
         if self._target.connect_ex(self._relay.target) not in CALLING:
             self._refused()
             return
         self._loop.add_writer(self._target, self._connected)
         self._timer = self._loop.call_later(CONNECT_TIMEOUT, self._refused)
 
-    # ------------------------------------------------------------------ what happens to it
+    # ------------------------------------------------------------------ its end
 
     @property
     def settled(self) -> bool:
-        """True once bytes went both ways."""
+        """True once bytes have passed in both directions."""
         return len(self._carried) == len(DIRECTIONS)
 
     def turn_away(self, why: str) -> None:
-        """End the connection to make room, or because client and target did not speak in time."""
+        """End the connection to make room, or since client and target were silent for too long."""
         self.note("turned away")
         self.reset()
 
@@ -98,7 +98,7 @@ class ProxiedConnection(Proxied):
             self._close()
 
     def cut(self) -> None:
-        """End in order: FIN to both; what still comes is read and dropped for a while."""
+        """End in order: FIN to both; later bytes are read and dropped for a while."""
         self._stop()
         self._connecting = False
         self._lingering = {self._client, self._target}
@@ -115,7 +115,7 @@ class ProxiedConnection(Proxied):
         self._close()
 
     def add(self, rules: Sequence[Rule]) -> None:
-        """Let rules hold from here on."""
+        """Apply rules from here on."""
         for direction, pipe in tuple(self._pipes.items()):
             chosen = [rule for rule in rules if rule.concerns(self.number, direction)]
             if chosen:
@@ -127,7 +127,7 @@ class ProxiedConnection(Proxied):
         self._refresh()
 
     def resume(self) -> None:
-        """Pass everything again, beginning with what waits."""
+        """Pass everything again, beginning with waiting bytes."""
         self.stalled.clear()
         self._refresh()
 
@@ -169,7 +169,7 @@ class ProxiedConnection(Proxied):
                 self._close()
 
     def _stop(self) -> None:
-        """Stop everything that moves; the sockets stay."""
+        """Stop all transfers and timers; the sockets stay."""
         for pipe in self._pipes.values():
             pipe.close()
         self._pipes.clear()
@@ -192,7 +192,7 @@ class ProxiedConnection(Proxied):
 
 
 class _RawAcceptor(Acceptor[ProxiedConnection]):
-    """Hands accepted sockets on as they are."""
+    """Passes accepted sockets on unchanged."""
 
     def __init__(self, relay: StreamRelay, places: Places[ProxiedConnection]) -> None:
         super().__init__(asyncio.Protocol, places, _log, name="smartcam.proxy")
@@ -234,7 +234,7 @@ class StreamRelay(Relay[ProxiedConnection]):
         try:
             address = client.getpeername()
             connection = ProxiedConnection(self, self._number, client)
-        except OSError:  # the client is gone again, or no file descriptor is left
+        except OSError:  # the client is gone, or no file descriptor is left
             self.log.note("not accepted", self._number)
             client.close()
             return
@@ -246,7 +246,7 @@ class StreamRelay(Relay[ProxiedConnection]):
             connection.connect()
 
     def forget(self, connection: ProxiedConnection) -> None:
-        """Know a connection no longer that is closed."""
+        """Forget a closed connection."""
         self._acceptor.leave(connection)
         del self.members[connection.number]
 

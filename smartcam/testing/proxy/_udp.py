@@ -33,17 +33,17 @@ MAX_SIZE_BYTES = 1 << 16
 """Largest number of bytes read of a datagram; none is longer."""
 
 MAX_CLIENTS = 64
-"""Client addresses that are known; the one that was not answered for longest makes room."""
+"""Largest number of client addresses that are known; the longest unanswered one makes room."""
 
 ANSWERED_GRACE = 60.0
-"""Seconds that a client keeps its place for certain after the target has answered it."""
+"""Seconds for which a client surely keeps its place after the target has answered it."""
 
 MAX_WAITING_DATAGRAMS = 1024
 """Largest number of datagrams that rules hold back; more are lost and counted as ``full``."""
 
 
 class _Peer(Proxied):
-    """One client's address and the socket to the target that is its own."""
+    """One client's address and its own socket to the target."""
 
     def __init__(self, relay: DatagramRelay, number: int, address: Any) -> None:
         super().__init__(relay, number)
@@ -66,7 +66,7 @@ class _Peer(Proxied):
         self.add(relay.rules)
 
     def add(self, rules: Sequence[Rule]) -> None:
-        """Put rules behind the others; their numbers count from here."""
+        """Add rules after the others; their numbers count from here."""
         for way in DIRECTIONS:
             for rule in rules:
                 if isinstance(rule, DatagramRule) and rule.concerns(self.number, way):
@@ -75,7 +75,7 @@ class _Peer(Proxied):
                     self._rules[way].append((rule.ahead(self._seen[way]), chance))
 
     def take(self, direction: Direction, data: bytes) -> None:
-        """Do to a datagram what the rules say."""
+        """Apply the rules to a datagram."""
         self._seen[direction] += 1
         number = self._seen[direction]
         if direction in self._relay.stalled:
@@ -106,22 +106,22 @@ class _Peer(Proxied):
 
     @property
     def settled(self) -> bool:
-        """True if the target has answered the client lately."""
+        """True if the target has answered the client recently."""
         return self._loop.time() - self._answered < ANSWERED_GRACE
 
     def turn_away(self, why: str) -> None:
-        """Forget the client, for another one."""
+        """Forget the client, to make room for another."""
         self.note("turned away")
         self.reset()
 
     def cut(self) -> None:
-        """Forget the client; datagrams know no orderly end."""
+        """Forget the client; datagrams have no orderly end."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget the client, so that the target sees a new one when it speaks again.
+        """Forget the client, so that the target sees a new one at its next datagram.
 
-        What is on its way is lost.
+        Datagrams on their way are lost.
         """
         del self._relay.members[self.address]
         self._relay.places.leave(self)
@@ -147,7 +147,7 @@ class _Peer(Proxied):
             data = self._sock.recv(MAX_SIZE_BYTES)
         except (BlockingIOError, InterruptedError):
             return
-        except OSError:  # the system says that nothing listens there
+        except OSError:  # the system reports that nothing listens there
             self.note("no target", "up")
             return
         self._answered = self._loop.time()
@@ -180,7 +180,7 @@ class DatagramRelay(Relay[_Peer]):
         self.places: Places[_Peer] = Places(MAX_CLIENTS, own="an answer")
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
-        """Lose everything; of one client alone is not possible."""
+        """Drop everything; UDP cannot stall a single client."""
         if connection is not None:
             raise ConfigurationError("on UDP a stall is for every client")
         super().stall(direction, connection)
@@ -199,7 +199,7 @@ class DatagramRelay(Relay[_Peer]):
 
     def _turn_away(self) -> None:
         if self._socket is not None:
-            # it takes datagrams of that peer alone, which is itself: the system refuses others
+            # connected to itself, the socket gets no datagrams of others
             self._socket.connect(self._address)
 
     def _take_again(self) -> None:
@@ -216,14 +216,14 @@ class DatagramRelay(Relay[_Peer]):
     def _receive(self, sock: socket.socket) -> None:
         try:
             data, address = sock.recvfrom(MAX_SIZE_BYTES)
-        except OSError:  # nothing there, or a client's socket is shut, which is not for us to know
+        except OSError:  # nothing there, or an error of a client's closed socket
             return
         peer = self.members.get(address) or self._newcomer(address)
         if peer is not None:
             peer.take("up", data)
 
     def _newcomer(self, address: Any) -> _Peer | None:
-        """Return a client that was not known; None if there is no room for it."""
+        """Return an unknown client; None if there is no room for it."""
         self._number += 1
         try:
             peer = _Peer(self, self._number, address)
@@ -232,7 +232,7 @@ class DatagramRelay(Relay[_Peer]):
             return None
         self.members[address] = peer
         if self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time()):
-            peer.turn_away("everybody else was answered lately")
+            peer.turn_away("all other clients were answered recently")
             return None
         self.log.note("connect", self._number)
         return peer

@@ -55,7 +55,7 @@ class IsOwedAnything(ShortMachine):
 
     def _receive_known(self) -> bool:
         for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(owed=(self._open, self._open_twice))
+            self._deliveries[size] = known._replace(pending=(self._open, self._open_twice))
         return super()._receive_known()
 
 

@@ -81,7 +81,7 @@ class Camera:
             await self._end.wait()
 
     def do(self, action: Callable[[], object]) -> None:
-        """Have an operator's method called in the emulator's thread; returns when it has."""
+        """Call an operator's method in the emulator's thread, and wait for its end."""
         done = threading.Event()
         self._loop.call_soon_threadsafe(lambda: (action(), done.set()))
         assert done.wait(TIMEOUT)

@@ -100,7 +100,7 @@ async def test_set_online_of_anything_else_is_invalid(
     await client.ask(b"SO" + argument + b"\r\n", wire.INVALID)
 
 
-async def test_set_online_of_a_camera_held_offline_says_so(
+async def test_set_online_of_a_camera_held_offline_reports_it(
     emulator: EmulatedInSight, client: TelnetClient
 ) -> None:
     emulator.set_online(False)
@@ -313,7 +313,7 @@ async def test_controls_are_set_until_the_job_is_loaded_again(
     await client.ask(b"GVB002\r\nGVD004\r\n", b"1\r\n3.000\r\n1\r\nBefore SS\r\n")
 
 
-async def test_control_with_a_name_is_set_behind_a_space() -> None:
+async def test_control_with_a_name_is_set_after_a_space() -> None:
     job = {"file": "1.job", "cells": {"Math_1.A1": {"kind": "string", "value": ""}}}
     async with EmulatedInSight([job]) as emulator, await TelnetClient.log_in(emulator) as client:
         await client.ask(b"SSMath_1.A1 After SS\r\n", wire.DONE)

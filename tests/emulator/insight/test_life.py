@@ -92,7 +92,7 @@ async def test_login_to_the_byte() -> None:
 @pytest.mark.parametrize(
     ("user", "password"), [(b"admin", b"x"), (b"Admin", b""), (b"nobody", b""), (b"", b"")]
 )
-async def test_wrong_login_is_told_and_ends_the_connection(user: bytes, password: bytes) -> None:
+async def test_refused_login_ends_the_connection(user: bytes, password: bytes) -> None:
     async with EmulatedInSight() as emulator, await TelnetClient.open(emulator) as client:
         await client.expect(wire.GREETING)
         await client.ask(user + b"\r\n", wire.PASSWORD)
@@ -138,7 +138,7 @@ async def test_connection_too_many_is_closed() -> None:
         assert len(emulator.links) == MAX_SESSIONS
 
 
-async def test_client_always_gets_in_where_not_all_are_logged_in() -> None:
+async def test_client_always_gets_in_if_not_all_are_logged_in() -> None:
     async with EmulatedInSight() as emulator, contextlib.AsyncExitStack() as stack:
         first = await stack.enter_async_context(await TelnetClient.log_in(emulator))
         idle = [
@@ -190,7 +190,7 @@ async def test_line_that_is_too_long_ends_the_connection() -> None:
         await client.expect_end()
 
 
-async def test_commands_behind_one_under_way_wait_in_a_bounded_buffer() -> None:
+async def test_commands_after_one_under_way_wait_in_a_bounded_buffer() -> None:
     clock = ManualClock()
     line = b"SS" + 4000 * b"x" + b"\r\n"
     async with (

@@ -1,4 +1,4 @@
-"""The suite for authors of protocols: subclass, say what the protocol is, inherit the tests.
+"""The suite for authors of protocols: subclass, name the protocol, inherit the tests.
 
 ::
 
@@ -7,8 +7,8 @@
         conversations = [Conversation(name="a trigger", dialect="lines", steps=[...])]
         camera_kinds = [CameraKind(name="Acme", open=put_up)]
 
-:class:`WireSuite` is the part of it that needs no camera, :class:`CameraSuite` the one that has a
-client in front of one. They run with pytest, and need no plugin for asynchronous tests.
+:class:`WireSuite` is the part that needs no camera, :class:`CameraSuite` the part that has a
+client connected to one. They run with pytest, and need no plugin for asynchronous tests.
 """
 
 from __future__ import annotations

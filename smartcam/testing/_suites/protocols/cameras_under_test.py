@@ -1,8 +1,7 @@
-"""Cameras that a suite runs against: how to put one up, and what stands on it.
+"""Cameras for a suite: how to open one, and its applications.
 
-A :class:`CameraKind` is one kind of camera; a :class:`LiveCamera` is the camera while it is up.
-Neither knows anything of the checks. What a camera can do in its dialect is asked of the client:
-``camera.capabilities``.
+A :class:`CameraKind` is one kind of camera; a :class:`LiveCamera` is an open camera. Neither knows
+the checks. The client knows what a camera can do in its dialect: ``camera.capabilities``.
 
 On each camera stand the same applications: :class:`LiveCamera` has their ids.
 """
@@ -52,12 +51,12 @@ class LiveCamera:
 
     @property
     def url(self) -> str:
-        """Its URL, with everything pinned that can be, as a client's ``url`` shows it."""
+        """The camera's URL, with all options pinned, as a client's ``url`` shows it."""
         raise NotImplementedError
 
     @property
     def unpinned(self) -> str:
-        """The same without what a client can find out."""
+        """The camera's URL without the options that a client can find out."""
         return self.url.partition("?")[0]
 
     @property
@@ -67,22 +66,22 @@ class LiveCamera:
 
     @property
     def inspects(self) -> bool:
-        """True while an inspection is under way."""
+        """True while an inspection is running."""
         self._cannot("tell whether an inspection is under way")
 
     def trigger(self) -> None:
-        """Trigger by the digital input; a camera that has none does nothing."""
+        """Trigger by the digital input; do nothing on a camera without one."""
 
     def switch(self, application: int) -> None:
-        """Load and run another application, as an operator does."""
+        """Load and run another application, like an operator."""
         self._cannot("switch as an operator does")
 
     async def restart(self) -> None:
-        """Lose every client and be there again at once, as it was at first."""
+        """Disconnect every client and be available again at once, in the first state."""
         self._cannot("restart the camera")
 
     async def kill(self) -> None:
-        """Be gone, and stay so."""
+        """Be gone for good."""
         self._cannot("have the camera gone")
 
     def _cannot(self, what: str) -> NoReturn:
@@ -97,15 +96,15 @@ class CameraKind:
         name: name of the kind for people.
         open: function that opens a camera of this kind.
         applications: ids of the applications on the camera, ``COUNTER`` among them.
-        numbers: how to interpret what the applications send: a record whose field ``n`` is the
+        numbers: interpretation of the applications' results: a record whose field ``n`` is the
             number.
-        numbers_with_sequence: ``numbers`` with the number marked as the sequence number, where
+        numbers_with_sequence: ``numbers`` with the number marked as the sequence number, if
             that can be set.
-        raw_request: id of a request that is answered by something, None if there is none.
+        raw_request: id of a request that has an answer, None if there is none.
         foreign_request: an id of another kind than the protocol's.
         silent_request: id of a request that the camera leaves without an answer, None if there is
-            not valid; unused where there are result codes.
-        datagrams: True if messages may be lost, and nobody is told that the camera is gone.
+            none; unused if there are result codes.
+        datagrams: True if messages may be lost, and no message reports that the camera is gone.
         exclusive: True if a second client takes the camera from the first.
         has_zero: True if an application may have the id 0.
     """

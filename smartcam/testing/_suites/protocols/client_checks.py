@@ -1,4 +1,4 @@
-"""The helpers that the checks of a client in front of a camera share."""
+"""Common helpers of the checks with a client connected to a camera."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ SHORT_TIMEOUT = 0.05
 """Seconds of a timeout that is meant to fire."""
 
 SOON_TIMEOUT = 5.0
-"""Seconds after which what should happen at once fails the check."""
+"""Seconds after which an event that should happen at once fails the check."""
 
 CHECK_TIMEOUT = 60.0
-"""Seconds of a whole check."""
+"""Seconds for a whole check."""
 
 GRACE_STEPS = 100
-"""Steps of the loop in which a cancelled task has to end."""
+"""Largest number of steps of the loop in which a cancelled task has to end."""
 
 
 def in_a_loop(
     check: Callable[Concatenate[Suite, Given], Coroutine[Any, Any, None]],
 ) -> Callable[Concatenate[Suite, Given], None]:
-    """Make a check an ordinary test, with a loop of its own.
+    """Turn a check into an ordinary test, with an event loop of its own.
 
-    So it needs no plugin for asynchronous tests, and bears with any. Tasks that a check leaves
-    behind fail it.
+    So it needs no plugin for asynchronous tests, and works with any of them. Tasks that a check
+    leaves running fail it.
     """
 
     @functools.wraps(check)
     def run(suite: Suite, /, *args: Given.args, **kwargs: Given.kwargs) -> None:
-        # with a factory the thread's current loop stays what it is
+        # with a factory the thread's current loop is not changed
         with asyncio.Runner(loop_factory=asyncio.new_event_loop) as runner:
             runner.run(_watched(check(suite, *args, **kwargs)))
 
@@ -68,14 +68,14 @@ async def _watched(check: Coroutine[Any, Any, None]) -> None:
 
 
 def needs(camera_kind: CameraKind, *applications: int) -> None:
-    """Skip the check where a camera has not all of these applications."""
+    """Skip the check if a camera does not have all of these applications."""
     missing = [one for one in applications if one not in camera_kind.applications]
     if missing:
         pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
 
 
 def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
-    """Return a client that reads numbers, and does not reconnect."""
+    """Return a client that interprets numbers, and does not reconnect."""
     options = {"reconnect": None, "interpret_as": camera_kind.numbers, **options}
     return smartcam.connect(live.url, **options)
 
@@ -84,7 +84,7 @@ def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
 async def visiting(
     camera_kind: CameraKind, **options: Any
 ) -> AsyncIterator[tuple[LiveCamera, Camera]]:
-    """Have a camera that is up, and a client in a session with it."""
+    """Open a camera, and a client in a session with it."""
     if "application" in options:
         needs(camera_kind, options["application"])
     async with camera_kind.open() as live, client(camera_kind, live, **options) as camera:
@@ -92,21 +92,21 @@ async def visiting(
 
 
 async def number(camera: Camera, application: int | None = None, **options: Any) -> int:
-    """Trigger and return the number that came."""
+    """Trigger and return the number in the result."""
     options.setdefault("timeout", SOON_TIMEOUT)
     result = await camera.trigger(application, **options)
     return int(result.value.n)
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Let the loop run until something is true."""
+    """Run the loop until a condition is true."""
     async with asyncio.timeout(SOON_TIMEOUT):
         while not condition():  # noqa: ASYNC110 - whatever the condition is
             await asyncio.sleep(0)
 
 
 async def refused(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
-    """See that the dialect cannot do it, that the error says so, and that the session goes on."""
+    """Check that a call is an UnsupportedError, and that the session continues."""
     dialect = re.escape(camera.capabilities.dialect)
     abilities = re.escape(", ".join(camera.capabilities.names))
     with pytest.raises(UnsupportedError, match=rf"dialect {dialect} .*{abilities}"):
@@ -116,7 +116,7 @@ async def refused(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
 
 
 def balance(statistics: Statistics) -> None:
-    """See that both accounts balance."""
+    """Check that both accounts balance."""
     assert statistics.received == (
         statistics.triggered
         + statistics.streamed

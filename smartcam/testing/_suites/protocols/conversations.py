@@ -1,4 +1,4 @@
-"""Written conversations of client and camera, and a player that leads a machine through them."""
+"""Recorded conversations of client and camera, and a player that runs them with a machine."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     Trace = Callable[[Sender, Frame | RemoteProtocolError], None]
 
 MAX_LENGTH = 1 << 12
-"""Largest payload that the machines of a suite accept, bytes."""
+"""Length of the longest payload, in bytes, that the machines of a suite accept."""
 
 Told: TypeAlias = Message | type[RemoteProtocolError]
-"""A machine's output: a message, or the kind of error that ends the link."""
+"""An output of a machine: a message, or the kind of error that ends the link."""
 
 
 class Sent(NamedTuple):
-    """The client says something.
+    """A message of the client.
 
     Attributes:
-        message: what it says.
-        wire: the bytes that it writes for that, those of all datagrams one after the other.
+        message: the message.
+        wire: the bytes written for it; those of several datagrams one after the other.
     """
 
     message: Message
@@ -39,13 +39,13 @@ class Sent(NamedTuple):
 
 
 class Came(NamedTuple):
-    """Bytes come from the camera: any piece of a stream, or one datagram.
+    """Bytes of the camera: any piece of a stream, or one datagram.
 
     Attributes:
         data: the bytes.
-        events: what the machine makes of them: messages, and in the end possibly the type of the
+        events: the machine's events for them: messages, and at the end possibly the type of the
             error that ends the link.
-        wire: what it writes to that by itself.
+        wire: bytes that the machine writes in reply, without a call.
     """
 
     data: bytes
@@ -58,7 +58,7 @@ Step: TypeAlias = Sent | Came
 
 @dataclass(frozen=True, kw_only=True)
 class Conversation:
-    """Bytes from the protocol's documents: what is said on one link, in order, from its beginning.
+    """Bytes from the protocol's documents: the messages on one link, in order, from its beginning.
 
     Attributes:
         name: name of the conversation for people.
@@ -89,7 +89,7 @@ class Conversation:
         return tries[0]
 
 
-def told(events: Iterable[Event]) -> list[Any]:
+def flat(events: Iterable[Event]) -> list[Any]:
     """Return events with each burst as its containers, and errors by their kind."""
     found: list[Any] = []
     for event in events:
@@ -101,7 +101,7 @@ def told(events: Iterable[Event]) -> list[Any]:
 
 
 class Player:
-    """Leads a machine through a conversation, and sees that it keeps to it."""
+    """Runs a machine through a conversation, and checks each step."""
 
     def __init__(
         self, protocol: Protocol, conversation: Conversation, trace: Trace | None = None
@@ -119,29 +119,29 @@ class Player:
         self.place: int = 0
 
     def play(self, until: int | None = None) -> Player:
-        """Go on to a place, by default to the end; return the player.
+        """Continue to a place, by default to the end; return the player.
 
         Raises:
-            AssertionError: the machine said or told something else.
+            AssertionError: the machine's bytes or events differ.
         """
         for step in self.conversation.steps[self.place : until]:
             self.step(step)
         return self
 
     def step(self, step: Step, chunks: Sequence[bytes] | None = None, *, room: bool = True) -> None:
-        """Do one step; ``chunks`` are what came, cut in another way.
+        """Do one step; ``chunks`` are the received bytes, cut in another way.
 
-        With ``room`` a stream's bytes are written where the machine wants them.
+        With ``room`` a stream's bytes are written into the machine's own buffer.
 
         Raises:
-            AssertionError: the machine said or told something else.
+            AssertionError: the machine's bytes or events differ.
         """
         where = f"{self.conversation}, step {self.place}, {step!r:.300}"
         events: list[Any] = []
         if isinstance(step, Sent):
             self.machine.send(step.message)
             wanted: list[Any] = []
-            events = told(self.machine.events())
+            events = flat(self.machine.events())
         else:
             wanted = list(step.events)
             for chunk in [step.data] if chunks is None else chunks:
@@ -156,10 +156,10 @@ class Player:
         self.place += 1
 
     def deliver(self, chunk: bytes, *, room: bool = True) -> list[Any]:
-        """Give bytes to the machine as a link does, and return what it tells."""
+        """Give bytes to the machine as a link does, and return its events."""
         if not room or self.machine.transport is Transport.UDP:
             self.machine.receive_data(chunk)
-            return told(self.machine.events())
+            return flat(self.machine.events())
         events: list[Any] = []
         while chunk:
             place = self.machine.room()
@@ -169,8 +169,8 @@ class Player:
             place[:count] = chunk[:count]
             chunk = chunk[count:]
             if self.machine.filled(count, 0.0):
-                events += told(self.machine.events())
-        return events + told(self.machine.events())
+                events += flat(self.machine.events())
+        return events + flat(self.machine.events())
 
     def written(self) -> bytes:
         """Return the bytes that the machine has to write."""

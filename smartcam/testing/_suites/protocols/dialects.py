@@ -1,4 +1,4 @@
-"""Checks of a protocol and its dialects: what they say of themselves fits together."""
+"""Checks of a protocol and its dialects: their descriptions are consistent."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 """The beginning of a URL (RFC 3986, 3.1), in lower case."""
 
 CODES = (*range(-300, 301), -(1 << 31), (1 << 16) - 1, (1 << 32) - 1)
-"""Result codes that a dialect is asked the meaning of."""
+"""Result codes whose meanings are checked."""
 
 
 def _is_line(text: object) -> bool:
@@ -59,7 +59,7 @@ class DialectChecks(Parameters):
     # ------------------------------------------------------------------ the protocol
 
     def test_protocol_describes_itself(self) -> None:
-        """Scheme, port, models and dialects are such that a URL can name them."""
+        """Check that a URL can name schemes, port, models and dialects."""
         protocol = self.protocol
         assert _is_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
         assert protocol.schemes, "schemes: expected at least one"
@@ -78,7 +78,7 @@ class DialectChecks(Parameters):
             assert _is_line(about), f"parameter {name!r}: expected a line that says what it is"
 
     def test_entry_point_gives_the_protocol(self) -> None:
-        """``connect()`` finds it: the package is installed and the names agree."""
+        """Check that ``connect()`` finds the protocol: it is installed, and the names agree."""
         name = self.protocol.name
         try:
             loaded = PROTOCOLS.load(name)
@@ -174,9 +174,9 @@ class DialectChecks(Parameters):
             if dialect.has(kind):
                 continue
             for asked in (kind, example(kind, dialect)):
-                said = _refusal(UnsupportedError, dialect.message_id, asked)
-                assert said is not None, f"has() is False for {kind.__name__}, but it has an id"
-                assert dialect.name in said, f"{said}: which dialect?"
+                text = _refusal(UnsupportedError, dialect.message_id, asked)
+                assert text is not None, f"has() is False for {kind.__name__}, but it has an id"
+                assert dialect.name in text, f"{text}: which dialect?"
 
     def test_codes_mean_something(self, dialect: Dialect) -> None:
         """Check that any code has a text and a verdict, and that one is good and one is not."""
@@ -225,13 +225,13 @@ class DialectChecks(Parameters):
             assert isinstance(body, bytes), f"body({other}): expected bytes, got {body!r}"
 
     def test_unknown_quirk_is_a_mistake(self, dialect: Dialect) -> None:
-        """None is no change; one that nobody knows is a ConfigurationError."""
+        """Check that known quirks change nothing, and an unknown one is a ConfigurationError."""
         same = dialect.with_quirks(dialect.quirks)
         assert same.label == dialect.label, f"with its own quirks it is {same.label!r}"
         assert dialect.with_parameters({}).name == dialect.name
-        said = _refusal(ConfigurationError, dialect.with_quirks, ["no such quirk"])
-        assert said is not None, "with_quirks(['no such quirk']) was taken"
-        assert "no such quirk" in said, f"{said}: which quirk?"
+        text = _refusal(ConfigurationError, dialect.with_quirks, ["no such quirk"])
+        assert text is not None, "with_quirks(['no such quirk']) was taken"
+        assert "no such quirk" in text, f"{text}: which quirk?"
 
     def test_address_is_read_back(self, dialect: Dialect) -> None:
         """Check that a URL with everything pinned is read back, and has no password."""
@@ -243,7 +243,7 @@ class DialectChecks(Parameters):
         ]
         for scheme in self.protocol.schemes:
             for host in ("192.0.2.7", "2001:db8::7"):
-                for said in parameters:
+                for values in parameters:
                     see_address(
                         Address(
                             self.protocol.name,
@@ -252,7 +252,7 @@ class DialectChecks(Parameters):
                             self.protocol.default_port,
                             dialect.name,
                             tuple(sorted(dialect.quirks)),
-                            said,
+                            values,
                         )
                     )
 
@@ -293,7 +293,7 @@ _TOPS: Mapping[tuple[m.Wire, str], int] = {
 def _refusal(
     error: type[SmartCamError], call: Callable[[Any], object], given: object
 ) -> str | None:
-    """Return the text of the error that a call raises, None if it raises none."""
+    """Return the text of the error that a call raises, None without one."""
     try:
         call(given)
     except error as exc:
@@ -302,10 +302,10 @@ def _refusal(
 
 
 def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
-    """See that a frame can be shown, in JSON as well.
+    """Check that a frame can be shown, in JSON as well.
 
     Raises:
-        AssertionError: the frame cannot.
+        AssertionError: the frame cannot be shown.
     """
     spelled = dialect.spell(sender, frame)
     assert isinstance(spelled, Spelled), f"spell({frame}): expected a Spelled, got {spelled!r}"
@@ -316,10 +316,10 @@ def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
 
 
 def see_address(address: Address) -> None:
-    """See that an address is what its own URL says.
+    """Check that an address equals the one in its own URL.
 
     Raises:
-        AssertionError: the address is not.
+        AssertionError: the address differs.
     """
     url = address.url
     read = parse_address(url)
@@ -330,10 +330,10 @@ def see_address(address: Address) -> None:
 
 
 def see_read_back(dialect: FramedDialect, kind: type[m.Message], values: Mapping[str, Any]) -> None:
-    """See that a message with these values on the wire goes through bytes unchanged.
+    """Check that a message with these values on the wire goes through bytes unchanged.
 
     Raises:
-        AssertionError: the message does not.
+        AssertionError: the message changes.
     """
     if kind is m.StatusReport:
         values = {**values, "status": dialect.status_bits.read(values["status"])}

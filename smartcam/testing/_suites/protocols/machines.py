@@ -40,7 +40,7 @@ MAX_ERROR_CHARACTERS = 500
 """Largest number of characters of an error's text, with at most 64 bytes of a peer."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
-"""Bytes of a camera that sends one of them without an end."""
+"""Bytes that a camera repeats endlessly, one at a time."""
 
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
@@ -67,7 +67,7 @@ class MachineChecks(Parameters):
         """Check that each request is the written bytes, and each answer the written message."""
         Player(self.protocol, conversation).play()
         kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
-        assert m.Connect in kinds, f"{conversation}: nobody sends Connect"
+        assert m.Connect in kinds, f"{conversation}: no step sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
         """Check any cut of a stream: each piece may come alone, or with the next."""
@@ -93,15 +93,15 @@ class MachineChecks(Parameters):
         samples = _samples(stream)
         pieces = strategies.st.lists(strategies.noise(samples), max_size=3)
 
-        def told(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
+        def outcome(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
             player = Player(self.protocol, stream).play(place)
             events = [event for chunk in cut for event in player.deliver(chunk)]
             return events, player.machine.state
 
         def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
-            first = told(place, [whole])
+            first = outcome(place, [whole])
             for cut in (chunks, [bytes([one]) for one in whole]):
-                other = told(place, cut)
+                other = outcome(place, cut)
                 assert other == first, f"whole: {first}, in pieces: {other}"
 
         def check(data: DataObject) -> None:
@@ -189,7 +189,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ requests
 
     def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
-        """Check that it is a LocalProtocolError; then the conversation goes as written."""
+        """Check that a request is a LocalProtocolError; then the conversation goes as written."""
         player = Player(self.protocol, conversation)
         dialect = player.machine.dialect
         for kind in REQUESTS:
@@ -198,7 +198,7 @@ class MachineChecks(Parameters):
         player.play()
 
     def test_disconnect_before_the_session_is_harmless(self, conversation: Conversation) -> None:
-        """Check Disconnect as the first word: it ends a session that a dead client left."""
+        """Check Disconnect as the first message: it ends a session that a dead client left."""
         player = Player(self.protocol, conversation)
         player.machine.send(m.Disconnect())
         player.written()
@@ -235,7 +235,7 @@ class MachineChecks(Parameters):
             player = Player(self.protocol, conversation).play(place)
             events = [event for one in data for event in player.deliver(one)]
             found = [one for one in events if isinstance(one, answer)]
-            assert not found, f"at step {place}, nobody had asked, but it told {found}"
+            assert not found, f"at step {place}, no request was open, but it reported {found}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
         """Check that Disconnect can be sent in any session, and that nothing is sent after it."""
@@ -257,7 +257,7 @@ class MachineChecks(Parameters):
                         message = example(kind, machine.dialect)
                         see_refused(player, message, f"at step {place}, after Disconnect")
 
-    # ------------------------------------------------------------------ what it says of itself
+    # ------------------------------------------------------------------ self-description
 
     def test_machine_says_what_it_is(self, conversation: Conversation) -> None:
         """Check dialect, transport and state, which the client uses, and that lists are copies."""
@@ -324,11 +324,11 @@ class MachineChecks(Parameters):
             assert not secret or secret not in shown, f"the trace has the password: {shown}"
         spoken = {
             sender
-            for sender, said in (
+            for sender, frames in (
                 (m.Sender.CLIENT, [one.wire for one in conversation.steps]),
                 (m.Sender.CAMERA, [*_samples(conversation)]),
             )
-            if any(said)
+            if any(frames)
         }
         missing = spoken - {sender for sender, _ in seen}
         assert not missing, f"nothing of the {missing} was traced"
@@ -349,7 +349,7 @@ class _Judge:
         return isinstance(self.last, (LinkFailed, LinkEnded, State))
 
     def let(self, action: bytes | m.Message) -> None:
-        """Pass bytes to the machine, or send a request."""
+        """Pass bytes or a request to the machine."""
         if isinstance(action, m.Message):
             try:
                 self.machine.send(action)
@@ -363,14 +363,14 @@ class _Judge:
         self._look()
 
     def end(self) -> None:
-        """Close the link twice as the camera, and pass bytes after that."""
+        """Close the link twice from the camera's side, and pass bytes after that."""
         before = self.over
         for _ in range(2):
             self.machine.receive_eof()
             self._look()
             self.machine.receive_data(b"too late\r\n\0")
             self._look()
-        assert self.over, "the link's end was not told"
+        assert self.over, "the link's end was not reported"
         wanted = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
         assert self.machine.state in wanted, f"at the end it is {self.machine.state}"
 
@@ -413,7 +413,7 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
     else:
         pytest.fail(f"{where}: {message} was taken")
     events, wire = machine.events(), player.written()
-    assert not events, f"{where}: {message} was refused, but it told {events}"
+    assert not events, f"{where}: {message} was refused, but it reported {events}"
     assert not wire, f"{where}: {message} was refused, but it said {wire!r}"
     assert machine.state is state, f"{where}: {message} was refused, but it is {machine.state}"
 
@@ -458,7 +458,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
 
 
 def _answers(conversation: Conversation) -> Iterator[tuple[int, type[m.Message], list[bytes]]]:
-    """Yield each answered request's place, its answer's type, and what came up to the answer."""
+    """Yield each answered request's place, its answer's type, and the bytes before the answer."""
     steps = conversation.steps
     for place, step in enumerate(steps):
         if not isinstance(step, Sent) or not isinstance(step.message, m.Request):

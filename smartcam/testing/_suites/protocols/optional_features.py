@@ -1,4 +1,4 @@
-"""Checks of what not every camera can do: it does, or an error says so and the session goes on."""
+"""Checks of optional features: they work, or raise an error and the session continues."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's cloc
 
 
 class OptionalFeatureChecks(Parameters):
-    """The checks of optional abilities: each works, or an error says so and the session lasts."""
+    """The checks of optional features: each works, or raises an error and the session goes on."""
 
     @in_a_loop
     async def test_start_and_stop(self, camera_kind: CameraKind) -> None:
@@ -87,7 +87,7 @@ class OptionalFeatureChecks(Parameters):
     async def test_input_that_does_not_fit_is_refused_where_there_are_codes(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the input is refused, and that nothing of it is left in the camera."""
+        """Check that the input is refused, and that the camera keeps no part of it."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.input_data and camera.capabilities.result_codes:
                 needs(camera_kind, ECHO)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class Parameters(SaysWhatWasExpected):
-    """Base of the suites: what an author gives.
+    """Base of the suites: the values that an author gives.
 
     Attributes:
-        protocol: what the entry point gives.
+        protocol: the protocol of the entry point.
         conversations: bytes from the protocol's documents, at least one for each dialect.
         camera_kinds: cameras that speak it.
     """
@@ -31,7 +31,7 @@ class Parameters(SaysWhatWasExpected):
     camera_kinds: ClassVar[Sequence[CameraKind]] = ()
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """Run a check with each of what it has an argument for; pytest calls it.
+        """Run a check with each value of its argument; pytest calls it.
 
         Raises:
             pytest.UsageError: ``protocol`` is not valid.

@@ -1,4 +1,4 @@
-"""Checks of a session: made, left, lost, taken."""
+"""Checks of a session: opened, closed, lost, taken."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
 class SessionChecks(Parameters):
-    """A session: made, left, lost, taken."""
+    """A session: opened, closed, lost, taken."""
 
     @in_a_loop
     async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
-        """URL, application and status are known when ``connect()`` is through."""
+        """Check that URL, application and status are known after ``connect()``."""
         async with visiting(camera_kind) as (live, camera):
             assert camera.connected
             assert camera.url == live.url
@@ -86,7 +86,7 @@ class SessionChecks(Parameters):
     async def test_close_ends_the_session_and_leaves_the_camera_as_it_is(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the camera is told, and goes on running; closing twice is harmless."""
+        """Check that the camera gets a Disconnect, and runs on; closing twice is harmless."""
         async with camera_kind.open() as live:
             assert not live.has_session
             camera = await client(camera_kind, live)
@@ -105,7 +105,7 @@ class SessionChecks(Parameters):
 
     @in_a_loop
     async def test_lost_camera_is_told_and_comes_back(self, camera_kind: CameraKind) -> None:
-        """Disconnected, Reconnected, and triggers work again."""
+        """Check for Disconnected, then Reconnected, and that triggers work again."""
         async with visiting(camera_kind, reconnect=FAST, liveness_timeout=0.4) as (live, camera):
             events = camera.events()
             await number(camera)
@@ -148,7 +148,7 @@ class SessionChecks(Parameters):
     async def test_newcomer_takes_the_camera_or_stands_beside(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the newcomer is served as the kind of camera says."""
+        """Check that the newcomer is served or refused, by the kind of camera."""
         async with visiting(camera_kind) as (live, first), client(camera_kind, live) as second:
             assert await number(second) == 0
             if not camera_kind.exclusive:

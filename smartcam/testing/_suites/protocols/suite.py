@@ -18,12 +18,12 @@ class WireSuite(DialectChecks, MachineChecks):
 
 
 class CameraSuite(SessionChecks, TriggerChecks, OptionalFeatureChecks):
-    """The checks of the client in front of any camera.
+    """The checks of a client connected to any camera.
 
-    A subclass has ``camera_kinds``, emulated or real cameras. What a camera cannot do in its
-    dialect must be an UnsupportedError, and the session must go on.
+    A subclass has ``camera_kinds``, emulated or real cameras. A feature that a camera lacks in its
+    dialect must be an UnsupportedError, and the session must continue.
     """
 
 
 class ProtocolSuite(WireSuite, CameraSuite):
-    """Both: a subclass has ``protocol``, ``conversations`` and ``camera_kinds``."""
+    """Both suites: a subclass has ``protocol``, ``conversations`` and ``camera_kinds``."""

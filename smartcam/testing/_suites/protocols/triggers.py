@@ -1,4 +1,4 @@
-"""Checks of triggers: one outcome each, and whose each result is."""
+"""Checks of triggers: each has one outcome, and its own result."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class TriggerChecks(Parameters):
-    """Triggers: one outcome each, and whose each result is."""
+    """Triggers: each has one outcome, and its own result."""
 
     @in_a_loop
     async def test_trigger_gives_a_typed_result(self, camera_kind: CameraKind) -> None:
@@ -128,7 +128,7 @@ class TriggerChecks(Parameters):
     async def test_trigger_dropped_while_ours_is_under_way_is_an_overtrigger(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check an overtrigger while somebody else's trigger comes in between."""
+        """Check an overtrigger while the trigger of another program comes in between."""
         async with visiting(camera_kind, application=SLOW) as (live, camera):
             if not camera.capabilities.unasked_results:
                 return  # it knows no triggers but the client's
@@ -214,7 +214,7 @@ class TriggerChecks(Parameters):
 
     @in_a_loop
     async def test_switch_to_id_0_is_refused(self, camera_kind: CameraKind) -> None:
-        """Check that the client refuses id 0 where none may have it, and else the camera."""
+        """Check that the client refuses id 0 if no application may have it, else the camera."""
         async with visiting(camera_kind) as (_, camera):
             if not camera.capabilities.switch:
                 return
@@ -243,7 +243,7 @@ class TriggerChecks(Parameters):
     async def test_next_result_is_the_next_one_whoever_triggers(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that it is, and that a wait for a result that does not come ends in time."""
+        """Check the next result, and that a wait without a result ends in time."""
         async with visiting(camera_kind) as (live, camera):
             waiting = asyncio.create_task(camera.next_result(timeout=SOON_TIMEOUT))
             await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""Provide an example of each message, and list those that a client of any protocol needs."""
+"""Provide an example of each message, and list the messages that every client needs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NEEDED: tuple[type[m.Message], ...] = (
     m.StatusReport,
     m.ResultContainer,
 )
-"""Messages that no client can do without: a session, a sign of life, the status, results."""
+"""Messages that every client needs: a session, a sign of life, the status, results."""
 
 ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
     "switch": (m.SwitchApplication, m.SwitchAnswer),
@@ -49,7 +49,7 @@ ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
     "reset_errors": (m.ResetErrors, m.ResetErrorsAnswer),
     "read_image": (m.ReadImage, m.Image),
 }
-"""The messages that each of :class:`~smartcam.Capabilities` rests on."""
+"""The messages that each field of :class:`~smartcam.Capabilities` depends on."""
 
 _VALUES: Mapping[str, Any] = {
     "status": Status.RUNNING,
