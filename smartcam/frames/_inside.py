@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.gvcp import Register
     from smartcam.frames._gige.session import GigESession
     from smartcam.frames._group import GroupStatistics
+    from smartcam.frames._marks import COLOURS, Drawing, Kind, Role, stroke_width
     from smartcam.frames._pixels.layouts import Planes, YuvPairs
     from smartcam.frames._reader import FRAME_TIMEOUT, FrameTap
     from smartcam.frames._streaming.rate import RateStatistics
@@ -31,21 +32,25 @@ if TYPE_CHECKING:
     from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_video
 
 __all__ = [
+    "COLOURS",
     "FEATURE_TIMEOUT",
     "FRAME_TIMEOUT",
     "MAX_DRIFT",
     "MIN_DRIFT_DURATION",
     "ClockStatistics",
     "ControlChannel",
+    "Drawing",
     "FrameTap",
     "GenicamFeatures",
     "GigEDriver",
     "GigESession",
     "GroupStatistics",
+    "Kind",
     "PacketCounts",
     "Planes",
     "RateStatistics",
     "Register",
+    "Role",
     "TaskDriver",
     "YuvPairs",
     "changed",
@@ -61,6 +66,7 @@ __all__ = [
     "places",
     "read_bitmap",
     "read_stamp",
+    "stroke_width",
     "to_jpeg",
     "to_lossless_video",
     "with_pixels",
@@ -88,6 +94,7 @@ if not TYPE_CHECKING:
             "_gige.features": "GenicamFeatures",
             "_gige.gvcp": "Register",
             "_gige.session": "GigESession",
+            "_marks": "COLOURS Drawing Kind Role stroke_width",
             "_pixels.layouts": "Planes YuvPairs",
             "_reader": "FRAME_TIMEOUT FrameTap",
             "_synthetic": "read_stamp",

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.frames._inside import Drawing
     from smartcam.inspection._camera.client import SoftwareCamera
     from smartcam.inspection._camera.device import SoftwareDevice
     from smartcam.inspection._cell import (
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
         make_camera,
         software_mistakes,
     )
-    from smartcam.inspection._finding import Drawing, Finding, Inspection
+    from smartcam.inspection._finding import Finding, Inspection
     from smartcam.inspection._locate.find import LocatedPart
     from smartcam.inspection._locate.model import PartModel
     from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
@@ -77,7 +78,7 @@ if not TYPE_CHECKING:
             "_camera.client": "SoftwareCamera",
             "_camera.device": "SoftwareDevice",
             "_cell": "CellCamera Software load_cell make_camera software_mistakes",
-            "_finding": "Drawing Finding Inspection",
+            "_finding": "Finding Inspection",
             "_locate.find": "LocatedPart",
             "_locate.model": "PartModel",
             "_locate.troubles": "TeachingError TeachingTrouble",
@@ -86,5 +87,6 @@ if not TYPE_CHECKING:
             "_program": "Program register_tool",
             "_teaching": "Teaching",
             "_tool": "Tool ToolSettings ToolSetup View",
+            "smartcam.frames._inside": "Drawing",
         },
     )

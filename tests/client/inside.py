@@ -16,7 +16,7 @@ from smartcam._client.correlation import (
     _Owed,
 )
 from smartcam._client.dispatch import Dispatch
-from smartcam._client.doorbell import DirectFuture, Doorbell
+from smartcam._client.doorbell import DirectFuture, Doorbell, outlast
 from smartcam._client.handshake import establish
 from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, open_link, split
 from smartcam._client.requests import Requests

@@ -429,6 +429,31 @@ async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) ->
     assert await caller == "here"
 
 
+async def test_outcome_that_is_given_wakes_its_caller_at_once(bell: Doorbell) -> None:
+    heard, said = list[str](), asyncio.get_running_loop().create_future()
+    outcome: DirectFuture[str] = bell.outcome()
+    asking = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+
+    def give() -> None:
+        bell.give(outcome, "it")
+        said.set_result([*heard])
+
+    asyncio.get_running_loop().call_soon(give)
+    assert await said == ["it"]
+    await asking
+
+
+async def test_outcome_that_a_task_gives_wakes_its_caller_by_the_loop(bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: DirectFuture[str] = bell.outcome()
+    asking = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+    bell.give(outcome, "it")
+    assert heard == []
+    assert await asking == "it"
+
+
 async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
     heard = list[str]()
     outcome: DirectFuture[str] = bell.outcome()

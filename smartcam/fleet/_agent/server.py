@@ -407,7 +407,7 @@ class FleetServer(Server):
         teller = JudgedResults(
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
-            lambda result, judged: observers.picture(result, judged.frame),
+            lambda result, judged: observers.picture(result, judged.marked_frame),
             kept=0,
         )
         device.eyes.viewers.add(teller.take)

@@ -217,7 +217,10 @@ class Feed(Generic[NumberedT]):
         """Take what the agent said by itself; ``following`` is the number it gives next."""
         if epoch == self.epoch and self.expected and not self.lacking:
             for thing in things:
-                if thing.number > self.expected:
+                if thing.number == self.expected:
+                    self.expected = thing.next
+                    self._take(thing)
+                elif thing.number > self.expected:
                     self._hold(epoch, thing)
                 elif thing.next > self.expected:
                     self._have(thing)
@@ -269,7 +272,10 @@ class Feed(Generic[NumberedT]):
     def _go_on(self, following: int) -> None:
         """Take what was held as far as it fits; ask for what is missing before the rest."""
         self.lacking = False
-        self._announced = max(self._announced, following)
+        if following > self._announced:
+            self._announced = following
+        if not self._held and following <= self.expected:
+            return
         held = self._now_held()
         while held and held[0].number <= self.expected:
             thing = held.popleft()

@@ -5,8 +5,9 @@ is a JSON object with the field names of the public models; a field that is None
 viewers such as Foxglove take a field's type from the schema and know no "or null". The schemas
 keep to the types that Foxglove reads (``type`` is one word everywhere).
 
-Where pictures are recorded there is a fifth topic, ``/CAMERA/pictures``, whose messages are no JSON
-but Foxglove's of Protocol Buffers: see ``_pictures``.
+Where pictures are recorded there is a fifth topic, ``/CAMERA/pictures``, and for the marks on them
+``/CAMERA/annotations``, whose messages are no JSON but Foxglove's of Protocol Buffers: see
+``_pictures``.
 """
 
 from __future__ import annotations
@@ -556,3 +557,9 @@ PICTURES = "pictures"
 
 PICTURE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo")
 """Schemas of pictures, which are read by another distribution of smartcam."""
+
+ANNOTATIONS = "annotations"
+"""Last part of the topic of marks on pictures."""
+
+ANNOTATIONS_SCHEMA = "foxglove.ImageAnnotations"
+"""Schema of marks on a picture."""
