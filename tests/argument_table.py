@@ -295,6 +295,7 @@ EmulatedFleet.__init__  scenarios: list, host: text, transport: choice or None,
 Recorder.__init__  path: text, overwrite: flag, pictures: flag
 CellCamera.program  application: application or name
 Inspection.payload  byte_order: choice, sequence: seed or None
+PartModel.bands_at  scale: not judged
 PartModel.from_outline  path: text, pixels_per_mm: number, name: text, bright: flag,
     unit: choice or None, layers: names
 PartModel.predicted_sigma  noise: number or None

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration import CameraModel, Checkerboard, Transform, find_target
-from smartcam.calibration.simulation import HandEyeScene, hand_eye_scene, render
-from tests.calibration.inside import apply_homography, fit_homography
+from smartcam.calibration.simulation import hand_eye_scene, render
+from tests.calibration.inside import _scenes, apply_homography, fit_homography
 from tests.geometry.rigid import refused as refused
 
 if TYPE_CHECKING:
@@ -31,7 +31,9 @@ PAIRS_BOARD = Checkerboard(columns=9, rows=6, square=0.025)
 """Target of OpenCV's pairs."""
 
 
-def scene(setup: Setup, *, poses: int = 9, tilt: float = 30.0, seed: int = 5) -> HandEyeScene:
+def scene(
+    setup: Setup, *, poses: int = 9, tilt: float = 30.0, seed: int = 5
+) -> _scenes.HandEyeScene:
     """Return a robot with a camera; ``tilt`` of the outermost views in degrees."""
     return hand_eye_scene(
         SHEET,

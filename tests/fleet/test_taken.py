@@ -13,7 +13,6 @@ import smartcam
 from smartcam import Backoff
 from smartcam.exceptions import ConnectionTakenError, ResponseTimeoutError
 from smartcam.fleet import FleetCamera, MemoryBus
-from smartcam.fleet._agent.host import Host
 from smartcam.fleet._inside import Bus, Keys
 from smartcam.settings import Address, CameraSettings
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
@@ -25,7 +24,7 @@ QUICK = Backoff(initial=0.1, maximum=0.2, jitter=0.0)
 class Shop:
     """A camera, its agent, and a program on a bus."""
 
-    def __init__(self, box: NumberedCamera, host: Host, camera: FleetCamera[Any], end: Bus) -> None:
+    def __init__(self, box: NumberedCamera, host: Any, camera: FleetCamera[Any], end: Bus) -> None:
         self.box, self.host, self.camera, self.end = box, host, camera, end
 
     async def take(self) -> None:

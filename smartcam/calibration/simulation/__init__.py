@@ -8,10 +8,9 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.calibration.simulation._images import render
-    from smartcam.calibration.simulation._scenes import HandEyeScene, around, hand_eye_scene, view
+    from smartcam.calibration.simulation._scenes import around, hand_eye_scene, view
 
 __all__ = [
-    "HandEyeScene",
     "around",
     "hand_eye_scene",
     "render",
@@ -23,6 +22,6 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_images": "render",
-            "_scenes": "HandEyeScene around hand_eye_scene view",
+            "_scenes": "around hand_eye_scene view",
         },
     )
