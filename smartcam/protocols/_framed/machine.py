@@ -492,7 +492,8 @@ class Machine:
         if volley is not None:
             known, frames, size, owed, left = volley
             if known is messages and owed[0] == self._open and owed[1] == self._open_twice:
-                self._open, self._open_twice = left[0].copy(), left[1].copy()
+                self._open = left[0].copy() if left[0] else set()
+                self._open_twice = left[1].copy() if left[1] else set()
                 self._outbox += frames
                 counters = self.counters
                 counters.frames_sent += len(frames)
@@ -630,7 +631,8 @@ class Machine:
             return False
         if owed[0] != self._open or owed[1] != self._open_twice:
             return False
-        self._open, self._open_twice = left[0].copy(), left[1].copy()
+        self._open = left[0].copy() if left[0] else set()
+        self._open_twice = left[1].copy() if left[1] else set()
         events += before
         if make is not None:
             events.append(make(buffer[begin:end]))
