@@ -38,8 +38,8 @@ from smartcam.protocols import Transport
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Iterable
-    from typing import Self
+    from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable
+    from typing import Any, Self
 
     from smartcam.observers import Observer
     from smartcam.settings import Address, CameraSettings
@@ -223,8 +223,8 @@ class SmartCamera(Camera[ValueT]):
         async with self._lock.hold(timeout) as deadline:
             await self._commands.stop(deadline)
 
-    async def _query_application(self, timeout: float) -> int:
-        return await self._commands.query(self._connection.in_seconds(timeout))
+    def _query_application(self, timeout: float) -> Coroutine[Any, Any, int]:
+        return self._commands.query(self._connection.in_seconds(timeout))
 
     async def _query_status(self, timeout: float) -> Status:
         self._connection.require(m.GetStatus)

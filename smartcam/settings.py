@@ -249,6 +249,9 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         )
     if "://" in url:
         scheme = url.partition("://")[0].lower()
+        usual = cast("Protocol", PROTOCOLS.load("bvs"))
+        if scheme in usual.schemes:  # whatever else is installed, which takes long to list
+            return usual, url
         for protocol in known_protocols():
             if scheme in protocol.schemes:
                 return protocol, url

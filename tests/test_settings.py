@@ -233,6 +233,19 @@ def test_parse_address_plugin_with_our_own_name_is_left_out(
     assert parse_address("bvs://h") == known
 
 
+def test_parse_address_of_our_own_scheme_looks_at_nothing_that_is_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def looked() -> Iterator[None]:
+        raise AssertionError("looked")
+
+    PROTOCOLS.refresh()
+    monkeypatch.setattr("smartcam.registry.distributions", looked)
+    assert parse_address("bvs+udp://h").protocol == "bvs"
+    assert parse_address("h").protocol == "bvs"
+    monkeypatch.undo()
+
+
 def test_parse_address_again_goes_by_the_protocols_of_now(
     provide: Callable[[str, str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

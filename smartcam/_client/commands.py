@@ -137,6 +137,8 @@ class Commands:
             await requests.await_owed(m.SwitchAnswer, _QUERY, deadline)
         while True:
             answer = await requests.ask(_QUERY, m.QueryAnswer, deadline)
+            if requests.is_done(m.Query, answer):
+                return answer.application
             if not requests.is_busy(answer):
                 requests.check(m.Query, answer)
                 return answer.application

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
 
 from smartcam._user_code import ENDS_PROGRAM
 
@@ -39,10 +39,10 @@ class Doorbell:
     Cancellation: safe; the task is woken by the loop.
     """
 
-    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake", "due")
+    __slots__ = ("_asyncio_future_blocking", "_context", "_wake", "due", "loop")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
+        self.loop = loop
         # outcomes of the present delivery; None: outcomes wake by way of the loop
         self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
@@ -56,17 +56,17 @@ class Doorbell:
         if wake is None or context is None:
             return
         self._wake = None
-        if asyncio.current_task(self._loop) is None:
+        if asyncio.current_task(self.loop) is None:
             context.run(wake, self)
         else:
-            self._loop.call_soon(wake, self, context=context)
+            self.loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
         """Make the task go on as :meth:`ring` does, and after it the callers whose outcome came.
 
         The loop raises exceptions that end the program: a transport would take them for its own.
         """
-        wake, context, loop = self._wake, self._context, self._loop
+        wake, context, loop = self._wake, self._context, self.loop
         if wake is None or context is None or asyncio.current_task(loop) is not None:
             self.ring()
             return
@@ -120,7 +120,7 @@ class Doorbell:
 
     def get_loop(self) -> asyncio.AbstractEventLoop:
         """Return the loop that the task runs in."""
-        return self._loop
+        return self.loop
 
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
@@ -132,7 +132,7 @@ class Doorbell:
         """Wake the task, which is then cancelled."""
         wake, self._wake = self._wake, None
         if wake is not None:
-            self._loop.call_soon(wake, self, context=self._context)
+            self.loop.call_soon(wake, self, context=self._context)
         return False
 
     def result(self) -> None:
@@ -207,7 +207,7 @@ class DirectFuture(Generic[T]):
         """Make the task go on in the loop's next turn, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None:
-            self.get_loop().call_soon(wake, self, context=self._context)
+            self._bell.loop.call_soon(wake, self, context=self._context)
 
     # ------------------------------------------------------------------ for the task's machinery
 
@@ -220,7 +220,7 @@ class DirectFuture(Generic[T]):
 
     def get_loop(self) -> asyncio.AbstractEventLoop:
         """Return the loop that the task runs in."""
-        return self._bell.get_loop()
+        return self._bell.loop
 
     def add_done_callback(
         self, wake: Callable[[DirectFuture[T]], None], *, context: contextvars.Context
@@ -242,7 +242,7 @@ class DirectFuture(Generic[T]):
         error, self._error = self._error, None  # once raised, it refers to the waiting task
         if error is not None:
             raise error
-        return cast("T", self._value)
+        return self._value  # type: ignore[return-value]  # there is one
 
 
 Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"

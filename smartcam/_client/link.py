@@ -165,6 +165,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._closed = False
         self._closers: list[asyncio.Future[None]] = []  # futures of the waits for its end
         self._loss: BaseException | None = None
+        self._full = False  # the transport takes no more at present
         self._writable = asyncio.Event()
         self._writable.set()
         self._closing = False
@@ -204,7 +205,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def is_writable(self) -> bool:
         """Return True if the transport takes more at once, so that :meth:`drain` would not wait."""
-        return self._writable.is_set()
+        return not self._full
 
     async def drain(self) -> None:
         """Wait until the transport takes more; bounded by the caller's deadline."""
@@ -374,10 +375,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def pause_writing(self) -> None:
         """asyncio: the send buffer is full."""
+        self._full = True
         self._writable.clear()
 
     def resume_writing(self) -> None:
         """asyncio: the send buffer has room again."""
+        self._full = False
         self._writable.set()
 
     # ------------------------------------------------------------------ inside
@@ -467,6 +470,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._loss is None:
             self._loss = reason
             self._show_rest()
+        self._full = False
         self._writable.set()
         self._doorbell.ring()
 

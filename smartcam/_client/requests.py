@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
     from smartcam._client.doorbell import Waiter
+    from smartcam._client.link import Link
     from smartcam._client.waits import OwedAnswer, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
@@ -157,7 +158,10 @@ class Requests:
             ResponseTimeoutError: the answer did not come. It stays pending if it may still come; if
                 it is overdue, too, the link is given up.
         """
-        answer = await self.post(message, key, deadline)
+        if self.is_free(key):  # as post() does, without a coroutine for it
+            answer = self._send(message, key, deadline)
+        else:
+            answer = await self.post(message, key, deadline)
         try:
             return await self._take_answer(answer, deadline)
         except TimeoutError as exc:
@@ -178,9 +182,8 @@ class Requests:
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
         """
-        if self.is_free(key):
-            return self._send(message, key, deadline)
-        await self.await_turn(key, message, deadline)
+        if not self.is_free(key):
+            await self.await_turn(key, message, deadline)
         return self._send(message, key, deadline)  # at once, before the next request in line
 
     def is_free(self, key: type[m.Message] | int) -> bool:
@@ -207,18 +210,23 @@ class Requests:
             lock.release()
 
     def _send(self, message: m.Message, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
-        self._connection.require_link().send(message)
-        return self.expect(key, deadline)
+        link = self._connection.require_link()
+        link.send(message)
+        return self._expect(link, key, deadline)
 
     def expect(self, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
         It may come later: the link is given up only when ``request_timeout`` is over, too.
         """
-        link = self._connection.require_link()
+        return self._expect(self._connection.require_link(), key, deadline)
+
+    def _expect(self, link: Link, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
         patience = self._switch_patience if key is m.SwitchAnswer else self.patience
-        self._due[key] = max(deadline, link.loop.time() + patience)
-        return self._waits.next_answer(key, behind=link.deliveries)
+        now = link.loop.time()
+        due = now + patience
+        self._due[key] = max(deadline, due)
+        return self._waits.next_answer(key, link.loop, now, behind=link.deliveries)
 
     # ------------------------------------------------------------------ Query, and what it fences
 
@@ -259,6 +267,11 @@ class Requests:
         with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports it
             if self.ask_for_life(asyncio.get_running_loop().time()):
                 self._state.asked()
+
+    def is_done(self, request: type[m.Message], answer: m.Acknowledgement) -> bool:
+        """Return True if an answer says that all is well: :meth:`check` would not raise."""
+        link = self._connection.require_link()
+        return link.machine.dialect.code(answer.code, request).verdict is Verdict.DONE
 
     def is_busy(self, answer: m.Acknowledgement) -> bool:
         """Return True if an answer says that the camera was too busy."""

@@ -249,7 +249,8 @@ class Triggers:
                 await self._clear_overtriggered(deadline)
             elif features.fences and (
                 self._waits.owes(m.QueryAnswer)  # one can be open
-                or not (waited or self._requests.is_free(m.QueryAnswer))
+                if waited
+                else not self._requests.is_free(m.QueryAnswer)
             ):
                 await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
                 waited = True

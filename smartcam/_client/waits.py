@@ -134,23 +134,33 @@ class Waits:
 
     # ------------------------------------------------------------------ answers
 
-    def next_answer(self, key: type[m.Message] | int, *, behind: int = 0) -> OwedAnswer:
+    def next_answer(
+        self,
+        key: type[m.Message] | int,
+        loop: asyncio.AbstractEventLoop,
+        now: float,
+        *,
+        behind: int = 0,
+    ) -> OwedAnswer:
         """Register for the next answer of this kind; errors come as a result, never raised.
 
         Messages in the delivery ``behind`` of the link, or in an earlier one, are no answer: they
         came before the request was sent, and wait to be passed on.
         """
-        loop = asyncio.get_running_loop()
         future = OwedAnswer(loop)
         self.answers[key] = future
         self._behind[key] = behind
         if key is not m.SwitchAnswer:  # a switch takes long, which is no round trip
-            self._asked_at[key] = loop.time()
+            self._asked_at[key] = now
         return future
 
     def owed_answer(self, key: type[m.Message] | int) -> OwedAnswer:
         """Return the future of a pending answer (:meth:`owes`)."""
-        return self.answers.get(key) or self.next_answer(key)
+        owed = self.answers.get(key)
+        if owed is None:
+            loop = asyncio.get_running_loop()
+            owed = self.next_answer(key, loop, loop.time())
+        return owed
 
     def owes(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""

@@ -491,7 +491,8 @@ class Machine:
         if volley is not None:
             known, frames, size, pending, pending_after = volley
             if known is messages and pending[0] == self._open and pending[1] == self._open_twice:
-                self._open, self._open_twice = pending_after[0].copy(), pending_after[1].copy()
+                self._open = pending_after[0].copy() if pending_after[0] else set()
+                self._open_twice = pending_after[1].copy() if pending_after[1] else set()
                 self._outbox += frames
                 counters = self.counters
                 counters.frames_sent += len(frames)
@@ -631,7 +632,8 @@ class Machine:
             return False
         if pending[0] != self._open or pending[1] != self._open_twice:
             return False
-        self._open, self._open_twice = pending_after[0].copy(), pending_after[1].copy()
+        self._open = pending_after[0].copy() if pending_after[0] else set()
+        self._open_twice = pending_after[1].copy() if pending_after[1] else set()
         events += before
         if make is not None:
             events.append(make(buffer[begin:end]))

@@ -190,7 +190,8 @@ class Client:
         answer = request.answer
         if self.machine.state is State.CONNECTED and answer and not self.waits.owes(answer):
             self.machine.send(request)
-            self.awaited.append(self.waits.next_answer(answer, behind=self.deliveries))
+            owed = self.waits.next_answer(answer, LOOP, LOOP.time(), behind=self.deliveries)
+            self.awaited.append(owed)
             self.written += self.machine.data_to_send()
 
     def await_status(self, mask: int) -> None:
