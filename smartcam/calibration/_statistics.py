@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_MOVED_SPREAD: Final = 0.2
-"""Offsets are one move if each is at most this part of the move from their mean. A sheet pushed by 3
-to 50 mm before the last two to four of nine touches, or by 20 mm before the last three of fourteen
-views, was called good."""
+"""Offsets are one move if each is at most this part of the move from their mean. A sheet pushed by
+3 to 50 mm before the last two to four of nine touches, or by 20 mm before the last three of
+fourteen views, was called good."""
 
 
 class Noise(NamedTuple):
