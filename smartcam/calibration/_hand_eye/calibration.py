@@ -439,8 +439,9 @@ def _without_bad(
         kept = _bad_view(result, index, named[number], "is used all the same")
         remarks.setdefault(number, kept)
     errors, left_out = np.full((2, problem.count), np.nan)
-    unused = np.setdiff1d(np.arange(problem.count), used).tolist()
-    for number in unused:
+    unused = np.setdiff1d(np.arange(problem.count), used)
+    left: list[int] = unused.tolist()
+    for number in left:
         (off,) = result.point_errors([robot_poses[number]], [seen[number]])
         if np.isfinite(off).all():
             errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
@@ -455,7 +456,7 @@ def _without_bad(
         warnings=(
             *_size_remark(some, asked),
             *_remarks(some, result),
-            *_moved_remark(problem.taken(unused), result, [named[i] for i in unused]),
+            *_moved_remark(problem.taken(unused), result, [named[i] for i in left]),
             *remarks.values(),
         ),
     )

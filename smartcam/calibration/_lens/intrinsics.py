@@ -338,6 +338,7 @@ def _numbered_alike(
     used = [number for number, one in enumerate(found.views) if one.used]
     bad = sorted(set(range(len(views))) - set(used))
     numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
+    shaped = found
     for _ in range(MAX_ROUNDS):
         lens = fit_lens([numbered[i] for i in used], model, held)
         shaped = _summary(numbered, used, lens, bad, "free")
