@@ -61,6 +61,7 @@ from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, Sheet
 from smartcam.calibration._lens.suspicions import without_strays
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.validation import check_positive
+from smartcam.calibration._statistics import common_move
 from smartcam.calibration._views import as_list, as_views
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code, Remark, Transform
@@ -109,10 +110,6 @@ ROUNDING_ERROR_M = 1e-7
 
 MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
-
-MAX_MOVED_SPREAD = 0.25
-"""Poses that were left out agree on a move of camera or target if they are at most this part of it
-apart. A sheet pushed by 20 mm before the last three of fourteen views put points 22 mm off."""
 
 MIN_GOOD_POSES = 5
 """At least this many poses must be left after leaving out those that belong to other views."""
@@ -442,8 +439,9 @@ def _without_bad(
         kept = _bad_view(result, index, named[number], "is used all the same")
         remarks.setdefault(number, kept)
     errors, left_out = np.full((2, problem.count), np.nan)
-    unused = np.setdiff1d(np.arange(problem.count), used).tolist()
-    for number in unused:
+    unused = np.setdiff1d(np.arange(problem.count), used)
+    left: list[int] = unused.tolist()
+    for number in left:
         (off,) = result.point_errors([robot_poses[number]], [seen[number]])
         if np.isfinite(off).all():
             errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
@@ -458,7 +456,7 @@ def _without_bad(
         warnings=(
             *_size_remark(some, asked),
             *_remarks(some, result),
-            *_moved_remark(problem.taken(unused), result, [named[i] for i in unused]),
+            *_moved_remark(problem.taken(unused), result, [named[i] for i in left]),
             *remarks.values(),
         ),
     )
@@ -468,20 +466,17 @@ def _moved_remark(
     unused: Problem, result: HandEyeCalibration, named: Sequence[str]
 ) -> Iterator[Remark]:
     """Yield a remark if the poses that were left out agree on another place of camera or target."""
-    if unused.count < 2:
+    if not named:
         return
     between, seen = unused.robot.between, unused.poses.scaled(result.target_scale)
     camera, target = result.camera_pose.rigid, result.target_pose.rigid
-    arm = float(np.median(np.linalg.norm(seen.translation, axis=1)))
-    by_carrier = {"target": (target, between.inverse() @ (camera @ seen))}
-    by_carrier["camera"] = (camera, between @ (target @ seen.inverse()))
-    for what, (place, others) in by_carrier.items():
-        steps = place.before(others) * np.repeat([arm, 1.0], 3)
-        middle = np.median(steps, axis=0)
-        apart = np.linalg.norm(steps - middle, axis=1)
-        if float(apart.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle)):
+    arm = float(np.linalg.norm(seen.translation, axis=1).mean())
+    places = {"target": target.before(between.inverse() @ (camera @ seen))}
+    places["camera"] = camera.before(between @ (target @ seen.inverse()))
+    for what, steps in places.items():
+        if (move := common_move(steps * np.repeat([arm, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
-                f"the {what} seems to have moved by {1e3 * np.linalg.norm(middle[3:]):.3g} mm: "
+                f"the {what} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
                 f"{', '.join(named)} were left out, and agree on another place of it than all "
                 "others; which of both holds now, they cannot tell"
             )

@@ -50,7 +50,7 @@ from smartcam.calibration._plane.validation import (
     normalize,
     read_pairs,
 )
-from smartcam.calibration._statistics import Noise, normal_deviations
+from smartcam.calibration._statistics import Noise, common_move, normal_deviations
 from smartcam.calibration._verdict import Allowed, judge
 from smartcam.exceptions import ConfigurationError
 from smartcam.geometry import Code, Remark
@@ -78,10 +78,6 @@ same mistake (shown by simulation)."""
 MAX_TOUCH_SIGMAS = 4.0
 """A touch further than this many sigmas from the mean of its point's touches is remarked on: noise
 alone does it once in a thousand."""
-
-MAX_MOVED_SPREAD = 0.2
-"""Touches that were left out are off by the same move if they are at most this part of it apart. A
-sheet pushed by 3 to 50 mm before the last two to four of nine touches was called good."""
 
 MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
@@ -671,14 +667,10 @@ def _moved_remark(missed: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
     ``missed`` (N, 3): their distances from where the others say, metres. ``numbers``: of the
     points, from 1.
     """
-    if len(missed) < 2:
-        return
-    middle = missed.mean(axis=0)
-    apart = np.linalg.norm(missed - middle, axis=1)
-    if float(apart.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle)):
+    if (move := common_move(missed)) is not None:
         yield Code.POOR_FIT.remark(
             f"points {', '.join(map(str, numbers.tolist()))} are left out, and all lie "
-            f"{1e3 * float(np.linalg.norm(middle)):.3g} mm off to one side: the sheet or the tip "
+            f"{1e3 * float(np.linalg.norm(move)):.3g} mm off to one side: the sheet or the tip "
             "moved between the touches, and which of both holds now, they cannot tell"
         )
 

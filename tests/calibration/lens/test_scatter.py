@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import Code, calibrate_intrinsics, compare
+from smartcam.calibration import Checkerboard, Code, calibrate_intrinsics, compare
 from smartcam.calibration._inside import Lens, compare_lenses
-from tests.calibration.inside import lens_values, with_lens
+from tests.calibration.inside import half_turned, lens_values, with_lens
 from tests.calibration.lens.estimates import spread_poses
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, poses, seen
 
@@ -100,3 +100,21 @@ def test_halves_of_views_with_common_errors_give_the_same_lens() -> None:
     assert compared.same
     assert compared.ratio is not None
     assert compared.ratio < 2.0
+
+
+@pytest.mark.long
+@pytest.mark.judged
+def test_views_that_number_a_board_from_its_other_end_are_numbered_as_the_rest() -> None:
+    """A sheet that bends to one side shows its ends, whose numbers a picture does not show."""
+    board = Checkerboard(columns=8, rows=6, square=0.025)
+    across = (board.points[:, 0] - 0.0875) / 0.0875
+    bent = board.points + np.outer(6e-4 * across**3, [0.0, 0.0, 1.0])
+    views = seen(LEFT, poses(12), target=board, points=bent)
+    other = {1, 3, 4, 8, 9}
+    mixed = [half_turned(one) if number in other else one for number, one in enumerate(views)]
+    mixed = [dataclasses.replace(one, name=f"v{number}") for number, one in enumerate(mixed)]
+    found = calibrate_intrinsics(mixed)
+    assert found.sheet is not None
+    assert found.camera.matrix[0, 0] == pytest.approx(LEFT.matrix[0, 0], rel=2e-3)
+    assert found.rms < 2 * calibrate_intrinsics(views).rms
+    assert "v1, v3, v4, v8, v9 numbered it from its other end" in found.warnings[-1].text
