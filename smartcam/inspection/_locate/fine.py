@@ -92,7 +92,7 @@ class FineSettings(NamedTuple):
 
 
 class PartShape(NamedTuple):
-    """How a part differs from the taught one, besides its pose."""
+    """The pose of a part, and how else it differs from the taught one."""
 
     pose: PixelPose
     stretch: float = 0.0  # longer along the taught x and shorter along y, in parts
@@ -107,20 +107,20 @@ class PartShape(NamedTuple):
         return PartShape(pose, self.stretch + stretch, self.shear + shear, self.growth + growth)
 
     def offsets(self, segments: Segments) -> Array:
-        """Return how far each edge is off its place across, (N,), pixels of the picture."""
+        """Return the shifts of the edges across by the changes, (N,), pixels of the picture."""
         changes = _changes(segments, self.pose.scale)
         offsets: Array = changes @ [self.stretch, self.shear, self.growth]
         return offsets
 
 
 class Expected(NamedTuple):
-    """What is known of a part before it is seen: its scale, and how little it is changed."""
+    """The scale of a part, and how little it is changed, as known before it is seen."""
 
     scale: float
     sigmas: Array  # (4,), of size, stretch, shear (parts) and growth (pixels); infinite: unknown
 
     def off(self, shape: PartShape) -> Array:
-        """Return how far a shape is off what is expected, (4,)."""
+        """Return the differences (4,) of a shape from what is expected."""
         size = shape.pose.scale / self.scale - 1
         return np.array([size, shape.stretch, shape.shear, shape.growth])
 
@@ -172,7 +172,7 @@ def fit_pose(
 
 
 def _changes(segments: Segments, scale: float) -> Array:
-    """Return what stretch, shear and growth move each edge across by, (N, 3)."""
+    """Return the shifts (N, 3) of edges across by one of stretch, shear and growth each."""
     (x, y), (u, v) = segments.middles.T, segments.normals.T
     return np.column_stack([scale * (u * x - v * y), scale * (u * y + v * x), np.ones_like(x)])
 
