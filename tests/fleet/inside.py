@@ -8,7 +8,6 @@ from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
 from smartcam.fleet._agent.gate import Change, Gate, InLine
 from smartcam.fleet._agent.shared import Carrier
 from smartcam.fleet._agent.summary import _read
-from smartcam.fleet._agent.workers import Workers
 from smartcam.fleet._bus import wire, zenoh
 from smartcam.fleet._bus.address import CERTIFICATE_FILES, check_name, check_pattern
 from smartcam.fleet._bus.bus import BusQuestion, Data, Handle, MemoryEnd, Publisher, never
