@@ -21,7 +21,7 @@ def use(endpoint: str) -> None:
             answers = [*session.get(service, payload=request, timeout=7)]
             answer = json.loads(answers[0].ok.payload.to_string()) if answers else {"error": "?"}
             print(answer["error"] or answer["result"]["value"])
-            if not answer["error"]:  # everybody who subscribes gets the result, too
+            if not answer["error"]:  # all subscribers get the result, too
                 print(json.loads(results.recv().payload.to_string())["number"])
 
 
