@@ -1,4 +1,4 @@
-"""Settings of outlets, as a section of a fleet file or a file of their own has them."""
+"""Settings of outlets, from a section of a fleet file or a file of their own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _OutletFields(BaseModel):
 
 
 class Secret(_OutletFields):
-    """A secret, which never stands in a settings file itself: where it is instead."""
+    """The source of a secret, which is never in a settings file itself."""
 
     file: str | None = Field(None, min_length=1, description="path of a file that holds it alone")
     variable: str | None = Field(
@@ -56,7 +56,7 @@ class Secret(_OutletFields):
             folder: folder of a relative path.
 
         Raises:
-            ConfigurationError: the secret is not there; says where it was looked for.
+            ConfigurationError: the secret does not exist; the text names its place.
         """
         if self.variable is not None:
             found = os.environ.get(self.variable)
@@ -86,7 +86,7 @@ class OutletSettings(_OutletFields):
     size: Size = Field(1e9, description="of the entries that wait at most: 1 GB")
     full: Policy = Field(
         "drop_oldest",
-        description="beyond it, drop_oldest: the oldest make room; drop_newest: the newest are "
+        description="beyond the size, drop_oldest: the oldest are dropped; drop_newest: the newest "
         "refused. Both are counted, and the far end is told of the gap",
     )
     durable: bool = Field(
@@ -99,18 +99,18 @@ class OutletSettings(_OutletFields):
     )
 
     def chooses(self, camera: str) -> bool:
-        """Return True if a camera of this name is of this outlet."""
+        """Return True if this outlet is for a camera of this name."""
         return chosen(self.cameras, camera)
 
 
 Section = dict[str, dict[str, Any]]
-"""The section ``outlets:`` as it stands in a file: settings by the outlet's name."""
+"""The section ``outlets:`` of a file: settings by the outlet's name."""
 
 
 class OutletsFile(_OutletFields):
     """Outlets of one camera in a file of their own."""
 
-    outlets: Section = Field(description="by name; the name says the kind where kind: does not")
+    outlets: Section = Field(description="by name; without kind: the name is the kind")
 
     @classmethod
     def load(cls, path: str | Path) -> OutletsFile:
