@@ -1,8 +1,8 @@
-"""Pictures as Foxglove's messages of Protocol Buffers, with what a frame says beside the pixels.
+"""Pictures as Foxglove's messages of Protocol Buffers, with the other attributes of a frame.
 
 A viewer reads ``foxglove.RawImage``, ``CompressedImage`` or ``CompressedVideo``. Fields from 100 on
-are ours, and part of the schema in the file: the pixel format by its PFNC name, the times as the
-source had them, the number, what was lost. So the frame that is read is the frame that was written.
+are smartcam's, and part of the schema in the file: the PFNC name of the pixel format, the source's
+times, the number, the lost frames. So the frame that is read equals the frame that was written.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.frames import PixelFormat
 
 MAX_SIDE_PX: Final = 1 << 20
-"""Pixels along a side of a picture that is written, or read."""
+"""Largest number of pixels along a side of a picture that is written or read."""
 
 MAX_FIELDS: Final = 1000
-"""Largest number of fields of a message that is read; ours have fewer than 30."""
+"""Largest number of fields of a message that is read; smartcam's have fewer than 30."""
 
 RAW: Final = "foxglove.RawImage"
 COMPRESSED: Final = "foxglove.CompressedImage"
@@ -47,7 +47,7 @@ _ENCODINGS: Final = {
     "YUV422_8": "yuyv",
     "YUV422_8_UYVY": "uyvy",
 }
-"""Encodings that Foxglove knows, by our formats; all others have the name of the format itself."""
+"""Foxglove's encodings, by smartcam's formats; others have the name of the format itself."""
 
 _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": "h264"}
 
@@ -58,7 +58,7 @@ _TYPES: Final = {"double": 1, "uint64": 4, "fixed32": 7, "string": 9, "message":
 
 
 class WireField(NamedTuple):
-    """A field of a message: its number, its type, and of a message the type's name."""
+    """A field of a message: its number, its type, and for a message the type's name."""
 
     number: int
     type: str
@@ -85,8 +85,8 @@ _OURS: Final = {
     "stride": WireField(115, "fixed32"),
     "result_received": WireField(116, "double"),
 }
-"""Fields of ours: those of a frame, what the recorder left out before, number and arrival of the
-result that was made of the picture."""
+"""smartcam's fields: attributes of a frame, pictures that the recorder left out before it, number
+and arrival of its result."""
 
 SCHEMAS: Final[dict[str, dict[str, WireField]]] = {
     RAW: {
@@ -129,11 +129,11 @@ def schema_of(picture: RecordedPicture) -> str:
 
 
 def check_readable(frame: Frame) -> None:
-    """See that what is written of a frame can be read again.
+    """Check that the message of a frame can be read again.
 
     Raises:
-        FrameFormatError: the message cannot be, and the recording would end there for those who
-            read it.
+        FrameFormatError: the message could not be read, and neither could the rest of the
+            recording.
     """
     said, form = "", find_format(frame.format.name)
     if not (1 <= frame.width <= MAX_SIDE_PX and 1 <= frame.height <= MAX_SIDE_PX):
@@ -190,7 +190,7 @@ def picture_message(picture: RecordedPicture) -> bytes:
         encoding = _ENCODINGS.get(frame.format.name, frame.format.name)
         values |= {"width": frame.width, "height": frame.height, "step": frame.stride}
         values["encoding"] = encoding
-        if frame.format.name in _ENCODINGS:  # the last row may have come without its padding
+        if frame.format.name in _ENCODINGS:  # the last row may lack its padding
             padding = bytes(max(0, frame.stride * frame.height - data.nbytes))
     else:
         values["format"] = _COMPRESSIONS.get(frame.format.name, frame.format.name)
@@ -239,7 +239,7 @@ def _varint(value: int) -> bytes:
 
 @cache
 def schema_data(name: str) -> bytes:
-    """Return the schema of a message as MCAP has it: a FileDescriptorSet."""
+    """Return the schema of a message for MCAP: a FileDescriptorSet."""
     package, _, short = name.partition(".")
     stamp = _file(
         "google/protobuf/timestamp.proto",
@@ -280,7 +280,7 @@ def picture_of(schema: str, data: memoryview) -> RecordedPicture:
     """Return the picture of a message; its pixels are a view of ``data``.
 
     Raises:
-        ValueError: the message is not valid, or has not what its format asks for.
+        ValueError: the message is not valid, or lacks a field of its format.
     """
     values = _values(schema, data)
     said = _Values(values)
@@ -324,7 +324,7 @@ def _frame(said: _Values, found: PixelFormat) -> Frame:
 
 
 class _Values:
-    """The values of a message by the names of its fields, checked where they are asked for."""
+    """The values of a message by the names of its fields, checked on access."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
@@ -367,7 +367,7 @@ class _Values:
 
 
 def _values(schema: str, data: memoryview) -> dict[str, Any]:
-    """Return the values of the known fields, of the right types; others are passed over."""
+    """Return the values of the known fields, with checked types; ignore others."""
     known = {one.number: (name, one) for name, one in SCHEMAS[schema].items()}
     found: dict[str, Any] = {}
     for count, (number, wire, value) in enumerate(_pieces(data)):
@@ -416,7 +416,7 @@ def _pieces(data: memoryview) -> Iterator[tuple[int, int, Any]]:
 
 
 def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
-    """Return the number that begins at a place, and the place behind it."""
+    """Return the number at a place, and the place after it."""
     value = 0
     for shift in range(0, 64, 7):
         if place >= len(data):
