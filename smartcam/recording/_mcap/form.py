@@ -201,7 +201,7 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
     Args:
         kind: name of the kind of item, a key of ``KINDS``.
         item: item to write.
-        raw_from: for a result, number of the frame with its ``raw``, which is then not written
+        raw_from: number of the frame with the ``raw`` of a result, which is then not written
             again.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Tell a camera's health to ROS: its status, and its diagnostics.
+"""Convert a camera's health to ROS: its status, and its diagnostics.
 
-A node reports it for its camera, a bag for a recorded camera.
+A node publishes the health of its camera, a bag that of a recorded camera.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.INPUT_CONTAINER: (WARN, "Input Container: input data and inspections are out of step"),
     Status.OVERTRIGGERED: (WARN, "Overtriggered: a trigger was dropped"),
 }
-"""Bits of the status that are errors, the worst first: level and words."""
+"""Error bits of the status, the worst first: level and text."""
 
 
 class KnownState(NamedTuple):
@@ -55,7 +55,7 @@ class KnownState(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera[Any]) -> KnownState:
-        """Return the present state of a camera."""
+        """Return the current state of a camera."""
         if not camera.connected:
             return cls(camera.name, why=str(camera.trouble or ""))
         try:
@@ -66,7 +66,7 @@ class KnownState(NamedTuple):
 
     @property
     def bits(self) -> Status:
-        """The status of the present session; no bits if none was sent."""
+        """The status of the current session; no bits if none was sent."""
         return self.status if self.connected and self.status is not None else Status(0)
 
 
@@ -83,7 +83,7 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
 
     Args:
         known: what is known of the camera.
-        heard: whether there is a sign of the program that has the session with the camera.
+        heard: whether the program that has the session with the camera is alive.
     """
     if not known.connected:
         text = known.why[:MAX_ERROR_CHARACTERS] or "there was no session yet"
