@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on who may use the bus, and refuse what cannot work."""
+"""Read the section of a fleet file on access to the bus, and refuse wrong values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Mistake = tuple[tuple[str, ...], str]
 
 
 def access_of(said: Access | None, listen: Sequence[str]) -> Access | None:
-    """Return the access that holds: with TLS at least roles, or any certificate could command."""
+    """Return the effective access: with TLS roles, or any certificate could command."""
     tls = any(one.startswith("tls/") for one in listen)
     return said or ("roles" if tls else None)
 

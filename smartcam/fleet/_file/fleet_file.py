@@ -1,4 +1,4 @@
-"""Fleet files: which cameras an agent shares, and where; read from YAML."""
+"""Fleet files, read from YAML: the cameras that an agent shares, and its settings."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ _ENDPOINTS_SCHEMA = WithJsonSchema(
 
 
 class Retry(Fields):
-    """The delays before a camera that is not there, or was lost, is tried again."""
+    """The delays before each further attempt to connect to a camera."""
 
     initial: float = Field(0.1, ge=0, description="the first delay, seconds")
     factor: float = Field(2.0, ge=1, description="each delay is this times the last")
@@ -116,10 +116,10 @@ class Retry(Fields):
     attempts: int | None = Field(None, ge=1, description="tries until it is given up; none: never")
 
     def backoff(self) -> Backoff:
-        """Return the same for a client.
+        """Return the delays for a client.
 
         Raises:
-            ConfigurationError: the values do not go together.
+            ConfigurationError: the values do not fit together.
         """
         return Backoff(**self.model_dump())
 
@@ -137,7 +137,7 @@ def _or_bool(schema: dict[str, Any]) -> None:
 
 
 class Emulated(Fields):
-    """Emulated cameras, to try a plant on a desk."""
+    """Emulated cameras, to try a plant without hardware."""
 
     count: int = Field(1, ge=1, le=MAX_CAMERAS_PER_AGENT, description="number of cameras")
     scenario: str | None = Field(
@@ -167,18 +167,18 @@ class FramesEntry(Fields):
     )
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Show all of it but a password, which is not for logs."""
+        """Yield all fields, without a password, which is not for logs."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" else value
 
     def source(self, folder: Path) -> FrameSource:
-        """Return the source of the frames; it is not open.
+        """Return the closed source of the frames.
 
         Args:
-            folder: folder that the fleet file is in.
+            folder: folder of the fleet file.
 
         Raises:
-            SmartCamError: the URL, or the lens, cannot work.
+            SmartCamError: the URL, or the lens, is not valid.
             OSError: the lens cannot be read.
         """
         from smartcam import frames
@@ -190,7 +190,7 @@ class FramesEntry(Fields):
         """Return the lens, None if the file names none.
 
         Raises:
-            CalibrationError: the file is no lens.
+            CalibrationError: the file has no lens.
             OSError: the file cannot be read.
         """
         if self.camera_info is None:
@@ -204,7 +204,7 @@ class FramesEntry(Fields):
         return read_cameras(path, "camera_info").cameras[0]
 
     def camera_info_url(self, folder: Path) -> str:
-        """Return the URL of ROS' ``camera_info``; empty if that is none of ROS' files."""
+        """Return the URL of ROS' ``camera_info``; empty if the file is not one of ROS."""
         if self.camera_info is None:
             return ""
         path = (folder / self.camera_info).absolute()
@@ -212,7 +212,7 @@ class FramesEntry(Fields):
 
 
 def _is_ours(path: Path) -> bool:
-    """Return True if a file is a calibration of smartcam's.
+    """Return True if a file is a calibration of smartcam.
 
     Raises:
         OSError: the file cannot be read.
@@ -222,7 +222,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _frames(given: object) -> object:
-    """Take a URL alone for a mapping with nothing else in it."""
+    """Convert a URL alone to a mapping."""
     return {"url": given} if isinstance(given, str) else given
 
 
@@ -231,7 +231,7 @@ def _or_url(schema: dict[str, Any]) -> None:
 
 
 _SOURCES = ("url", "emulated", "software")
-"""The keys of an entry, one of which says where the camera is."""
+"""The keys of an entry, one of which has the camera's source."""
 
 
 class CameraEntry(Fields):
@@ -297,7 +297,7 @@ class CameraEntry(Fields):
         return self
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Show all of it but a password, which is not for logs."""
+        """Yield all fields, without a password, which is not for logs."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" and isinstance(value, str) else value
 
@@ -306,11 +306,11 @@ class CameraEntry(Fields):
 
         Args:
             name: name of the camera in the fleet.
-            url: where the camera is.
-            restore: value of ``restore`` where the entry has none.
+            url: address of the camera.
+            restore: value of ``restore`` if the entry has none.
 
         Raises:
-            ConfigurationError: an option cannot work.
+            ConfigurationError: an option is wrong.
         """
         own = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
         options: dict[str, Any] = self.model_dump(exclude=own)
@@ -322,7 +322,7 @@ class CameraEntry(Fields):
 
 
 class History(Fields):
-    """The results of each camera that are kept for programs which were cut off for a while."""
+    """The results of each camera that are kept for programs that were cut off for a while."""
 
     results: int = Field(20_000, ge=1, le=10_000_000, description="results")
     bytes: int = Field(1 << 24, ge=1, le=1 << 34, description="their bytes, about")
@@ -343,7 +343,7 @@ class Planned(NamedTuple):
 
 
 def _named(given: object) -> object:
-    """Refuse what YAML has not read as a text: it takes 12 and yes for something else."""
+    """Refuse names that YAML has not read as texts, such as 12 and yes."""
     if isinstance(given, dict):
         for name in cast("dict[object, object]", given):
             if not isinstance(name, str):
@@ -436,7 +436,7 @@ class FleetFile(Fields):
         """Return the cameras of the file.
 
         Raises:
-            ValueError: a name cannot be one, or comes twice; or there are too many.
+            ValueError: a name is not valid, or comes twice; or there are too many.
         """
         found: dict[str, Planned] = {}
         for name, entry in self.cameras.items():
@@ -445,7 +445,7 @@ class FleetFile(Fields):
 
 
 def _add(found: dict[str, Planned], name: str, entry: CameraEntry) -> None:
-    """Add the cameras of an entry to those that are there."""
+    """Add the cameras of an entry to the cameras so far."""
     for planned in _planned(name, entry):
         if planned.name in found:
             raise ValueError(f"there is a camera {planned.name} already")
@@ -498,7 +498,7 @@ def load_fleet(path: str | Path) -> FleetFile:
 
 
 def _no_file(url: str) -> ConfigurationError:
-    """Return the error for an address where a fleet file is wanted."""
+    """Return the error for an address instead of a fleet file."""
     shown = masked(url)
     if is_fleet(url):
         return ConfigurationError(
@@ -571,7 +571,7 @@ def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
 def _of_entry(
     name: str, entry: CameraEntry, taken: dict[tuple[str, int], str], folder: Path
 ) -> Iterator[Mistake]:
-    """Give what cannot work of a camera; ``taken``: whose each address is."""
+    """Yield the mistakes of a camera; ``taken``: cameras by their addresses."""
     if entry.url is not None:
         try:
             address = parse_address(entry.url, model=entry.model)
@@ -635,11 +635,11 @@ def _of_frames(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
 
 
 def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamera:
-    """Return the software camera that an entry says.
+    """Return the software camera of an entry.
 
     Raises:
-        ConfigurationError: something of it cannot work.
-        MissingExtraError: what it needs is not installed.
+        ConfigurationError: the entry is wrong.
+        MissingExtraError: a package that it needs is not installed.
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
         from smartcam.inspection import Software, make_camera

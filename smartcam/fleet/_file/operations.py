@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on how an agent is watched."""
+"""Read the section of a fleet file on health, metrics and the log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-
 
 
 class OperationsSection(Fields):
-    """The ways to watch an agent: health and numbers over HTTP, and its log."""
+    """The operation of an agent: health and metrics over HTTP, and its log."""
 
     listen: Place | None = Field(
         DEFAULT_PLACE,

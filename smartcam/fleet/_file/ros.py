@@ -89,10 +89,10 @@ class RosCamera(Fields):
         """Return the calibration, None if the file names none.
 
         Args:
-            folder: folder that the fleet file is in.
+            folder: folder of the fleet file.
 
         Raises:
-            CalibrationError: the file holds something else.
+            CalibrationError: the file has no calibration.
             OSError: the file cannot be read.
         """
         if self.calibration is None:
@@ -102,7 +102,7 @@ class RosCamera(Fields):
         return load_calibration(folder / self.calibration)
 
     def load_hand_eye(self, folder: Path) -> HandEyeCalibration | None:
-        """Return the hand-eye calibration, None if none is named; as ``load_calibration``."""
+        """Return the hand-eye calibration, None without one; like ``load_calibration``."""
         if self.hand_eye is None:
             return None
         from smartcam.calibration import HandEyeCalibration
@@ -113,7 +113,7 @@ class RosCamera(Fields):
         """Return the pose of ``calibrated_at``, None if the file names none.
 
         Raises:
-            CalibrationError: the numbers are no pose.
+            CalibrationError: the numbers are not a pose.
         """
         if self.calibrated_at is None:
             return None
@@ -124,10 +124,10 @@ class RosCamera(Fields):
 
 
 def node_names(cameras: list[str]) -> dict[str, str]:
-    """Return the name in the graph of each camera.
+    """Return the name of each camera in the graph.
 
     Raises:
-        ValueError: two have the same.
+        ValueError: two cameras have the same name.
     """
     found: dict[str, str] = {}
     for camera in cameras:

@@ -1,8 +1,8 @@
-"""An agent's numbers as Prometheus has them: families, and the text of them.
+"""Convert an agent's numbers to Prometheus' families and their text.
 
-The text of a thousand cameras takes a tenth of a second, and a thread that makes it would keep the
-event loop waiting for 5 ms at a time. So it is made in the event loop, half a millisecond at a
-time: a family of a few cameras after the other.
+The text of a thousand cameras takes a tenth of a second, and a thread for it would block the event
+loop for 5 ms at a time. So it is written in the event loop, half a millisecond at a time: one
+family of a few cameras after the other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
 
 MAX_LINES_PER_TURN = 80
-"""Largest number of lines that are made at a time."""
+"""Largest number of lines that are written at a time."""
 
 _SUMS = {
     "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),
@@ -74,7 +74,7 @@ async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes
             for begin in range(0, len(chosen), size):
                 family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
                 text = _text(client, family)
-                # what it means stands in front of the first ones
+                # the help text is before the first ones
                 parts.append(text.split(b"\n", 2)[2] if begin else text)
                 await asyncio.sleep(0)
     return b"".join(parts), client.CONTENT_TYPE_LATEST
@@ -91,7 +91,7 @@ def require_client() -> Any:
 
 
 class _One(NamedTuple):
-    """A family as a collector, from which prometheus-client makes a text."""
+    """A family as a collector, which prometheus-client converts to text."""
 
     family: Any
 
@@ -169,7 +169,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
 
 
 def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    """Give the accounts of outlets: what came is what was delivered, waits, or was dropped."""
+    """Yield the accounts of outlets: results that came were delivered, wait, or were dropped."""
     if not numbers.outlets:
         return
     labels = ["agent", "outlet"]
@@ -204,10 +204,10 @@ class _MetricKind(NamedTuple):
     """A family of numbers that each camera has.
 
     Attributes:
-        type: type of the family, as prometheus-client's classes are called.
+        type: type of the family, in the names of prometheus-client's classes.
         name: name of the family.
         text: help text of the family, for people.
-        labels: names of the labels beside ``agent`` and ``camera``.
+        labels: names of the labels besides ``agent`` and ``camera``.
         values: function for a camera's values: the labels, and the arguments of a number.
         lines: approximate number of lines for one camera.
         chosen: whether a camera has it.
@@ -321,7 +321,7 @@ _KINDS = (
         20,
     ),
 )
-"""Families of each camera's numbers; without ``each`` a summary takes the last one's place."""
+"""Families of each camera's numbers; without ``each`` a summary replaces the last one."""
 
 
 def _version() -> str:

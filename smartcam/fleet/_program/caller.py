@@ -504,7 +504,7 @@ class Caller:
             timeout: seconds.
 
         Raises:
-            SmartCamError: as :meth:`call`.
+            SmartCamError: like :meth:`call`.
 
         Cancellation: the agent is told.
         """
