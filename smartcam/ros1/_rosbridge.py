@@ -45,6 +45,7 @@ class RosbridgeNode(NamedNode):
     again after a loss. Then it advertises everything again, and publishes the last message of each
     latched topic again; other messages without a bridge are dropped and counted. A call under way
     is cancelled when the bridge is lost.
+
     The protocol has no answer to an advertisement: if a bridge does not know a type, because its
     machine does not have the package, only the bridge's log says so.
 

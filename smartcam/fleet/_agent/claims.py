@@ -2,6 +2,7 @@
 
 Two agents of one name see each other's starts. The earlier start keeps the name; the later agent
 gives up its cameras, and logs that.
+
 An agent announces a camera by a presence. Another agent with the same camera either refuses to
 start, or stands by: without a session, until that presence ends. If two agents share one camera
 after a split of the network, the camera decides, which serves the newcomer: the agent that has lost

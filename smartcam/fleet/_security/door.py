@@ -3,8 +3,10 @@
 The engine has no bounds: a silent connection stays for 10 s, and after each failed handshake no
 connection is accepted for 0.1 s. So the system drops requests for a further connection, by a filter
 on the listening socket:
+
 - from an address that has many half-open connections, whose handshake has not ended;
 - from all addresses while few file descriptors are left, which cameras and health need.
+
 Existing connections are not affected; TCP repeats a dropped request by itself. The filter cannot
 look at contents, since connections inherit it from the listening socket.
 """
@@ -37,8 +39,8 @@ Place = tuple[str, int]
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
-"""Seconds between two checks of the free descriptors, and the same if there are hardly fewer than at
-the last check. A new connection causes a check at once."""
+"""Seconds between two checks of the free descriptors, and the same if there are hardly fewer than
+at the last check. A new connection causes a check at once."""
 
 LOOK_WHO_COMES_EVERY = 0.25
 """Seconds between two checks of connections while some are half-open and no other comes."""

@@ -4,6 +4,7 @@ Each camera has four topics, ``/CAMERA/frames``, ``results``, ``events`` and ``e
 is a JSON object with the field names of the public models; a field that is None is left out, since
 viewers such as Foxglove take a field's type from the schema and do not support null. The schemas
 use only types that Foxglove supports (``type`` is always one word).
+
 With pictures there is a fifth topic, ``/CAMERA/pictures``, with Foxglove's messages of Protocol
 Buffers: see ``_pictures``.
 """

@@ -55,6 +55,7 @@ class JudgedPictures(Observer):
 
         Raises:
             FrameSourceError: the source is lost, or hangs.
+
         Cancellation: safe; earlier pictures are recorded.
         """
 

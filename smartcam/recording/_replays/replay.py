@@ -1,12 +1,14 @@
 """Emulate a recorded camera, which sends the recorded messages with the same timing.
 
 The device is the emulator's own. Its applications send the recorded containers, byte for byte:
+
 - The n-th trigger of an application gets the n-th recorded container of a trigger, after the same
   time; if the recorded trigger had no result it gets none, and if it was dropped it is dropped.
 - Containers without a trigger come by themselves: the first at its time after the start of the
   run, each other at its time after the one before. They wait while the camera is stopped or has
   another application; none is left out.
 - Overheat and System Error come and go at their times after the start of the first session.
+
 Only sequence numbers are not as recorded, if the client sets them, as a client does whose layout
 has an ``@sequence`` field. Such a client gets its own numbers in that field, whose place is known
 from the ``interpret_as`` in the recording.

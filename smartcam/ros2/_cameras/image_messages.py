@@ -51,6 +51,7 @@ ENCODINGS: Final[dict[str, str]] = {
     "YCbCr601_422_8_CbYCrY": "yuv422",
 }
 """Encodings of ROS by the names of the pixel formats that are sent unchanged.
+
 Pixels of 10, 12 and 14 bits are sent with 16 bits and the same values. Frames of other formats are
 converted to ``rgb8`` or unpacked first: see :func:`prepared`.
 """

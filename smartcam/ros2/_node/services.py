@@ -282,6 +282,7 @@ class RosClient(RosEnd):
             RosMessageError: the value is not a request of the type, or the reply cannot be read.
             ServiceTimeoutError: there is no server, or no reply came in time.
             ServiceCallError: the server refused, or was lost.
+
         Cancellation: the client stays usable; whether the call is carried out is unknown.
         """
         loop = asyncio.get_running_loop()
