@@ -84,27 +84,27 @@ class MqttSettings(OutletSettings):
     )
     user: str | None = Field(None, description="name to log in with")
     password: Secret | None = Field(
-        None, description="where the password is: {file: PATH} or {variable: NAME}"
+        None, description="source of the password: {file: PATH} or {variable: NAME}"
     )
     ca: str | None = Field(
         None, min_length=1, description="file of the broker's authority, relative to this file"
     )
     topic: Annotated[str, AfterValidator(_prefix)] = Field(
-        "smartcam", min_length=1, max_length=200, description="what every topic begins with"
+        "smartcam", min_length=1, max_length=200, description="first part of every topic"
     )
     client_id: str | None = Field(
-        None, min_length=1, max_length=100, description="default: smartcam-NAME, of the outlet"
+        None, min_length=1, max_length=100, description="client id; default: smartcam-NAME"
     )
     commands: bool = Field(
         False,
-        description="whoever may publish to TOPIC/command/# may trigger cameras and switch "
-        "applications; see to it that the broker says who that is",
+        description="whether clients that may publish to TOPIC/command/# may trigger cameras and "
+        "switch applications; limit these clients in the broker",
     )
     largest: int = Field(
         10_000_000,
         ge=1000,
         le=268_000_000,
-        description="bytes of a message with its topic; larger are refused",
+        description="largest number of bytes of a message with its topic",
     )
 
 

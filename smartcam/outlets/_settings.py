@@ -33,9 +33,9 @@ class _OutletFields(BaseModel):
 class Secret(_OutletFields):
     """The source of a secret, which is never in a settings file itself."""
 
-    file: str | None = Field(None, min_length=1, description="path of a file that holds it alone")
+    file: str | None = Field(None, min_length=1, description="path of a file with only the secret")
     variable: str | None = Field(
-        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable that holds it"
+        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable with it"
     )
 
     @model_validator(mode="before")
@@ -78,24 +78,26 @@ class OutletSettings(_OutletFields):
 
     kind: str | None = Field(None, description="the kind of outlet; default: its name")
     cameras: Patterns = Field(
-        ("**",), description="which cameras: names, * for one part of them, ** for any number"
+        ("**",), description="cameras: names, * for one part of a name, ** for any number"
     )
     spool: str = Field(
-        "outlets", min_length=1, description="folder of the spool, beside this file; made if new"
+        "outlets",
+        min_length=1,
+        description="folder of the spool, beside this file; made if missing",
     )
-    size: Size = Field(1e9, description="of the entries that wait at most: 1 GB")
+    size: Size = Field(1e9, description="largest size of the waiting entries, such as 1 GB")
     full: Policy = Field(
         "drop_oldest",
-        description="beyond the size, drop_oldest: the oldest are dropped; drop_newest: the newest "
-        "refused. Both are counted, and the far end is told of the gap",
+        description="beyond the size, drop_oldest: drop the oldest; drop_newest: refuse the "
+        "newest. Both are counted, and the gap is delivered",
     )
     durable: bool = Field(
         False,
-        description="each write reaches the disk before it counts, so that a loss of power takes "
-        "nothing either; slower",
+        description="whether each write waits for the disk, so that a power failure loses "
+        "nothing; slower",
     )
     timeout: float = Field(
-        30.0, gt=0, le=3600, description="seconds within which the far end takes a batch"
+        30.0, gt=0, le=3600, description="seconds of the timeout for delivering a batch"
     )
 
     def chooses(self, camera: str) -> bool:

@@ -68,7 +68,7 @@ _OWN = frozenset({"id", "record", "rowid"})
 class StoreSettings(OutletSettings):
     """The settings of a store of results."""
 
-    file: str = Field(min_length=1, description="the file, beside this one; made if new")
+    file: str = Field(min_length=1, description="the file, beside this one; made if missing")
     keep: Age | None = Field(None, description="age beyond which results are deleted: 90 d")
     keep_size: Size | None = Field(
         None, description="size of the file beyond which the oldest are deleted: 10 GB"
@@ -76,8 +76,8 @@ class StoreSettings(OutletSettings):
     pictures: str | None = Field(
         None,
         min_length=1,
-        description="place of a result's picture, beside the file, with {camera}, {application}, "
-        "{number} and {sequence} in it; it is referred to where it is there",
+        description="path of a result's picture, beside the file, with {camera}, {application}, "
+        "{number} and {sequence} in it; the row has it if the picture exists",
     )
 
 

@@ -132,7 +132,7 @@ class RosbridgeService:
 
     async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
         if busy:
-            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most")
+            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most")
         request = from_json(self.type.request, {} if said is None else said)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)

@@ -473,7 +473,7 @@ async def test_too_many_calls(
     node.serve("~/trigger", TRIGGER, never)
     calls = [asyncio.create_task(bridge.call("/line1/cam3/trigger")) for _ in range(4)]
     response = await calls[3]
-    assert "3 calls of it are under way, which is the most" in response["values"]["message"]
+    assert "3 calls of it are running, which is the most" in response["values"]["message"]
     await node.stop()
     for call in calls[:3]:
         with pytest.raises(Gone):

@@ -197,7 +197,9 @@ class Reloader:
             except BaseException:
                 self.last = ConfigurationError("the reload was cancelled; all stays as it was")
                 if self._applying is not None and not self._applying.done():
-                    self.last = ConfigurationError("nobody waited for the end of the reload")
+                    self.last = ConfigurationError(
+                        "the caller of the reload was cancelled before its end"
+                    )
                 raise
             else:
                 logger.info("the fleet file was read again: %s", changes)

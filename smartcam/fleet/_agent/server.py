@@ -323,25 +323,24 @@ class FleetServer(Server):
             warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
 
     async def reload(self, file: str | Path | FleetFile | None = None) -> FleetChanges:
-        """Read the fleet file again, and do as it says now; cameras that did not change go on.
+        """Read the fleet file again, and apply its changes; unchanged cameras are not touched.
 
-        Those keep their sessions, and what is under way ends as if nothing was. A camera that
-        changed is closed and opened again, one that is new is shared at once, whether it is
-        connected or not. Only ``cameras`` can be changed; another field wants a restart. Several
-        at a time are done one after the other.
+        Those keep their sessions and running calls. A changed camera is closed and opened again, a
+        new one is shared at once, connected or not. Only ``cameras`` can be changed; other fields
+        need a restart. Several calls at a time are carried out one after the other.
 
         Args:
-            file: another file, or what stands in it; None for the one that it was made with.
+            file: another file, or the contents of one; None for the server's own.
 
         Returns:
-            What has changed.
+            The changes.
 
         Raises:
-            ConfigurationError: the file is wrong, or changes what wants a restart; says where. All
-                stays as it was.
+            ConfigurationError: the file is wrong, or a change needs a restart; the text names the
+                place. Nothing was changed.
             ConnectionClosedError: the agent is not started, or it ends.
 
-        Cancellation: nothing has changed; or all of it is changed, also when nobody waits for it.
+        Cancellation: nothing is changed, or everything.
         """
         if self._agent is None:
             raise ConnectionClosedError("the agent is not started: there is nothing to reload")

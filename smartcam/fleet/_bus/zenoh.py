@@ -261,7 +261,9 @@ class ZenohEnd(ZenohSession, Bus):
         """
         size = len(payload)
         if self._sending + size > MAX_WAITING_BYTES:
-            logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
+            logger.warning(
+                "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
+            )
             return
         lane = hash(way) % SENDERS
         sender = self._senders.get(lane)

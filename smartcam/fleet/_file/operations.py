@@ -36,25 +36,25 @@ class OperationsSection(Fields):
 
     listen: Place | None = Field(
         DEFAULT_PLACE,
-        description="HOST:PORT at which /healthz, /readyz and /metrics are served, to all who ask; "
+        description="HOST:PORT of /healthz, /readyz and /metrics, which every client can read; "
         "null: nowhere; port 0 takes a free one",
     )
     names: tuple[Name, ...] = Field(
         (),
-        description="names by which others ask, where it listens on more than this computer's own "
-        "address: they are what a request may say in its Host, beside addresses and the computer's "
-        "own name; a web page that has its name point here says another one",
+        description="further names of this computer that a request may have in its Host, besides "
+        "addresses and its own name, if it listens on more than its local address; requests of a "
+        "foreign web page have another name",
     )
     latency: Literal["agent", "camera"] = Field(
         "agent",
-        description="owner of the histograms of latency: all cameras of the agent together, each "
-        "camera then has sum and count only; or each camera, which is 20 lines more for each",
+        description="histograms of latency: agent, one for all cameras, each of which has only sum "
+        "and count; or camera, one for each, with 20 lines more",
     )
     log: Literal["text", "json"] = Field(
         "text", description="form of smartcam serve's log: lines for people, or JSON"
     )
     level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="lowest level of JSON lines that are written"
+        "info", description="lowest level of written JSON lines"
     )
 
     @property

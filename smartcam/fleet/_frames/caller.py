@@ -83,7 +83,9 @@ class FrameCaller:
             size = int(said["width"]), int(said["height"])
             return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(f"{self.name}: what the agent says of it: {exc!r}") from exc
+            raise RemoteProtocolError(
+                f"{self.name}: the agent's format of frames is not valid: {exc!r}"
+            ) from exc
 
     async def one(
         self,
@@ -213,7 +215,9 @@ class FrameCaller:
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
-            raise RemoteProtocolError(f"{self.name}: what the agent says: {exc!r}") from exc
+            raise RemoteProtocolError(
+                f"{self.name}: the agent's reply is not valid: {exc!r}"
+            ) from exc
         finally:
             incoming.forget()
         return {**answer, "skipped": skipped}, frames
@@ -251,7 +255,9 @@ class FrameCaller:
             try:
                 found = None if said is None else CameraModel.from_data(said)
             except CalibrationError as exc:
-                raise RemoteProtocolError(f"{self.name}: the agent's lens: {exc}") from exc
+                raise RemoteProtocolError(
+                    f"{self.name}: the agent's lens is not valid: {exc}"
+                ) from exc
             self._lenses[key] = found
             if len(self._lenses) > MAX_LENSES:
                 del self._lenses[next(iter(self._lenses))]

@@ -52,7 +52,7 @@ class VideoUnits:
         try:
             numbers = [int(unit["number"]) for unit in answer["units"]]
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(f"what the agent says of H.264: {exc!r}") from exc
+            raise RemoteProtocolError(f"the agent's reply on H.264 is not valid: {exc!r}") from exc
         for place, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
             if self._decoder is None:
                 self.have = number

@@ -221,7 +221,7 @@ def from_fields(
             **_read_more(said, captured, source),
         }
     except (KeyError, TypeError, ValueError) as exc:
-        raise RemoteProtocolError(f"{source}: what the agent says of a frame: {exc!r}") from exc
+        raise RemoteProtocolError(f"{source}: the agent's frame is not valid: {exc!r}") from exc
     return FleetFrame(
         data=data,
         format=find_format(pixels),

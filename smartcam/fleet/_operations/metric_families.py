@@ -37,7 +37,7 @@ _SUMS = {
     ),
     "ignored_datagrams": ("smartcam_ignored_datagrams", "Datagrams that were dropped"),
     "unknown_ids": ("smartcam_unknown_messages", "Messages of an unknown kind"),
-    "unexpected_messages": ("smartcam_unexpected_messages", "Answers nobody waited for"),
+    "unexpected_messages": ("smartcam_unexpected_messages", "Answers that no call waited for"),
     "long_bodies": ("smartcam_long_messages", "Messages longer than documented"),
 }
 
@@ -48,7 +48,7 @@ _GAUGES = (
     ("smartcam_agent_reserved_cameras", "reserved", "Cameras that a program has reserved"),
     ("smartcam_agent_kept_results", "kept_results", "Results kept for programs that were cut off"),
     ("smartcam_agent_kept_results_bytes", "kept_bytes", "Their bytes"),
-    ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be said on the bus"),
+    ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be sent on the bus"),
 )
 
 

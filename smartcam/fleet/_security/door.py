@@ -203,15 +203,15 @@ class Door:
             self.shut = True
             self._set()
             logger.warning(
-                "! the port of the fleet takes nobody in: %d file descriptors are left, and %d are "
-                "for cameras and health",
+                "! the port of the fleet accepts no connection: %d file descriptors are left, %d "
+                "of them for cameras and health",
                 left,
                 reserve,
             )
         elif self.shut and left > reserve + reserve // 4:
             self.shut = False
             self._set()
-            logger.warning("= the port of the fleet takes programs in again")
+            logger.warning("= the port of the fleet accepts connections again")
 
     # ------------------------------------------------------------------ connections
 
@@ -265,8 +265,8 @@ class Door:
             return
         for host in sorted({*many} - self.blocked):
             logger.warning(
-                "! the port of the fleet takes nobody more in from %s: %d connections from there "
-                "have not come in yet",
+                "! the port of the fleet accepts no further connection from %s: %d from there are "
+                "half-open",
                 host,
                 coming[host],
             )

@@ -22,7 +22,7 @@ STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Largest number of characters of an error in a message; what is longer is cut."""
+"""Largest number of characters of an error in a message; a longer one is cut."""
 
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ``diagnostic_msgs/msg/DiagnosticStatus``."""
@@ -82,7 +82,7 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
     """Return the health of a camera.
 
     Args:
-        known: what is known of the camera.
+        known: known state of the camera.
         heard: whether the program that has the session with the camera is alive.
     """
     if not known.connected:
@@ -103,7 +103,7 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
 
 
 def status_fields(known: KnownState) -> dict[str, Any]:
-    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` but for its header."""
+    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` without its header."""
     connected, status, how = known.connected, known.bits, health(known)
     bad = Status.BUSY in status or Status.SYSTEM_ERROR in status
     application = known.application if connected else None

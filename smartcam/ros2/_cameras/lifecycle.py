@@ -151,7 +151,7 @@ class CameraLifecycle(Lifecycle):
                 why = str(exc)
             except SmartCamError as exc:
                 # a further attempt would stop the shared camera each time
-                text = "%s ! it stays %s until somebody configures it: %s"
+                text = "%s ! it stays %s until a program configures it: %s"
                 logger.error(text, self.name, self.state.label, exc)  # noqa: TRY400 - it is said
                 return
             else:

@@ -98,7 +98,7 @@ class PictureRequests:
         try:
             return await self._serve(request.timeout)
         except SmartCamError as exc:
-            logger.warning("%s ! a picture was asked for in vain: %s", self._node.full_name, exc)
+            logger.warning("%s ! a request for a picture failed: %s", self._node.full_name, exc)
             return {"error": error_text(exc)}
 
     async def _serve(self, asked: float) -> dict[str, Any]:

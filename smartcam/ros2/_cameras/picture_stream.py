@@ -128,7 +128,9 @@ class HeardPictures(Generic[Item]):
                     with contextlib.suppress(FrameTimeoutError):
                         await self._one(await anext(reader))
         except StopAsyncIteration:
-            self._tell("the source of pictures ended; it is tried again while somebody hears")
+            self._tell(
+                "the source of pictures ended; it is opened again while there is a subscriber"
+            )
         except SmartCamError as exc:
             self._tell(str(exc))
         except Exception:

@@ -210,7 +210,7 @@ class CameraPictures:
     async def _in_thread(self, work: Callable[[], Value]) -> Value:
         """Run a function in the thread for pictures; a started function is finished."""
         if self._thread is None:
-            raise RosError("these pictures are closed")
+            raise RosError("the publisher of pictures is closed")
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
 

@@ -106,4 +106,4 @@ class CameraStatusTopic:
         try:
             publisher.publish(publisher.type.new(header=header, **fields))
         except SmartCamError as exc:
-            logger.warning("%s ! its status was not said: %s", self._node.full_name, exc)
+            logger.warning("%s ! its status was not published: %s", self._node.full_name, exc)

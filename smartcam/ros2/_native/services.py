@@ -70,7 +70,7 @@ class ServiceCalls:
             self._under_way += not full
         if full:
             return self._reply(
-                self._refused(f"{MAX_CONCURRENT_CALLS} calls are under way, which is the most")
+                self._refused(f"{MAX_CONCURRENT_CALLS} calls are running, which is the most")
             )
         try:
             answered = self._future(executor=self._node.executor)
@@ -97,7 +97,7 @@ class ServiceCalls:
     def _done(self, task: asyncio.Task[None], answered: Any) -> None:
         self._tasks.discard(task)
         if not answered.done():  # the task was cancelled before it began
-            self._answer(answered, self._refused("the call was given up"))
+            self._answer(answered, self._refused("the call was cancelled"))
 
     def _answer(self, answered: Any, data: bytes | None) -> None:
         answered.set_result(data)
@@ -109,7 +109,7 @@ class ServiceCalls:
                 reply = await self._handler(self._kind.request.decode(data, whole=False))
             found: bytes | None = self._kind.response.encode(said(reply, {}))
         except asyncio.CancelledError:
-            self._answer(answered, self._refused("the call was given up"))
+            self._answer(answered, self._refused("the call was cancelled"))
             raise
         except TimeoutError as exc:
             given_up = f"no answer in {self._timeout:g} s"
@@ -232,7 +232,7 @@ class NativeClient:
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
             raise ServiceTimeoutError(
-                f"{self.name}: nobody serves {self.type.name} there within {timeout:g} s",
+                f"{self.name}: no server for {self.type.name} within {timeout:g} s",
                 service=self.name,
             ) from exc
 

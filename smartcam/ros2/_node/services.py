@@ -61,7 +61,7 @@ class RosService(RosEnd):
 
     Attributes:
         type: type of requests and replies.
-        calls: number of calls that came.
+        calls: number of received calls.
         failed: number of calls that were not carried out.
     """
 
@@ -104,7 +104,7 @@ class RosService(RosEnd):
         call = _RequestedCall(query, data, attachment)
         full = len(self._tasks) >= MAX_CONCURRENT_CALLS
         if self._closed:
-            self._refuse(call, RosError("it is not served any more"))
+            self._refuse(call, RosError("the service is closed"))
         elif len(data) > MAX_REQUEST_BYTES:
             why = f"a request of {len(data)} bytes: expected {MAX_REQUEST_BYTES} at most"
             self._refuse(call, RosMessageError(why))
@@ -113,7 +113,7 @@ class RosService(RosEnd):
         elif full:
             self._refuse(
                 call,
-                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most"),
+                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most"),
             )
         else:
             self._begin(call)
@@ -143,7 +143,7 @@ class RosService(RosEnd):
                 reply = await self._handler(request)
             data = self.type.response.encode(said(reply, {}))
         except asyncio.CancelledError:
-            self._refuse(call, RosError("the call was given up"))
+            self._refuse(call, RosError("the call was cancelled"))
             raise
         except TimeoutError as exc:
             why = exc if isinstance(exc, SmartCamError) else f"no answer in {self._timeout:g} s"
@@ -194,7 +194,7 @@ class RosService(RosEnd):
             self._stop_listening()
             waiting, self._waiting = self._waiting, collections.deque()
             for call in waiting:
-                self._refuse(call, RosError("it is not served any more"))
+                self._refuse(call, RosError("the service is closed"))
             for task in self._tasks:
                 task.cancel()
 
@@ -259,9 +259,9 @@ class RosClient(RosEnd):
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
             others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
-            what = f", but somebody serves {', '.join(others)}" if others else ""
+            what = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
-                f"{self.name}: nobody serves {self.type.name} {self.type.hash} there within "
+                f"{self.name}: no server for {self.type.name} {self.type.hash} within "
                 f"{timeout:g} s{what}",
                 service=self.name,
             ) from exc
@@ -321,7 +321,9 @@ class RosClient(RosEnd):
                 why = (
                     refused[0]
                     if refused
-                    else ("it ended without a reply; whether the call was carried out is unknown")
+                    else (
+                        "the call ended without a reply; whether it was carried out is unknown"
+                    )
                 )
                 reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
 
@@ -351,11 +353,11 @@ class RosClient(RosEnd):
         try:
             got = Attachment.decode(extra)
         except RosMessageError as exc:
-            logger.warning("%s ! a reply was left out: %s", self.name, exc)
+            logger.warning("%s ! a reply was ignored: %s", self.name, exc)
             return False
         if (got.number, got.gid) == (wanted.number, wanted.gid):
             return True
-        logger.warning("%s ! a reply to another call was left out: %s", self.name, got)
+        logger.warning("%s ! a reply to another call was ignored: %s", self.name, got)
         return False
 
     def close(self) -> None:

@@ -45,7 +45,7 @@ def said(message: object, fields: dict[str, Any]) -> object:
 
 
 MAX_SHORT_MESSAGES = 10_000
-"""Largest number of waiting short messages of a topic; of long ones its depth is the largest."""
+"""Largest number of waiting short messages of a topic; for long ones it is the topic's depth."""
 
 HEARTBEAT = 0.5
 """Seconds between two heartbeats of a latched topic (``rmw_publisher_data.cpp``)."""
@@ -331,7 +331,7 @@ class _FromTopic(NamedTuple):
 
 
 class RosSubscription(RosEnd, TopicReader[_FromTopic]):
-    """Subscription to a topic, made by :meth:`Node.subscribe` and read by ``async for``.
+    """Subscription to a topic, created by :meth:`Node.subscribe` and read by ``async for``.
 
     Attributes:
         attachment: number, time and publisher of the last message that was read.
