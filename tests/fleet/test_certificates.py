@@ -192,7 +192,7 @@ TO_ALL = "accepts every program without a certificate, and each may command"
         ("tcp/plant-server:7447", None, TO_ALL),
         ("tcp/0.0.0.0:7447", "anyone-may-command", ""),
         ("tcp/127.0.0.1:0", "roles", "asks for no certificate, so its programs have no role"),
-        ("tcp/127.0.0.1:0", "any-certificate", "any-certificate wants listen: tls/"),
+        ("tcp/127.0.0.1:0", "any-certificate", "any-certificate needs listen: tls/"),
         ("tcp/0.0.0.0:0", "any-certificate", TO_ALL),
     ],
 )
