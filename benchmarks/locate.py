@@ -59,7 +59,7 @@ def run(plan: Plan) -> Iterator[Comparison]:
         for k in range(3)
     ]
     part, nothing = picture_of((700.3, 500.6, 1.234)), picture_of()
-    _ = model.bands, model.coarse
+    _ = model.bands_at(1.0), model.coarse
     count = plan.operations(PICTURES, least=2)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)

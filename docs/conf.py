@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import importlib
 import inspect
 import itertools
@@ -791,6 +792,7 @@ def setup(app: Any) -> None:
     app.add_directive("generated", Generated)
     app.connect("source-read", _link_results)
     app.connect("autodoc-skip-member", _skip)
+    app.connect("autodoc-process-docstring", _tell_returned, priority=400)  # before napoleon
     app.connect("autodoc-process-signature", _plain_types)
     app.connect("autodoc-process-signature", _which_frame)
 
@@ -829,6 +831,34 @@ def _which_frame(
         return text and re.sub(r"(?<![\w.])Frame(?!\w)", f"~smartcam.{home}.Frame", text)
 
     return named(signature), named(gives)
+
+
+@functools.cache
+def _returned_classes() -> dict[str, list[str]]:
+    """Return the docstrings of classes that functions return and no module exports, in lines."""
+    exported: set[str] = set()
+    found: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "smartcam").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                text = ast.get_docstring(node) or ""
+                if "\nAttributes:\n" in text:
+                    found[node.name] = text.splitlines()
+            elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+                exported.update(ast.literal_eval(node.value) if path.stem != "_inside" else ())
+    return {name: lines for name, lines in found.items() if name not in exported}
+
+
+def _tell_returned(
+    _app: Any, _what: str, _name: str, member: Any, _options: Any, lines: list[str]
+) -> None:
+    """Add what a function returns, where that class has no place of its own in the reference."""
+    gives = getattr(getattr(member, "fget", member), "__annotations__", {}).get("return")
+    for name in re.findall(r"\w+", str(gives or "")):
+        if name in _returned_classes():
+            first, *rest = _returned_classes()[name]
+            lines += ["", f"``{name}``: {first}", *rest]
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:

@@ -54,6 +54,17 @@ def shown(value: object) -> str:
         return f"{type(value).__name__} that cannot be shown"
 
 
+def shown_time(seconds: float, *, coarse: bool = False) -> str:
+    """Return a time as an error's text shows it: ``2.5 s``, ``4.2 ms``.
+
+    Seconds have two digits behind the point at most, or with ``coarse`` always one. What these
+    cannot show is milliseconds.
+    """
+    if 0 < seconds < (0.05 if coarse else 0.01):
+        return f"{seconds * 1000:.3g} ms"
+    return f"{seconds:.1f} s" if coarse else f"{round(seconds, 2):g} s"
+
+
 def wrong_argument(what: str, expected: str, value: object, who: str = "") -> ConfigurationError:
     """Return the error for an argument that cannot work."""
     return ConfigurationError(
@@ -150,6 +161,8 @@ def check_seconds_or_none(
 
 def check_moment(value: object, what: str, who: str = "") -> float:
     """Return a moment of a clock: any finite number of seconds."""
+    if type(value) is float and math.isfinite(value):
+        return value
     number = _as_float(value)
     if number is None or not math.isfinite(number):
         raise wrong_argument(what, "a finite number of seconds", value, who)

@@ -110,6 +110,8 @@ MAX_DECLARED_AT_ONCE = 32
 
 _ONE = (1).to_bytes(8, sys.byteorder)
 
+_NOT_TAKEN = "%s ! what came from the bus was not taken"
+
 
 @dataclass(frozen=True)
 class BusLink:
@@ -277,7 +279,9 @@ class ZenohSession:
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
+        # bytes that came, and those of them that were taken; all threads count the first ones
         self._bytes = self._patient_bytes = 0
+        self._taken_bytes = self._taken_patient_bytes = 0
         self._woken = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
@@ -447,7 +451,7 @@ class ZenohSession:
     def _forget_waiting(self) -> None:
         self._waiting.clear()
         self._patient.clear()
-        self._bytes = self._patient_bytes = 0
+        self._taken_bytes, self._taken_patient_bytes = self._bytes, self._patient_bytes
 
     def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
         """Have something called in the event loop, in order; for any thread."""
@@ -480,35 +484,40 @@ class ZenohSession:
     def _drain(self) -> None:
         waiting, patient = self._waiting, self._patient
         for _ in range(TURN):
-            try:
-                call, arguments, size = waiting.popleft()
-            except IndexError:
+            if not waiting:
                 break
-            with self._lock:
-                self._bytes -= size
-            self._take(call, arguments)
-        if patient:
-            for _ in range(min(PATIENT_TURN, len(patient))):
-                call, arguments, size = patient.popleft()
-                with self._lock:
-                    self._patient_bytes -= size
-                self._take(call, arguments)
+            call, arguments, size = waiting.popleft()
+            self._taken_bytes += size
+            try:
+                call(*arguments)
+            except ENDS_PROGRAM:
+                self._loop.call_soon(self._drain)
+                raise
+            except BaseException:
+                logger.exception(_NOT_TAKEN, self._link.place)
+        for _ in range(min(PATIENT_TURN, len(patient))):
+            if not patient:
+                break
+            call, arguments, size = patient.popleft()
+            self._taken_patient_bytes += size
+            try:
+                call(*arguments)
+            except ENDS_PROGRAM:
+                self._loop.call_soon(self._drain)
+                raise
+            except BaseException:
+                logger.exception(_NOT_TAKEN, self._link.place)
         with self._lock:
             self._woken = bool(waiting or patient)
         if self._woken:
             self._loop.call_soon(self._drain)
 
-    def _take(self, call: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        try:
-            call(*arguments)
-        except ENDS_PROGRAM:
-            raise
-        except BaseException:
-            logger.exception("%s ! what came from the bus was not taken", self._link.place)
-
     def full(self, size: int, *, patient: bool = False) -> bool:
         """Return True if the loop is so far behind that repeatable messages are dropped."""
-        waiting = self._patient_bytes if patient else self._bytes
+        if patient:
+            waiting = self._patient_bytes - self._taken_patient_bytes
+        else:
+            waiting = self._bytes - self._taken_bytes
         if waiting + size <= MAX_WAITING_BYTES:
             return False
         if not self._told_dropped:
@@ -614,8 +623,10 @@ class _LoopBell:
 
     def ring(self) -> None:
         """Have the loop call; once, however often it is rung before."""
-        with contextlib.suppress(ValueError, OSError):  # closed: nobody hears any more
+        try:  # noqa: SIM105 - each message does this, and suppress() costs as much as the rest
             self._file.write(_ONE)
+        except (ValueError, OSError):  # closed: nobody hears any more
+            pass
 
     def _hear(self) -> None:
         self._file.read(8)
@@ -747,7 +758,8 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
     """
 
     def called(it: Any) -> None:
-        keep_thread()
+        if not _thread.known:
+            keep_thread()
         call(it)
 
     return engine().handlers.Callback(called, ended, indirect=False)

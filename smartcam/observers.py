@@ -157,6 +157,7 @@ class Observers:
         see_states: whether any looks at events.
         see_results: whether any looks at results.
         see_each: whether any looks at each result by itself.
+        see_pictures: whether any looks at the pictures of results.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
@@ -167,6 +168,7 @@ class Observers:
         self._on_state = self._overriding("on_state")
         self._on_result = tuple(self._looking_at("on_results", "on_result"))
         self._on_picture = self._overriding("on_picture")
+        self.see_pictures: bool = bool(self._on_picture)
         self.see_states: bool = bool(self._on_state)
         self.see_results: bool = bool(self._on_result)
         self.see_each: bool = not all(together for _, together in self._on_result)

@@ -46,12 +46,16 @@ class Registry:
         group: entry-point group, as in ``[project.entry-points."smartcam.interpreters"]``.
         builtins: name to ``module:attribute`` of those that smartcam brings.
         aliases: other accepted names of built-ins.
+
+    Attributes:
+        revision: number that changes with what is registered, or looked for anew.
     """
 
     def __init__(
         self, group: str, builtins: dict[str, str], aliases: dict[str, str] | None = None
     ) -> None:
         self.group = group
+        self.revision: int = 0
         self._builtins = builtins
         self._aliases = aliases or {}
         self._found: dict[str, list[EntryPoint]] | None = None
@@ -84,6 +88,7 @@ class Registry:
         if name in self and self.load(name) is not plugin:
             raise PluginError(f"{self.group}: {shown(name)} is there already", name=name)
         self._registered[name] = plugin
+        self.revision += 1
 
     def load(self, name: str) -> object:
         """Return the plug-in of a name, importing it at the first call.
@@ -101,6 +106,7 @@ class Registry:
         """Forget what was found and loaded, but not what was registered; the next call looks."""
         self._found = None
         self._loaded.clear()
+        self.revision += 1
 
     def _entry_points(self) -> dict[str, list[EntryPoint]]:
         if self._found is None:

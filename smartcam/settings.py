@@ -5,10 +5,11 @@ A wrong option is a :exc:`~smartcam.ConfigurationError` that names it.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, TypeVar, cast
-from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
+from urllib.parse import parse_qsl, quote, quote_plus, unquote, urlencode, urlsplit
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, InstanceOf, ValidationError
 
@@ -36,6 +37,9 @@ M = TypeVar("M", bound=BaseModel)
 
 PLAIN = BeforeValidator(plain)
 """Lets a strict type take numbers and texts of any class, such as numpy's."""
+
+MAX_NAME_CHARACTERS = 200
+"""Largest number of characters of a camera's name that a user gives."""
 
 Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
 Integer = Annotated[int, Field(strict=True), PLAIN]
@@ -72,12 +76,17 @@ class Address(NamedTuple):
     def url(self) -> str:
         """The address as a URL, with everything pinned that is known; never with a password."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        user = "".join(quote(value, safe="") + "@" for key, value in self.parameters if key == USER)
-        said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
-        query = urlencode(
-            [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
-            safe=",:",
-        )
+        user = query = ""
+        if self.parameters or self.quirks:
+            named = [quote(value, safe="") for key, value in self.parameters if key == USER]
+            user = "".join(f"{one}@" for one in named)
+            said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
+            query = urlencode(
+                [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
+                safe=",:",
+            )
+        elif self.dialect:
+            query = f"dialect={quote_plus(self.dialect, safe=',:')}"
         place = f"{user}{host}:{self.port}" if host else ""
         path = f"/{self.path}" if self.path else ""
         return f"{self.scheme}://{place}{path}{'?' if query else ''}{query}"
@@ -104,6 +113,10 @@ def is_software(url: str) -> bool:
     return check_text(url, "url").strip().lower().startswith(SOFTWARE_SCHEME)
 
 
+MAX_KNOWN_ADDRESSES = 256
+"""Largest number of URLs whose address is kept, so that a camera opened again reads none anew."""
+
+
 def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
 
@@ -117,6 +130,18 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     url = check_text(url, "camera address")
     if model is not None:
         model = check_text(model, "camera model", least=1, most=200)
+    if "@" in url:  # before it stands a password, which is kept nowhere else
+        return _read_address(url, model)
+    return _known_address(url, model, PROTOCOLS.revision)
+
+
+@functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
+def _known_address(url: str, model: str | None, revision: int) -> Address:
+    """Return what a URL says; ``revision`` is that of the protocols it is read with."""
+    return _read_address(url, model)
+
+
+def _read_address(url: str, model: str | None) -> Address:
     protocol, full = _pick_protocol(url.strip(), model)
     shown = masked(url)
     try:
@@ -300,13 +325,15 @@ class CameraSettings(BaseModel):
 
     address: Address = Field(description="address of the camera")
     name: Text = Field(
-        "", max_length=200, description="name in logs and results; default HOST:PORT"
+        "",
+        max_length=MAX_NAME_CHARACTERS,
+        description="name in logs and results; default HOST:PORT",
     )
     application: Integer | None = Field(
         None, ge=0, le=0xFFFFFFFF, description="application to have running and ready"
     )
     application_names: dict[Text, ApplicationId] = Field(
-        {},
+        default_factory=dict,
         max_length=1000,
         description="names of applications and their ids; a name stands wherever an id may",
     )
@@ -359,8 +386,12 @@ class CameraSettings(BaseModel):
         Raises:
             ConfigurationError: names the option, what came and what was expected.
         """
+        usual = address.path or f"{address.host}:{address.port}"
         try:
-            settings = cls(address=address, **with_ids(cast("dict[str, Any]", options)))
+            given = with_ids(cast("dict[str, Any]", options))
+            if "name" not in given and len(usual) <= MAX_NAME_CHARACTERS:
+                given = {**given, "name": usual}
+            settings = cls(address=address, **given)
         except ValidationError as exc:
             known = [*CameraOptions.__annotations__, *OtherOptions.__annotations__]
             raise ConfigurationError(f"connect: {validation_text(exc, known)}") from exc
@@ -368,8 +399,7 @@ class CameraSettings(BaseModel):
             raise ConfigurationError(f"connect: {exc!s:.200}") from exc
         if settings.name:
             return settings
-        name = address.path or f"{address.host}:{address.port}"
-        return settings.model_copy(update={"name": name})
+        return settings.model_copy(update={"name": usual})
 
 
 def with_ids(options: dict[str, Any]) -> dict[str, Any]:

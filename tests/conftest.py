@@ -124,9 +124,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark as ``long`` the cases of a ``sampled`` test that the short run leaves out.
 
     Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
-    values of the parameter that changes fastest take turns.
+    values of the parameter that changes fastest take turns. Of the others every second one is
+    ``judged``, and the rest ``widest``.
     """
     counts: Counter[tuple[Any, str]] = Counter()
+    left_out: Counter[tuple[Any, str]] = Counter()
     for item in items:
         marker = item.get_closest_marker("sampled")
         if marker is None or item.get_closest_marker("long"):
@@ -135,7 +137,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         row, place = divmod(counts[test], every)
         if (row + place) % every:
             item.add_marker(pytest.mark.long)
-            item.add_marker(pytest.mark.judged)
+            item.add_marker(pytest.mark.widest if left_out[test] % 2 else pytest.mark.judged)
+            left_out[test] += 1
         counts[test] += 1
 
 

@@ -34,11 +34,9 @@ ODD_MEASURED: dict[str, Any] = {
 
 RETURNED = frozenset(
     {
-        *("CalibrationVerdict", "Code", "ColourRegion", "DepthFrame", "Disparity", "Drift"),
-        *("HandEyeCalibration", "IntrinsicCalibration", "LensComparison", "NextView"),
-        *("PlaneCalibration", "ProjectionUncertainty", "RegionDepth", "Registration", "Remark"),
-        *("RobotSigmas", "Sheet", "SheetCalibration", "StereoCalibration", "StereoStatistics"),
-        *("TargetPose", "TargetView", "TimeOffset"),
+        *("Code", "DepthFrame", "Drift", "HandEyeCalibration", "IntrinsicCalibration"),
+        *("PlaneCalibration", "Remark", "RobotSigmas", "Sheet", "SheetCalibration"),
+        *("StereoCalibration", "TargetView"),
     }
 )
 """Classes that functions return, with fields that nobody gives odd values or that files hold."""

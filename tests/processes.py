@@ -21,9 +21,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+
+import pytest
 
 from smartcam._zenoh import with_ports
 
@@ -81,6 +83,34 @@ def printed_by(python: str) -> str:
         timeout=PATIENCE,
         env=plain,
     ).stdout
+
+
+@contextlib.contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Have files of this process refused to grow beyond ``size`` bytes."""
+    resource = pytest.importorskip("resource", reason="a limit of POSIX")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def network_namespace(program: str, package: str) -> list[str]:
+    """Return the command that runs another one in a network namespace of its own; skip without it.
+
+    Args:
+        program: one that the test needs beside.
+        package: package of Debian's that brings it.
+    """
+    for needed, brought in ((program, package), ("ip", "iproute2"), ("unshare", "util-linux")):
+        if shutil.which(needed) is None:
+            pytest.skip(f"needs {needed}: apt-get install {brought}")
+    for command in (["unshare", "-n"], ["unshare", "-r", "-n"]):
+        if subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0:  # noqa: S603
+            return command
+    pytest.skip("needs network namespaces: unshare -n is not allowed here")
 
 
 class Outcome(NamedTuple):

@@ -23,6 +23,7 @@ import smartcam.fleet
 import smartcam.frames
 import smartcam.sync
 from smartcam import Backoff, ConfigurationError
+from smartcam._arguments import shown_time
 from smartcam.conformance.camera import ConformanceOptions
 from smartcam.conformance.client import CommandClient, FunctionClient
 from smartcam.emulator import (
@@ -81,7 +82,7 @@ BASE: dict[str, Any] = {
 
 
 def test_every_public_argument_is_in_the_table() -> None:
-    elsewhere = {name for names in NOT_HERE.values() for name in names}
+    elsewhere = {name for names in NOT_HERE.values() for name in names.split()}
     calls = {call.name: set(call.arguments) for call in public_calls()}
     assert len(calls) > 300
     missing = {
@@ -492,3 +493,26 @@ async def test_odd_arguments_are_refused_everywhere_else() -> None:
             if said:
                 found[name] = said
     assert found == {}
+
+
+# ---------------------------------------------------------------------- values in texts
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fine", "coarse"),
+    [
+        (0.0, "0 s", "0.0 s"),
+        (0.0000421, "0.0421 ms", "0.0421 ms"),
+        (0.0042, "4.2 ms", "4.2 ms"),
+        (0.00999999, "10 ms", "10 ms"),
+        (0.01, "0.01 s", "10 ms"),
+        (0.0499, "0.05 s", "49.9 ms"),
+        (0.0999, "0.1 s", "0.1 s"),
+        (0.25, "0.25 s", "0.2 s"),
+        (2.0, "2 s", "2.0 s"),
+        (86_400.0, "86400 s", "86400.0 s"),
+    ],
+)
+def test_shown_time_never_says_0_for_what_is_more(seconds: float, fine: str, coarse: str) -> None:
+    assert shown_time(seconds) == fine
+    assert shown_time(seconds, coarse=True) == coarse

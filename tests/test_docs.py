@@ -25,6 +25,7 @@ import pytest
 
 from smartcam import exceptions
 from smartcam.camera import Camera
+from smartcam.depth import region_depth
 from smartcam.emulator import InSightQuirks, Quirks, faults
 from smartcam.models import Status
 from smartcam.protocols import BVS, FramedDialect, State
@@ -291,6 +292,13 @@ def test_documents_build_without_warnings(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_reference_tells_the_fields_of_a_returned_class_that_no_module_exports() -> None:
+    lines = ["Return the depth of a region."]
+    module_of("conf")._tell_returned(None, "function", "", region_depth, None, lines)
+    assert "``RegionDepth``: The depth of a region, and its errors." in lines
+    assert any(line.startswith("    sigma: standard deviation of ``median``") for line in lines)
+
+
 # ---------------------------------------------------------------------- promises, troubleshooting
 
 
@@ -311,7 +319,7 @@ def test_promises_name_tests_that_are_there() -> None:
 
 def test_promises_have_every_wait_with_its_default() -> None:
     page = (DOCS / "promises.md").read_text(encoding="utf-8")
-    table = page.partition("\n(waits)=\n")[2].partition("\nWaiting for another task")[0]
+    table = page.partition("\n(waits)=\n")[2].partition("\nThe `timeout` includes")[0]
     waits = [row for row in rows(table[table.index("\n|") + 1 :]) if len(row) == 3]
     named: set[str] = set()
     calls = [(call, *row) for calls, *row in waits for call in re.findall(r"\w+\([\w=]*\)", calls)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import runpy
 import struct
 import sys
@@ -94,6 +95,28 @@ def test_tangram_is_found_in_a_picture(capsys: pytest.CaptureFixture[str]) -> No
     assert names == {*TableScene().pieces}
     assert last.startswith("7 of 7 pieces, all within ")
     assert float(last.split()[-2]) < 0.03
+
+
+@pytest.mark.long
+def test_tower_is_built_by_pictures(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(ROOT / "examples" / "tower" / "tower.py"), run_name="__main__")
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [one.split()[0] for one in lines] == [
+        "block",
+        "top",
+        "a",
+        "block",
+        "top",
+        "a",
+        "block",
+        "top",
+    ]
+    found = re.fullmatch(
+        r"5 layers, 75 mm; all found within (.*) mm, (.*) degrees and (.*) mm of height", last
+    )
+    assert found is not None, last
+    beside, turned, higher = map(float, found.groups())
+    assert (beside < 0.05, turned < 0.05, higher < 0.2) == (True, True, True)
 
 
 # ---------------------------------------------------------------------- sorting

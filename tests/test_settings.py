@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -232,6 +233,17 @@ def test_parse_address_plugin_with_our_own_name_is_left_out(
     assert parse_address("bvs://h") == known
 
 
+def test_parse_address_again_goes_by_the_protocols_of_now(
+    provide: Callable[[str, str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provide("acme", "acme_camera:PROTOCOL")
+    assert parse_address("acme://h") == parse_address("acme://h")
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(tmp_path)])
+    PROTOCOLS.refresh()
+    with pytest.raises(ConfigurationError, match=r"unknown scheme 'acme'"):
+        parse_address("acme://h")
+
+
 # ---------------------------------------------------------------------- a login
 
 
@@ -440,3 +452,11 @@ def test_option_that_is_misspelt_says_which_is_meant(option: str, meant: str) ->
 
 def test_bare_host_speaks_bvs_over_tcp() -> None:
     assert smartcam.connect("camera").url == "bvs://camera:36701"
+
+
+def test_name_is_the_place_where_none_is_given_however_long_that_is() -> None:
+    host = "h" * 230
+    assert CameraSettings.make(f"bvs://{host}", None, {}).name == f"{host}:36701"
+    assert CameraSettings.make("bvs://h", None, {}).name == "h:36701"
+    assert CameraSettings.make("bvs://h", None, {"name": ""}).name == "h:36701"
+    assert CameraSettings.make("bvs://h", None, {"name": "left"}).name == "left"

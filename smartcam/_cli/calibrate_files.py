@@ -18,8 +18,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration import LensComparison
-    from smartcam.calibration._inside import MapFigures, StoredLenses
+    from smartcam.calibration._inside import LensComparison, MapFigures, StoredLenses
     from smartcam.calibration.formats import LengthUnit
 
 DIFFERENT = 7

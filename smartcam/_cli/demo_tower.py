@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam._cli.options import Options
-    from smartcam.depth import ColourRegion
-    from smartcam.depth._inside import TableSight, TowerTable, WoodenBlock
+    from smartcam.depth._inside import ColourRegion, TableSight, TowerTable, WoodenBlock
 
 LAYERS: Final = 5
 """Blocks that the robot puts onto the tower."""

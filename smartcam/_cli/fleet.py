@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
 
     from smartcam.camera import Camera
-    from smartcam.fleet import CameraSummary, Fleet, FleetEvent, FleetResults
+    from smartcam.fleet import Fleet, FleetEvent
+    from smartcam.fleet._inside import CameraSummary, FleetResults
     from smartcam.models import Result
     from smartcam.streams import Subscription
 

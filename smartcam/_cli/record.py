@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from smartcam.fleet import FleetCamera
     from smartcam.frames import FrameSource
     from smartcam.observers import Observer
-    from smartcam.recording import BagCounts, BagRecorder, FleetReplay, Recorder, Recording
-    from smartcam.recording._inside import JudgedPictures
+    from smartcam.recording import BagRecorder, FleetReplay, Recorder, Recording
+    from smartcam.recording._inside import BagCounts, JudgedPictures
 
 
 def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:

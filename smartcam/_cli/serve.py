@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
     from smartcam.exceptions import RecordingError
-    from smartcam.fleet import FleetChanges, FleetServer
+    from smartcam.fleet import FleetServer
+    from smartcam.fleet._inside import FleetChanges
     from smartcam.models import CameraEvent
     from smartcam.recording import FleetRecorder
 

@@ -31,15 +31,16 @@ LINGER: Final = 3.0
 @click.command(
     help="Teach an application of a software camera, on a page or by options: draw regions, "
     "choose tools, see what they find, set tolerances, save. CELL is a cell file, or a fleet file "
-    "with software cameras; APPLICATION is its number, a new one is added. The page tries the "
-    "tools at once on all PICTURES (files, or folders of them; without any, the camera's own), and "
-    "sets tolerances from those that show good parts. Save writes the file; its comments stay. The "
-    "page's address goes to stdout. With --set, --learn or --save there is no page: the tools are "
-    'changed, tried on the PICTURES, and printed. The page needs the extra "web".'
+    "with software cameras; APPLICATION is its number or name, a new number is added. The page "
+    "tries the tools at once on all PICTURES (files, or folders of them; without any, the camera's "
+    "own), and sets tolerances from those that show good parts. Save writes the file; its comments "
+    "stay. The page's address goes to stdout. With --set, --learn or --save there is no page: the "
+    "tools are changed, tried on the PICTURES, and printed. The page needs the extra "
+    '"web".'
 )
 @click.argument("cell")
 @click.argument("camera")
-@click.argument("which", metavar="APPLICATION", type=click.IntRange(1, 0xFFFFFFFF))
+@click.argument("which", metavar="APPLICATION")
 @click.argument("pictures", nargs=-1)
 @click.option(
     "--set",
@@ -61,7 +62,7 @@ LINGER: Final = 3.0
 async def teach(
     cell: str,
     camera: str,
-    which: int,
+    which: str,
     pictures: Sequence[str],
     changes: Sequence[str],
     learn: bool,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
     from smartcam._client.deadline import DeadlineTimer
+    from smartcam._client.doorbell import Doorbell, Outcome, PlainDoorbell, make_doorbell
     from smartcam._client.handshake import Session, attempt, names_of, remarks
     from smartcam._client.interpretation import (
         Interpretation,
@@ -34,9 +35,12 @@ __all__ = [
     "CameraState",
     "ClientCounters",
     "DeadlineTimer",
+    "Doorbell",
     "Interpretation",
     "Interpreted",
     "Listeners",
+    "Outcome",
+    "PlainDoorbell",
     "Reason",
     "Session",
     "SessionRefusedError",
@@ -46,6 +50,7 @@ __all__ = [
     "explain",
     "in_pixels",
     "localizations_of",
+    "make_doorbell",
     "names_of",
     "own_interpreter",
     "reason_for",
@@ -62,6 +67,7 @@ if not TYPE_CHECKING:
             "camera_state": "CameraState",
             "counters": "ClientCounters",
             "deadline": "DeadlineTimer",
+            "doorbell": "Doorbell Outcome PlainDoorbell make_doorbell",
             "handshake": "Session attempt names_of remarks",
             "interpretation": "Interpretation Interpreted in_pixels localizations_of "
             "own_interpreter without_poses",

@@ -9,6 +9,7 @@ import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from smartcam._arguments import shown_time
 from smartcam.exceptions import (
     CommandRejectedError,
     ConnectionLostError,
@@ -79,7 +80,7 @@ class Try:
         system = lost if isinstance(lost, OSError) else error
         if timeout and not isinstance(error, SmartCamError):
             what = f"{self.received} bytes, then silence" if self.received else "silence"
-            self.outcome = f"{what} for {waited:.1f} s"
+            self.outcome = f"{what} for {shown_time(waited, coarse=True)}"
         elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
             words = os.strerror(system.errno)  # plainer than "Connect call failed"
             self.outcome = str(system) if words.startswith("Unknown error") else words  # Winsock's

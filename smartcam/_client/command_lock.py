@@ -83,26 +83,23 @@ class CommandLock:
 
     # ------------------------------------------------------------------ for the supervisor
 
-    @contextlib.asynccontextmanager
-    async def session(self, *, restore: bool) -> AsyncGenerator[asyncio.TaskGroup]:
-        """Keep a session while the body runs, and until the jobs of the session have ended.
-
-        Gives the group of the session's tasks.
+    def begin_session(self, jobs: asyncio.TaskGroup, *, restore: bool) -> None:
+        """Begin a session; call :meth:`end_session` before its tasks are waited for.
 
         Args:
+            jobs: group of the session's tasks.
             restore: whether to restore the wanted application and run state.
         """
-        async with asyncio.TaskGroup() as jobs:
-            self._jobs = jobs
-            try:
-                owed, self._owed = self._owed, None
-                if owed is not None:
-                    self._start_job("going_back", self._go_back(owed))
-                elif restore:
-                    self._start_job("restoring", self._restore())
-                yield jobs
-            finally:
-                self._jobs = None
+        self._jobs = jobs
+        owed, self._owed = self._owed, None
+        if owed is not None:
+            self._start_job("going_back", self._go_back(owed))
+        elif restore:
+            self._start_job("restoring", self._restore())
+
+    def end_session(self) -> None:
+        """Begin no jobs until the next session."""
+        self._jobs = None
 
     async def vacated(self) -> None:
         """Wait until every command of the ended session has noticed that; bounded."""
@@ -268,6 +265,11 @@ class CommandLock:
                     self._failed = error
             finally:
                 self._state.want(wanted)
+
+    @property
+    def goes_back(self) -> bool:
+        """True while a job goes back: :meth:`settle` would wait."""
+        return bool(self._leaving)
 
     async def settle(self) -> None:
         """Wait until every job that goes back is done.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+import operator
 from typing import TYPE_CHECKING
 
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, Statistics
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 _WIRE = tuple(field.name for field in dataclasses.fields(Counters))
+_read = operator.attrgetter(*_WIRE)
 
 
 class Times:
@@ -120,12 +122,12 @@ class ClientCounters:
 
     def end(self) -> None:
         """Keep the counters of a link that is over."""
-        self._wire, self._open = self._wire_total(), None
+        if self._open is not None:
+            self._wire, self._open = self._wire_total(), None
 
     def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:
         """Return everything counted so far."""
-        total = self._wire_total()
-        wire = {name: getattr(total, name) for name in _WIRE}
+        wire = dict(zip(_WIRE, _read(self._wire_total()), strict=True))
         wire["ignored_datagrams"] = wire.pop("ignored_frames")
         return Statistics(
             received=self.received,
@@ -147,5 +149,4 @@ class ClientCounters:
     def _wire_total(self) -> Counters:
         if self._open is None:
             return self._wire
-        one, other = self._wire, self._open
-        return Counters(*(getattr(one, name) + getattr(other, name) for name in _WIRE))
+        return Counters(*map(operator.add, _read(self._wire), _read(self._open)))

@@ -76,7 +76,7 @@ class _Round(NamedTuple):
     """
 
     first: Event
-    began: Event
+    began: m.StatusReport
     ended: m.StatusReport
     last: Event
     application: int
@@ -179,7 +179,7 @@ class Dispatch:
         if (
             self._notes_events
             or listeners.events.references
-            or listeners.hears_statuses
+            or listeners.statuses.references
             or not self._waits.awaits_fences(2)
             or not state.stays(known.application, known.bits, known.endian)
             or container.application != known.application
@@ -189,6 +189,13 @@ class Dispatch:
         if owner is None:
             return False
         self._waits.expect_fences(0)
+        if listeners.hears_statuses:  # an agent
+            state.report(known.began, ())
+            listeners.offer_status(known.began.status, now)
+            self._results.on_own(container, owner, now, at)
+            state.report(known.ended, ())
+            listeners.offer_status(known.ended.status, now)
+            return True
         state.report_round(known.ended)
         self._results.on_own(container, owner, now, at)
         return True
@@ -206,8 +213,9 @@ class Dispatch:
         """
         if self._waits.fail(error):
             self._remarks.end()
-            self._listeners.fail(told(error))
-            self._results.fail(told(error))
+            if self._listeners.may_await:
+                self._listeners.fail(told(error))
+            self._results.fail(error)
 
     def finish(self, error: SmartCamError) -> None:
         """End the streams for good because of ``error``, quietly if we closed."""

@@ -255,8 +255,9 @@ async def attempt(
         logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
     if dialect.remark:
         logger.warning("%s ! %s", name, dialect.remark)
-    pinned = address._replace(dialect=dialect.name, quirks=dialect.quirks)
-    return Session(link, pinned, dialect, collector.version, collector.early)
+    if (address.dialect, address.quirks) != (dialect.name, dialect.quirks):
+        address = address._replace(dialect=dialect.name, quirks=dialect.quirks)
+    return Session(link, address, dialect, collector.version, collector.early)
 
 
 def tries_for(address: Address) -> list[tuple[Dialect, ...]]:

@@ -7,6 +7,7 @@ that it has turned into poses of the robot pass.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -126,7 +127,7 @@ class Interpretation:
                     )
                 self._by_application[application] = _way(resolve(one, lenient=lenient), own)
         else:
-            self._one = _way(resolve(spec, lenient=lenient), own)
+            self._one = _raw(own) if spec is None else _way(resolve(spec, lenient=lenient), own)
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
             if self._one is not None:
@@ -449,6 +450,12 @@ class _ApplicationReader:
     sequenced: bool
     numbering: Numbering | None
     calibrated: bool
+
+
+@functools.cache
+def _raw(own: bool) -> _ApplicationReader:
+    """Return the reader where nothing is said: bytes as they are, for each client the same."""
+    return _way(resolve(None), own)
 
 
 def _numbered(way: _ApplicationReader) -> str | None:

@@ -14,11 +14,12 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import shown_time
 from smartcam.exceptions import SmartCamError
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.link import Link
@@ -36,18 +37,13 @@ class KeepAlive:
     _timeout: float | None  # seconds that a camera has for a sign of life; None: no end
     _switch_timeout: float  # seconds that loading an application may take
 
-    @contextlib.contextmanager
-    def watched(self, link: Link) -> Generator[None]:
-        """Watch a link while the body runs."""
+    def watch(self, link: Link) -> Callable[[], None]:
+        """Watch a link; return the function that ends this."""
         if self._timeout is None:
-            yield
-            return
+            return _nothing
         watch = _Watch(self, link, self._timeout)
         watch.look()
-        try:
-            yield
-        finally:
-            watch.stop()
+        return watch.stop
 
     def ask(self, due: float) -> None:
         """Ask for a sign of life, to come until ``due`` (loop time)."""
@@ -63,6 +59,9 @@ class KeepAlive:
         loading = status is not None and status.loading
         slow = loading or any(map(self._waits.owes, (m.SwitchAnswer, m.TriggerAnswer)))
         return self._switch_timeout if slow else usual
+
+
+def _nothing() -> None: ...
 
 
 class _Watch:
@@ -99,7 +98,7 @@ class _Watch:
         else:
             end = self._asked_at + self._timeout
             if now >= end:
-                silence = f"no sign of life for {now - heard_at:.1f} s"
+                silence = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
                 self._link.give_up(TimeoutError(silence))
                 return
             # the camera may answer meanwhile, so look again when the next question is due

@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.doorbell import make_doorbell
+from smartcam._client.doorbell import make_doorbell, wake
 from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import RawFrame, TraceEntry
@@ -162,7 +162,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._doorbell = bell = make_doorbell(self.loop)  # of the task that receives
         self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
         self.wake_in_order: Callable[[], None] = bell.wake_in_order
-        self._closed: asyncio.Future[None] = self.loop.create_future()
+        self._closed = False
+        self._closers: list[asyncio.Future[None]] = []  # what those wait for who wait for its end
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
         self._writable.set()
@@ -248,7 +249,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """
         self._closing = True
         try:
-            if self._transport is None or self._closed.done():
+            if self._transport is None or self._closed:
                 return
             self._say_goodbye()
             if self._datagrams:
@@ -257,7 +258,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 self._resume()
                 with contextlib.suppress(OSError):  # it was reset just now
                     self._transport.write_eof()
-            await asyncio.wait({self._closed}, timeout=timeout)
+            await self.wait_closed(timeout)
         finally:
             self.abort()
 
@@ -286,7 +287,16 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     async def wait_closed(self, timeout: float) -> None:
         """Wait until the link is over, ``timeout`` seconds at most."""
-        await asyncio.wait({self._closed}, timeout=timeout)
+        if self._closed:
+            return
+        waiter: asyncio.Future[None] = self.loop.create_future()
+        self._closers.append(waiter)
+        timer = self.loop.call_later(timeout, wake, waiter)
+        try:
+            await waiter
+        finally:
+            timer.cancel()
+            self._closers.remove(waiter)
 
     @property
     def lost(self) -> bool:
@@ -358,8 +368,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._aside is not None:
             self._aside.close()
             self._aside = None
-        if not self._closed.done():
-            self._closed.set_result(None)
+        self._closed = True
+        for waiter in self._closers:
+            wake(waiter)
 
     def pause_writing(self) -> None:
         """asyncio: the send buffer is full."""

@@ -32,6 +32,7 @@ class Listeners:
         statuses: subscriptions to statuses.
         events: subscriptions to events.
         observed: True if some observer looks at results.
+        may_await: True if somebody asked for the next result since the last one.
     """
 
     def __init__(self, name: str, observers: Observers) -> None:
@@ -44,7 +45,7 @@ class Listeners:
         self._observers = observers
         # weak: a waiter that was made and never awaited must not count as a listener
         self._next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
-        self._may_await = False  # somebody asked for the next result since the last one
+        self.may_await: bool = False
 
     def streams(self) -> list[Queue[Any]]:
         """Return every subscription that is still referred to."""
@@ -54,7 +55,7 @@ class Listeners:
         """Return a future that gets the next result; it is let go when nobody holds it."""
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._next_results.add(future)
-        self._may_await = True
+        self.may_await = True
         return future
 
     @property
@@ -73,13 +74,13 @@ class Listeners:
 
     @property
     def _awaits_next(self) -> bool:
-        return self._may_await and any(not future.done() for future in self._next_results)
+        return self.may_await and any(not future.done() for future in self._next_results)
 
     @property
     def has_subscribers(self) -> bool:
         """True if a task beside the callers of commands may wait for what comes."""
         subscribed = self.results.references or self.statuses.references or self.events.references
-        return bool(subscribed) or self._may_await
+        return bool(subscribed) or self.may_await
 
     @property
     def hears_statuses(self) -> bool:
@@ -134,7 +135,7 @@ class Listeners:
             self._observers.result(result)
         if self.results.references:
             self.results.offer(result, now, len(result.raw))
-        if current and self._may_await:
+        if current and self.may_await:
             for future in self._take_next_results():
                 future.set_result(result)
 
@@ -166,13 +167,16 @@ class Listeners:
 
     def end(self, error: SmartCamError | None) -> None:
         """End the streams: nothing more will come, because of ``error`` if any."""
-        for stream in self.streams():
-            stream.end(error)
+        if self.results or self.statuses or self.events:
+            for stream in self.streams():
+                stream.end(error)
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
+        if not self.may_await:
+            return []
         waiting = [future for future in self._next_results if not future.done()]
         self._next_results.clear()
-        self._may_await = False
+        self.may_await = False
         return waiting
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import shown_time
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError
 from smartcam.protocols.messages import SwitchAnswer, TriggerAnswer
 
@@ -106,7 +107,8 @@ class Polling:
         if heard != self._heard or not state.owes_status or self._may_be_silent:
             self._heard, self._open_since = heard, now
         elif self._connection.features.ordered and now - self._open_since >= self._patience:
-            silence = f"no status within {now - self._open_since:.1f} s of being asked for"
+            open_for = shown_time(now - self._open_since, coarse=True)
+            silence = f"no status within {open_for} of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return
         if state.owes_status and now - state.status_asked_at >= REPEAT_AFTER:

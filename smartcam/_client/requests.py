@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from smartcam._client.deadline import DeadlineTimer
+from smartcam._client.doorbell import wake
 from smartcam._client.handshake import code_text
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -32,7 +33,8 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
-    from smartcam._client.waits import OwedAnswer, Waiter, Waits
+    from smartcam._client.doorbell import Waiter
+    from smartcam._client.waits import OwedAnswer, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -309,7 +311,7 @@ class Requests:
                 self._late = waiter
                 self._timer.set(deadline)
             else:
-                timer = link.loop.call_at(deadline, _wake, waiter)
+                timer = link.loop.call_at(deadline, wake, waiter)
             try:
                 await waiter
             finally:
@@ -328,7 +330,7 @@ class Requests:
 
     def _wake_late(self) -> None:
         if self._late is not None:
-            _wake(self._late)
+            wake(self._late)
 
     def _unsent(self, message: m.Message) -> ResponseTimeoutError:
         return self._timeout(message, "could not send", "in time: an earlier answer is owed")
@@ -339,8 +341,3 @@ class Requests:
             f"{self.name}: {what} {dialect.called(message)} {why}; status: {self._state.status}",
             message_id=dialect.message_id(message),
         )
-
-
-def _wake(waiter: Waiter) -> None:
-    if not waiter.done():
-        waiter.set_result(None)

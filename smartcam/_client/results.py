@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from smartcam._client.correlation import Correlation, Match, SentTrigger
 from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.interpretation import new_tuple
+from smartcam._client.waits import told
 from smartcam.exceptions import (
     CameraFaultError,
     InputContainerError,
@@ -124,7 +125,8 @@ class Results:
 
         What it would have given may come in the next session: it is owed.
         """
-        self.give_up(error)
+        if self._pending is not None:
+            self.give_up(told(error))
 
     def finish(self) -> None:
         """End for good: leave nothing in the event loop."""

@@ -7,6 +7,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import shown_time
 from smartcam.exceptions import LocalProtocolError, ResponseTimeoutError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -84,7 +85,7 @@ class StatusRequests:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited {round(waited, 2):g} s for {what}; "
+                f"{self._connection.name}: waited {shown_time(waited)} for {what}; "
                 f"status: {self.last}",
                 waited=waited,
             ) from exc

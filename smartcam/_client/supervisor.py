@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from smartcam._client.doorbell import outlast
 from smartcam._client.handshake import Session, establish
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
@@ -87,7 +88,9 @@ class Supervisor:
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._changed = asyncio.Event()
         self._closing = False
+        self._closed: ConnectionClosedError | None = None  # what close() tells everybody
         self._ended_by: SmartCamError | None = None  # why there is no more session, if not by us
+        self._finished = False  # the task is over, and everybody knows
         self._reading = False  # a link, whose end it notices by itself
         self.on_taken: Callable[[], None] | None = None
         self._times_taken = 0  # in a row
@@ -129,13 +132,12 @@ class Supervisor:
         Raises:
             ConnectFailedError: there was none.
         """
-        self._opened = asyncio.get_running_loop().create_future()
+        self._opened = opened = asyncio.get_running_loop().create_future()
         self._task = asyncio.create_task(
             self._run(), name=f"smartcam[{self._settings.address.host}].supervisor"
         )
         self._task.add_done_callback(self._end)
-        await asyncio.wait({self._opened})
-        error = self._opened.result()
+        error = await opened
         if error is not None:
             raise error
 
@@ -144,10 +146,11 @@ class Supervisor:
 
         Cancellation: the link is dropped at once.
         """
-        task, session, closed = self._task, self.session, self.closed_error()
+        task, session = self._task, self.session
+        self._closed = closed = self._closed or self.closed_error()
         self._closing = True
         try:
-            if self.connected:
+            if self.connected and self._lock.goes_back:
                 with contextlib.suppress(TimeoutError):  # another's command may be in between
                     async with asyncio.timeout(self._settings.switch_timeout):
                         await self._lock.settle()
@@ -159,9 +162,10 @@ class Supervisor:
             self._dispatch.fail(closed)
             self._drop()
             if task is not None:
-                await asyncio.wait({task})
-            self._dispatch.finish(self._ended_by or closed)
-            self._commands.end_session()
+                await outlast(task)
+            if not self._finished:
+                self._dispatch.finish(self._ended_by or closed)
+                self._commands.end_session()
 
     def abandon(self) -> bool:
         """Drop the link and end the task soon, from any thread: nobody has the client any more.
@@ -238,7 +242,7 @@ class Supervisor:
         error = self._reason(task)
         self._dispatch.fail(error)
         if self._closing:
-            error = self.closed_error()  # whatever it was before
+            error = self._closed or self.closed_error()  # whatever it was before
         else:
             self._ended_by = error
         if self.session is not None:
@@ -246,6 +250,7 @@ class Supervisor:
         self._counters.end()
         self._dispatch.finish(error)
         self._commands.end_session()
+        self._finished = True
         self._tell()
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(error)
@@ -314,12 +319,19 @@ class Supervisor:
         self._reading = True
         try:
             restore = settings.restore and self.session is not None
-            async with self._lock.session(restore=restore) as tasks:
-                self._adopt(session)
-                with self._keepalive.watched(link):
-                    name = f"smartcam[{self._name}].receive"
-                    error = await tasks.create_task(self._receive(link), name=name)
-                self._tell_of_loss(link, error)  # ends the jobs' waits too
+            async with asyncio.TaskGroup() as tasks:
+                try:
+                    self._lock.begin_session(tasks, restore=restore)
+                    self._adopt(session)
+                    stop_watching = self._keepalive.watch(link)
+                    try:
+                        name = f"smartcam[{self._name}].receive"
+                        error = await tasks.create_task(self._receive(link), name=name)
+                    finally:
+                        stop_watching()
+                    self._tell_of_loss(link, error)  # ends the jobs' waits too
+                finally:
+                    self._lock.end_session()
         finally:
             self._reading = False
             self._commands.end_session()

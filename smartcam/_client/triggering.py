@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import shown_time
 from smartcam._client.correlation import (
     EvidenceByAcknowledgement,
     EvidenceByAnswer,
@@ -351,7 +352,7 @@ class Triggers:
         came = f"{len(pending.results)} of {pending.wanted} results"
         return TriggerTimeoutError(
             f"{self._name}: {came if pending.results else 'no result'} within "
-            f"{round(waited, 2):g} s of the trigger; status: {self._status.last}"
+            f"{shown_time(waited)} of the trigger; status: {self._status.last}"
             f"{_what_is_missing(pending)}",
             waited=waited,
         )
@@ -450,7 +451,7 @@ class Triggers:
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self._name}: the camera did not wait for a trigger within "
-                    f"{round(waited, 2):g} s; status: {self._status.last}{free}",
+                    f"{shown_time(waited)}; status: {self._status.last}{free}",
                     waited=waited,
                 ) from exc
 
@@ -511,7 +512,7 @@ class Triggers:
             await self._status.insist(_is_not_overtriggered, now + grace)
             return
         raise OvertriggeredError(
-            f"{self._connection.name}: Overtriggered has stayed set for {round(grace, 2):g} s. As "
+            f"{self._connection.name}: Overtriggered has stayed set for {shown_time(grace)}. As "
             "long as it is, the camera cannot show that it drops a trigger, so none was sent. It "
             "may fall when the application is stopped and started"
         )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
+from smartcam._client.doorbell import wake
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import SmartCamError
 from smartcam.protocols import messages as m
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam._client.counters import ClientCounters
-    from smartcam._client.doorbell import DirectFuture
+    from smartcam._client.doorbell import Waiter
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
@@ -36,9 +37,6 @@ def told(error: ErrorT) -> ErrorT:
     return made
 
 
-Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"
-
-
 class OwedAnswer(asyncio.Future[Answer]):
     """An answer that the camera owes; it belongs to nobody who waits for it.
 
@@ -54,8 +52,7 @@ class OwedAnswer(asyncio.Future[Answer]):
         """Have the answer, or why there is none, and wake those who wait."""
         super().set_result(result)
         for waiter in self.waiters:
-            if not waiter.done():
-                waiter.set_result(None)
+            wake(waiter)
 
 
 @dataclass(slots=True, eq=False)
@@ -107,7 +104,9 @@ class Waits:
         """
         if self.end is not None:
             return False
-        self.end, error = error, told(error)
+        self.end = error
+        if self.answers or self.statuses:
+            error = told(error)
         for answer in self.answers.values():
             answer.set_result(error)
         self.answers.clear()

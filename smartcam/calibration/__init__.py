@@ -36,12 +36,11 @@ if TYPE_CHECKING:
     )
     from smartcam.calibration._hand_eye.equations import RobotSigmas
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
-    from smartcam.calibration._hand_eye.time_offset import TimeOffset, estimate_time_offset
-    from smartcam.calibration._lens.comparison import LensComparison, compare
-    from smartcam.calibration._lens.guide import NextView, suggest_views
+    from smartcam.calibration._hand_eye.time_offset import estimate_time_offset
+    from smartcam.calibration._lens.comparison import compare
+    from smartcam.calibration._lens.guide import suggest_views
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-    from smartcam.calibration._lens.poses import TargetPose, locate
-    from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
+    from smartcam.calibration._lens.poses import locate
     from smartcam.calibration._plane.calibration import Drift, PlaneCalibration, fit_plane
     from smartcam.calibration._plane.moving_camera import MovingCamera
     from smartcam.calibration._plane.tool import fit_tool_tip
@@ -62,12 +61,10 @@ if TYPE_CHECKING:
         target_from_data,
         target_to_data,
     )
-    from smartcam.calibration._verdict import CalibrationVerdict
     from smartcam.calibration._views import TargetView
     from smartcam.geometry import CameraModel, Code, PlacePattern, PoseHistory, Remark, Transform
 
 __all__ = [
-    "CalibrationVerdict",
     "CameraModel",
     "Chain",
     "Charuco",
@@ -79,23 +76,18 @@ __all__ = [
     "HandEyeCalibration",
     "Height",
     "IntrinsicCalibration",
-    "LensComparison",
     "MarkerGrid",
     "MovingCamera",
-    "NextView",
     "PlacePattern",
     "PlaneCalibration",
     "PlaneProjection",
     "PoseHistory",
-    "ProjectionUncertainty",
     "Remark",
     "RobotSigmas",
     "Sheet",
     "SheetCalibration",
     "StereoCalibration",
-    "TargetPose",
     "TargetView",
-    "TimeOffset",
     "ToolOffset",
     "Transform",
     "calibrate_hand_eye",
@@ -134,12 +126,11 @@ if not TYPE_CHECKING:
             "_hand_eye.calibration": "calibrate_hand_eye calibrate_hand_eye_from_poses",
             "_hand_eye.equations": "RobotSigmas",
             "_hand_eye.result": "HandEyeCalibration",
-            "_hand_eye.time_offset": "TimeOffset estimate_time_offset",
-            "_lens.comparison": "LensComparison compare",
-            "_lens.guide": "NextView suggest_views",
+            "_hand_eye.time_offset": "estimate_time_offset",
+            "_lens.comparison": "compare",
+            "_lens.guide": "suggest_views",
             "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
-            "_lens.poses": "TargetPose locate",
-            "_lens.uncertainty": "ProjectionUncertainty",
+            "_lens.poses": "locate",
             "_plane.calibration": "Drift PlaneCalibration fit_plane",
             "_plane.moving_camera": "MovingCamera",
             "_plane.tool": "fit_tool_tip",
@@ -150,7 +141,6 @@ if not TYPE_CHECKING:
             "_stereo.calibration": "StereoCalibration calibrate_stereo",
             "_targets": "Charuco Checkerboard CircleGrid MarkerGrid target_from_data "
             "target_to_data",
-            "_verdict": "CalibrationVerdict",
             "_views": "TargetView",
             "smartcam.geometry": "CameraModel Code PlacePattern PoseHistory Remark Transform",
         },

@@ -32,9 +32,10 @@ def fit_homography(flat: Array, pixels: Array) -> Array | None:
 
 
 def apply_homography(matrix: Array, points: Array) -> Array:
-    """Map points (N, 2) to (N, 2) or (N, 3)."""
+    """Map points (N, 2) to (N, 2) or (N, 3); infinite or NaN for one on the horizon."""
     mapped = points @ matrix[:, :2].T + matrix[:, 2]
-    places: Array = mapped[:, :-1] / mapped[:, -1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places: Array = mapped[:, :-1] / mapped[:, -1:]
     return places
 
 

@@ -10,7 +10,12 @@ if TYPE_CHECKING:
     from smartcam.calibration._drawing.files import draw_file
     from smartcam.calibration._files.load import AnyCalibration
     from smartcam.calibration._least_squares import independent_parts
-    from smartcam.calibration._lens.comparison import Lens, compare_lenses, rig_difference
+    from smartcam.calibration._lens.comparison import (
+        Lens,
+        LensComparison,
+        compare_lenses,
+        rig_difference,
+    )
     from smartcam.calibration._lens.uncertainty import MapFigures
     from smartcam.calibration._plane.drawing import draw
     from smartcam.calibration._printing.sheets import on_paper
@@ -48,6 +53,7 @@ __all__ = [
     "CameraInfo",
     "Input",
     "Lens",
+    "LensComparison",
     "MapFigures",
     "PixelPoseRequest",
     "Rectification",
@@ -77,7 +83,7 @@ if not TYPE_CHECKING:
             "_drawing.files": "draw_file",
             "_files.load": "AnyCalibration",
             "_least_squares": "independent_parts",
-            "_lens.comparison": "Lens compare_lenses rig_difference",
+            "_lens.comparison": "LensComparison Lens compare_lenses rig_difference",
             "_lens.uncertainty": "MapFigures",
             "_plane.drawing": "draw",
             "_printing.sheets": "on_paper",

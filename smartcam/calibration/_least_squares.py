@@ -140,7 +140,7 @@ def minimize(
         try:
             tried = moved(at, *normal.step(damping))
             after = evaluate(tried)
-        except CalibrationError:
+        except (CalibrationError, np.linalg.LinAlgError):
             tried, after = at, normal._replace(cost=math.inf)
         gained, least = normal.cost - after.cost, gain * (normal.cost + noise)
         if gained < 0:

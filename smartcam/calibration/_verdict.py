@@ -83,7 +83,7 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.WRONG_LENS: ("calibrate the lens as it is set now", "more"),
     Code.MIRRORED: ("see that no picture is flipped", "more"),
     Code.BAD_VIEW: ("remove view {number}", "remove"),
-    Code.POOR_FIT: ("remove view {number}", "remove"),
+    Code.POOR_FIT: ("see that nothing moved or slipped; else remove view {number}", "remove"),
     Code.INSUFFICIENT_ROTATION: ("take views that are tilted more to both sides", "more"),
     Code.POSES_TOO_SIMILAR: ("take views that are tilted more to both sides", "more"),
 }

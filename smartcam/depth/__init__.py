@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam.depth._cleaning import SpatialFilter, TemporalFilter, fill_holes
     from smartcam.depth._cloud import Cloud
     from smartcam.depth._cloud_files import load_cloud, save_cloud
-    from smartcam.depth._colours import ColourRange, ColourRegion, find_regions
+    from smartcam.depth._colours import ColourRange, find_regions
     from smartcam.depth._filters import (
         crop_box,
         pass_through,
@@ -22,24 +22,19 @@ if TYPE_CHECKING:
         remove_statistical_outliers,
         voxel_grid,
     )
-    from smartcam.depth._matcher import Disparity, StereoMatcher
+    from smartcam.depth._matcher import StereoMatcher
     from smartcam.depth._pair import read_camera_infos
-    from smartcam.depth._regions import RegionDepth, equalize_depth, region_depth
-    from smartcam.depth._registration import Registration, register
-    from smartcam.depth._stereo import DepthFrame, StereoDepth, StereoStatistics
+    from smartcam.depth._regions import equalize_depth, region_depth
+    from smartcam.depth._registration import register
+    from smartcam.depth._stereo import DepthFrame, StereoDepth
 
 __all__ = [
     "Cloud",
     "ColourRange",
-    "ColourRegion",
     "DepthFrame",
-    "Disparity",
-    "RegionDepth",
-    "Registration",
     "SpatialFilter",
     "StereoDepth",
     "StereoMatcher",
-    "StereoStatistics",
     "TemporalFilter",
     "crop_box",
     "equalize_depth",
@@ -63,13 +58,13 @@ if not TYPE_CHECKING:
             "_cleaning": "SpatialFilter TemporalFilter fill_holes",
             "_cloud": "Cloud",
             "_cloud_files": "load_cloud save_cloud",
-            "_colours": "ColourRange ColourRegion find_regions",
+            "_colours": "ColourRange find_regions",
             "_filters": "crop_box pass_through remove_radius_outliers "
             "remove_statistical_outliers voxel_grid",
-            "_matcher": "Disparity StereoMatcher",
+            "_matcher": "StereoMatcher",
             "_pair": "read_camera_infos",
-            "_regions": "RegionDepth equalize_depth region_depth",
-            "_registration": "Registration register",
-            "_stereo": "DepthFrame StereoDepth StereoStatistics",
+            "_regions": "equalize_depth region_depth",
+            "_registration": "register",
+            "_stereo": "DepthFrame StereoDepth",
         },
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.depth._colours import hsv
+    from smartcam.depth._colours import ColourRegion, hsv
     from smartcam.depth._simulation import (
         AXES,
         BLOCK,
@@ -23,6 +23,7 @@ __all__ = [
     "AXES",
     "BLOCK",
     "FOCAL",
+    "ColourRegion",
     "TableSight",
     "TowerTable",
     "WoodenBlock",
@@ -35,7 +36,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_colours": "hsv",
+            "_colours": "ColourRegion hsv",
             "_simulation": "AXES BLOCK FOCAL TableSight TowerTable WoodenBlock laid to_robot",
         },
     )

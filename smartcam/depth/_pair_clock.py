@@ -13,7 +13,8 @@ from smartcam.frames._inside import MAX_DRIFT, MIN_DRIFT_DURATION
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.frames import ClockStatistics, Frame
+    from smartcam.frames import Frame
+    from smartcam.frames._inside import ClockStatistics
 
 MAX_PAIRS: Final = 600
 """Pairs that are remembered: 20 s at 30 pairs a second."""

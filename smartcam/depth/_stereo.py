@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
     from smartcam.calibration import StereoCalibration
     from smartcam.calibration.formats import CameraChain
-    from smartcam.frames import Frame, FrameReader, FrameSet, GroupStatistics
+    from smartcam.frames import Frame, FrameReader, FrameSet
+    from smartcam.frames._inside import GroupStatistics
     from smartcam.geometry import CameraModel
 
 SEARCHED: Final = 5

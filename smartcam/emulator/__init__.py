@@ -27,23 +27,19 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_camera import LineCamera, LineClient
     from smartcam.emulator._scenario.file import load_scenario, load_scenarios, scenario_schema
     from smartcam.emulator._scenario.scenario import Scenario
-    from smartcam.emulator._scenario.states import DeviceState
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._scene import TablePose, TableScene
     from smartcam.emulator._ticketed_camera import TicketedCamera, TicketedClient
-    from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator._traffic import LogEntry
     from smartcam.emulator._wire_camera import WireCamera
-    from smartcam.emulator.faults import FiredFault
 
 __all__ = [
     "Application",
     "Cue",
     "Device",
-    "DeviceState",
     "EmulatedCamera",
     "EmulatedFleet",
     "EmulatedInSight",
-    "FiredFault",
     "InSightQuirks",
     "Job",
     "LineCamera",
@@ -57,7 +53,6 @@ __all__ = [
     "TableScene",
     "TicketedCamera",
     "TicketedClient",
-    "Visit",
     "WireCamera",
     "faults",
     "load_scenario",
@@ -84,12 +79,10 @@ if not TYPE_CHECKING:
             "_insight.job": "Job",
             "_scenario.file": "load_scenario load_scenarios scenario_schema",
             "_scenario.scenario": "Scenario",
-            "_scenario.states": "DeviceState",
             "_scenario.timeline": "Cue",
             "_scene": "TablePose TableScene",
             "_ticketed_camera": "TicketedCamera TicketedClient",
-            "_traffic": "LogEntry Visit",
+            "_traffic": "LogEntry",
             "_wire_camera": "WireCamera",
-            "faults": "FiredFault",
         },
     )

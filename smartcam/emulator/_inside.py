@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from smartcam.emulator._makes import check_options, emulated_class, options_of
     from smartcam.emulator._scene import PIECES, TABLE_SIZE, Observation
     from smartcam.emulator._tally import Tally
+    from smartcam.emulator._traffic import Visit
+    from smartcam.emulator.faults import FiredFault
     from smartcam.emulator.faults._base import MESSAGE_NAMES, BaseFault, DeviceFault, known_name
     from smartcam.emulator.faults._delay_line import DelayLine, Ending, Transmission
     from smartcam.emulator.faults._wire_effects import WireCodec
@@ -35,6 +37,7 @@ __all__ = [
     "DeviceFault",
     "Ending",
     "EvaluatingCamera",
+    "FiredFault",
     "HeardLine",
     "InspectedApplication",
     "InspectedJob",
@@ -49,6 +52,7 @@ __all__ = [
     "TimerHandle",
     "Transmission",
     "Values",
+    "Visit",
     "WireCodec",
     "applications_of",
     "check_options",
@@ -64,6 +68,8 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "faults": "FiredFault",
+            "_traffic": "Visit",
             "_bvs.device": "LastReport",
             "_camera": "CONDITIONS",
             "_client_link": "ClientLink",

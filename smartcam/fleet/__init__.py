@@ -16,10 +16,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
-    from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.server import FleetServer
-    from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.bus import MemoryBus
     from smartcam.fleet._file.fleet_file import FleetFile, fleet_schema, load_fleet
     from smartcam.fleet._frames.wire import FleetFrame
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
         CameraLeft,
         Fleet,
         FleetEvent,
-        FleetResults,
     )
 
 __all__ = [
@@ -40,19 +36,14 @@ __all__ = [
     "AgentLeft",
     "CameraJoined",
     "CameraLeft",
-    "CameraSummary",
     "Fleet",
     "FleetCamera",
-    "FleetChanges",
     "FleetEvent",
     "FleetFile",
     "FleetFrame",
-    "FleetResults",
     "FleetServer",
     "MemoryBus",
     "ReservationLost",
-    "ToldOutlet",
-    "ToldStore",
     "fleet_schema",
     "load_fleet",
     "open",
@@ -63,16 +54,12 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_agent.outlet_service": "ToldOutlet ToldStore",
-            "_agent.reload": "FleetChanges",
             "_agent.server": "FleetServer",
-            "_agent.summary": "CameraSummary",
             "_bus.bus": "MemoryBus",
             "_file.fleet_file": "FleetFile fleet_schema load_fleet",
             "_frames.wire": "FleetFrame",
             "_opening": "open serve",
             "_program.camera": "FleetCamera ReservationLost",
-            "_program.fleet": "AgentJoined AgentLeft CameraJoined "
-            "CameraLeft Fleet FleetEvent FleetResults",
+            "_program.fleet": "AgentJoined AgentLeft CameraJoined CameraLeft Fleet FleetEvent",
         },
     )

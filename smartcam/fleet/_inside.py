@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
+    from smartcam.fleet._agent.reload import FleetChanges
+    from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.address import FleetAddress
     from smartcam.fleet._bus.bus import Bus
     from smartcam.fleet._bus.keys import Keys, meets
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._operations.metric_families import exposition, require_client
     from smartcam.fleet._operations.metrics import read_numbers
     from smartcam.fleet._outlets import FleetOutlets
+    from smartcam.fleet._program.fleet import FleetResults
     from smartcam.fleet._ros import RosFleet, ros_of
     from smartcam.fleet._security.authority import MadeCertificate, make_certificates
     from smartcam.fleet._security.certificates import (
@@ -30,14 +34,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Bus",
+    "CameraSummary",
     "FleetAddress",
+    "FleetChanges",
     "FleetOutlets",
+    "FleetResults",
     "Keys",
     "MadeCertificate",
     "OperationsSection",
     "RecordSection",
     "RosFleet",
     "RosSection",
+    "ToldOutlet",
+    "ToldStore",
     "ZenohEnd",
     "ends_soon",
     "exposition",
@@ -57,6 +66,10 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_agent.outlet_service": "ToldStore ToldOutlet",
+            "_program.fleet": "FleetResults",
+            "_agent.reload": "FleetChanges",
+            "_agent.summary": "CameraSummary",
             "_bus.address": "FleetAddress",
             "_bus.bus": "Bus",
             "_bus.keys": "Keys meets",

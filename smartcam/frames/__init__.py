@@ -19,11 +19,10 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
-    from smartcam.frames._clocks import ClockStatistics
     from smartcam.frames._codecs.h264 import H264Decoder, H264Encoder
     from smartcam.frames._codecs.threads import Codecs
     from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
-    from smartcam.frames._events import FrameEvent, FrameEvents
+    from smartcam.frames._events import FrameEvents
     from smartcam.frames._features import (
         DeviceFeatures,
         Feature,
@@ -32,23 +31,19 @@ if TYPE_CHECKING:
         FrameFeatures,
     )
     from smartcam.frames._frame import Frame, FrameTrigger, Moment
-    from smartcam.frames._group import FrameGroup, FrameSet, GroupStatistics
+    from smartcam.frames._group import FrameGroup, FrameSet
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels.formats import PixelFormat, find_format
     from smartcam.frames._reader import FrameReader, ReaderStatistics
     from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
-    from smartcam.frames._streaming.rate import RateControl, RateStatistics
-    from smartcam.frames._streaming.rtp.feedback import RtpReceiver
-    from smartcam.frames._streaming.rtp.receiver import RtpStatistics
-    from smartcam.frames._streaming.rtp.sender import RtpSender, RtpSenderStatistics
+    from smartcam.frames._streaming.rate import RateControl
+    from smartcam.frames._streaming.rtp.sender import RtpSender
     from smartcam.frames._streaming.rtsp.server import RtspServer
-    from smartcam.frames._streaming.rtsp.streams import RtspStatistics
     from smartcam.frames._trigger import AwaitedTrigger
 
 __all__ = [
     "AwaitedTrigger",
-    "ClockStatistics",
     "Codecs",
     "DeviceFeatures",
     "Feature",
@@ -57,7 +52,6 @@ __all__ = [
     "Frame",
     "FrameAddress",
     "FrameDriver",
-    "FrameEvent",
     "FrameEvents",
     "FrameFeature",
     "FrameFeatures",
@@ -67,21 +61,15 @@ __all__ = [
     "FrameSink",
     "FrameSource",
     "FrameTrigger",
-    "GroupStatistics",
     "H264Decoder",
     "H264Encoder",
     "Moment",
     "PixelFormat",
     "RateControl",
-    "RateStatistics",
     "ReaderStatistics",
     "Rectifier",
-    "RtpReceiver",
     "RtpSender",
-    "RtpSenderStatistics",
-    "RtpStatistics",
     "RtspServer",
-    "RtspStatistics",
     "SourceStatistics",
     "StreamFormat",
     "Undistorter",
@@ -95,25 +83,21 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_address": "FrameAddress",
-            "_clocks": "ClockStatistics",
             "_codecs.h264": "H264Decoder H264Encoder",
             "_codecs.threads": "Codecs",
             "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
-            "_events": "FrameEvent FrameEvents",
+            "_events": "FrameEvents",
             "_features": "DeviceFeatures Feature FeatureValue FrameFeature FrameFeatures",
             "_frame": "Frame FrameTrigger Moment",
-            "_group": "FrameGroup FrameSet GroupStatistics",
+            "_group": "FrameGroup FrameSet",
             "_opening": "discover open",
             "_pixels.formats": "PixelFormat find_format",
             "_reader": "FrameReader ReaderStatistics",
             "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",
             "_trigger": "AwaitedTrigger",
-            "_streaming.rate": "RateControl RateStatistics",
-            "_streaming.rtp.feedback": "RtpReceiver",
-            "_streaming.rtp.receiver": "RtpStatistics",
-            "_streaming.rtp.sender": "RtpSender RtpSenderStatistics",
+            "_streaming.rate": "RateControl",
+            "_streaming.rtp.sender": "RtpSender",
             "_streaming.rtsp.server": "RtspServer",
-            "_streaming.rtsp.streams": "RtspStatistics",
         },
     )

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.frames._features import FeatureValue
+    from smartcam.frames._marks import Drawing
     from smartcam.frames._pixels.formats import PixelFormat
     from smartcam.geometry import CameraModel
 
@@ -77,6 +78,8 @@ class Frame:
         chunks: values that the camera sent with the picture, by the name of their feature, such as
             ``ChunkExposureTime``; empty if it sends none.
         trigger: trigger by :meth:`FrameSource.trigger` that caused the frame; None: there was none.
+        drawings: marks of the tools of the software camera that judged the picture, each a
+            :class:`smartcam.inspection.Drawing`; mostly empty. An agent shares frames without them.
     """
 
     data: bytes | bytearray | memoryview
@@ -96,6 +99,7 @@ class Frame:
     remark: str = ""
     chunks: Mapping[str, FeatureValue] = field(default_factory=dict)
     trigger: FrameTrigger | None = None
+    drawings: tuple[Drawing, ...] = ()
 
     def __reduce__(self) -> tuple[Callable[[], Frame], tuple[()]]:
         """Return a function that makes a copy, with bytes of its own, also in another process."""

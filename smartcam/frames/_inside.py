@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.frames._clocks import MAX_DRIFT, MIN_DRIFT_DURATION
+    from smartcam.frames._clocks import MAX_DRIFT, MIN_DRIFT_DURATION, ClockStatistics
     from smartcam.frames._codecs.bitmap import read_bitmap
     from smartcam.frames._codecs.h264 import entry_point
     from smartcam.frames._codecs.jpeg import jpeg_header
@@ -23,24 +23,34 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.force_address import checked_mac, force_address
     from smartcam.frames._gige.gvcp import Register
     from smartcam.frames._gige.session import GigESession
+    from smartcam.frames._group import GroupStatistics
+    from smartcam.frames._marks import COLOURS, Drawing, Kind, Role, stroke_width
     from smartcam.frames._pixels.layouts import Planes, YuvPairs
     from smartcam.frames._reader import FRAME_TIMEOUT, FrameTap
+    from smartcam.frames._streaming.rate import RateStatistics
     from smartcam.frames._synthetic import read_stamp
     from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_video
 
 __all__ = [
+    "COLOURS",
     "FEATURE_TIMEOUT",
     "FRAME_TIMEOUT",
     "MAX_DRIFT",
     "MIN_DRIFT_DURATION",
+    "ClockStatistics",
     "ControlChannel",
+    "Drawing",
     "FrameTap",
     "GenicamFeatures",
     "GigEDriver",
     "GigESession",
+    "GroupStatistics",
+    "Kind",
     "PacketCounts",
     "Planes",
+    "RateStatistics",
     "Register",
+    "Role",
     "TaskDriver",
     "YuvPairs",
     "changed",
@@ -56,6 +66,7 @@ __all__ = [
     "places",
     "read_bitmap",
     "read_stamp",
+    "stroke_width",
     "to_jpeg",
     "to_lossless_video",
     "with_pixels",
@@ -65,7 +76,9 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_clocks": "MIN_DRIFT_DURATION MAX_DRIFT",
+            "_streaming.rate": "RateStatistics",
+            "_group": "GroupStatistics",
+            "_clocks": "ClockStatistics MIN_DRIFT_DURATION MAX_DRIFT",
             "_codecs.bitmap": "read_bitmap",
             "_codecs.h264": "entry_point",
             "_codecs.jpeg": "jpeg_header",
@@ -81,6 +94,7 @@ if not TYPE_CHECKING:
             "_gige.features": "GenicamFeatures",
             "_gige.gvcp": "Register",
             "_gige.session": "GigESession",
+            "_marks": "COLOURS Drawing Kind Role stroke_width",
             "_pixels.layouts": "Planes YuvPairs",
             "_reader": "FRAME_TIMEOUT FrameTap",
             "_synthetic": "read_stamp",

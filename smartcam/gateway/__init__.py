@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.gateway._account import GatewayAccount
     from smartcam.gateway._gateway import Gateway
     from smartcam.gateway._settings import GatewayFile, GatewaySettings
 
-__all__ = ["Gateway", "GatewayAccount", "GatewayFile", "GatewaySettings"]
+__all__ = ["Gateway", "GatewayFile", "GatewaySettings"]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_account": "GatewayAccount",
             "_gateway": "Gateway",
             "_settings": "GatewayFile GatewaySettings",
         },

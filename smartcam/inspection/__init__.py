@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.frames._inside import Drawing
     from smartcam.inspection._camera.client import SoftwareCamera
     from smartcam.inspection._camera.device import SoftwareDevice
     from smartcam.inspection._cell import (
@@ -33,13 +34,12 @@ if TYPE_CHECKING:
         make_camera,
         software_mistakes,
     )
-    from smartcam.inspection._finding import Drawing, Finding, Inspection
+    from smartcam.inspection._finding import Finding, Inspection
     from smartcam.inspection._locate.find import LocatedPart
     from smartcam.inspection._locate.model import PartModel
-    from smartcam.inspection._locate.symmetry import Symmetry
     from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
     from smartcam.inspection._picture import Picture
-    from smartcam.inspection._places import PixelPose, PlacedRegion, Region
+    from smartcam.inspection._places import PixelPose, Region
     from smartcam.inspection._program import Program, register_tool
     from smartcam.inspection._teaching import Teaching
     from smartcam.inspection._tool import Tool, ToolSettings, ToolSetup, View
@@ -53,13 +53,11 @@ __all__ = [
     "PartModel",
     "Picture",
     "PixelPose",
-    "PlacedRegion",
     "Program",
     "Region",
     "Software",
     "SoftwareCamera",
     "SoftwareDevice",
-    "Symmetry",
     "Teaching",
     "TeachingError",
     "TeachingTrouble",
@@ -80,15 +78,15 @@ if not TYPE_CHECKING:
             "_camera.client": "SoftwareCamera",
             "_camera.device": "SoftwareDevice",
             "_cell": "CellCamera Software load_cell make_camera software_mistakes",
-            "_finding": "Drawing Finding Inspection",
+            "_finding": "Finding Inspection",
             "_locate.find": "LocatedPart",
             "_locate.model": "PartModel",
-            "_locate.symmetry": "Symmetry",
             "_locate.troubles": "TeachingError TeachingTrouble",
             "_picture": "Picture",
-            "_places": "PixelPose PlacedRegion Region",
+            "_places": "PixelPose Region",
             "_program": "Program register_tool",
             "_teaching": "Teaching",
             "_tool": "Tool ToolSettings ToolSetup View",
+            "smartcam.frames._inside": "Drawing",
         },
     )

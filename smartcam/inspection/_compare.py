@@ -10,7 +10,8 @@ from pydantic import Field
 
 from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection._finding import Drawing, Finding
+from smartcam.frames._inside import Drawing
+from smartcam.inspection._finding import Finding
 from smartcam.inspection._picture import Picture
 from smartcam.inspection._tool import Tool, ToolSettings
 

@@ -7,19 +7,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from smartcam._extras import load
+from smartcam.frames._inside import COLOURS, stroke_width
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.inspection._finding import Drawing, Inspection
-
-COLOURS: Final = {
-    "found": (46, 204, 64),
-    "wrong": (255, 65, 54),
-    "region": (0, 116, 217),
-    "hint": (255, 220, 0),
-}
-"""Red, green and blue of each role's marks."""
+    from smartcam.frames._inside import Drawing
+    from smartcam.inspection._finding import Inspection
 
 _SHIFT: Final = 4  # OpenCV draws at sixteenths of a pixel
 
@@ -27,13 +21,9 @@ _SHIFT: Final = 4  # OpenCV draws at sixteenths of a pixel
 def draw(inspection: Inspection) -> NDArray[Any]:
     """Return an inspection's picture with the marks of its tools, (H, W, 3), uint8, red first."""
     canvas = inspection.picture.rgb.copy()
-    thick = max(1, round(max(canvas.shape) / 800))
-    for found in inspection.findings.values():
-        for mark in found.drawings:
-            _draw(canvas, mark, thick)
-    verdict = "ok" if inspection.ok else f"not ok: {inspection.reason}"
-    colour = COLOURS["found" if inspection.ok else "wrong"]
-    _write(canvas, f"{inspection.name}: {verdict}", (4, 18 * thick), colour, thick)
+    thick = stroke_width(*inspection.picture.size)
+    for mark in inspection.drawings:
+        _draw(canvas, mark, thick)
     return canvas
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from smartcam._arguments import check_choice, check_integer
 from smartcam._forks import cached_property
+from smartcam.frames._inside import Drawing, stroke_width
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,26 +18,6 @@ if TYPE_CHECKING:
     from smartcam.inspection._places import PixelPose
     from smartcam.layout import Layout, Record
     from smartcam.models import ByteOrder
-
-Role = Literal["found", "wrong", "region", "hint"]
-Kind = Literal["points", "line", "polygon", "text"]
-
-
-@dataclass(frozen=True, slots=True)
-class Drawing:
-    """A mark that shows people what a tool saw.
-
-    Attributes:
-        kind: points each by itself, a line through them, a closed polygon, or a text at the first.
-        points: places in the picture's pixels.
-        role: meaning of the mark: ``found``, what is ``wrong``, the ``region``, or a ``hint``.
-        text: the text, or a word beside the first point.
-    """
-
-    kind: Kind
-    points: tuple[tuple[float, float], ...]
-    role: Role = "found"
-    text: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +69,15 @@ class Inspection:
     seconds: Mapping[str, float]
     layout: Layout = field(repr=False)
     picture: Picture = field(repr=False)
+
+    @property
+    def drawings(self) -> tuple[Drawing, ...]:
+        """The marks of all tools, and the verdict as a text in the upper left corner."""
+        marks = [mark for found in self.findings.values() for mark in found.drawings]
+        verdict = "ok" if self.ok else f"not ok: {self.reason}"
+        place = (0.0, 22.0 * stroke_width(*self.picture.size))
+        role: Literal["found", "wrong"] = "found" if self.ok else "wrong"
+        return (*marks, Drawing("text", (place,), role, f"{self.name}: {verdict}"))
 
     def payload(self, byte_order: ByteOrder = "little", *, sequence: int | None = None) -> bytes:
         """Return the bytes of the result container.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import numpy as np
@@ -24,6 +25,9 @@ MAX_CORNERS: Final = 200
 
 MAX_COORDINATE_PX: Final = 100_000.0
 """Largest coordinate of a region, in pixels; no picture is larger."""
+
+MAX_FIXED_PLACES: Final = 256
+"""Largest number of places of fixed regions that are kept from one picture to the next."""
 
 
 class PixelPose(NamedTuple):
@@ -169,10 +173,23 @@ def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) 
             that ``[0, 0, width, height]`` is all of it, from half a pixel before the first centre.
         size: width and height of the picture, pixels.
     """
-    width, height = size
+    if region is None or pose is None:
+        return _place_fixed(region, size)
+    return _placed(pose.to_picture(region), size)
+
+
+@lru_cache(maxsize=MAX_FIXED_PLACES)
+def _place_fixed(region: Region | None, size: tuple[int, int]) -> PlacedRegion:
+    """Return the place of a region that follows nothing; its corners cannot be changed."""
     if region is None:
-        region, pose = _region([0, 0, width, height]), None
-    corners = np.asarray(region) - 0.5 if pose is None else pose.to_picture(region)
+        region = _region([0, 0, *size])
+    corners = np.asarray(region) - 0.5
+    corners.flags.writeable = False
+    return _placed(corners, size)
+
+
+def _placed(corners: NDArray[np.float64], size: tuple[int, int]) -> PlacedRegion:
+    width, height = size
     (left, top), (right, below) = corners.min(axis=0) + 0.5, corners.max(axis=0) + 0.5
     return PlacedRegion(
         corners,

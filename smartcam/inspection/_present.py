@@ -10,7 +10,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from smartcam._extras import load
 from smartcam.depth import ColourRange
-from smartcam.inspection._finding import Drawing, Finding
+from smartcam.frames._inside import Drawing
+from smartcam.inspection._finding import Finding
 from smartcam.inspection._places import PixelPose
 from smartcam.inspection._tool import Tool, ToolSettings
 

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from pydantic import ValidationError
 
-from smartcam._arguments import check_application, check_path, check_text, wrong_argument
+from smartcam._arguments import (
+    MAX_APPLICATION_ID,
+    check_application_or_name,
+    check_integer,
+    check_path,
+    check_text,
+    wrong_argument,
+)
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
 from smartcam._whole_files import replace_file
@@ -45,10 +52,12 @@ class Teaching:
     Args:
         path: the cell file, or a fleet file.
         camera: name of the software camera in it.
-        application: number of the application; one that is not there is added when it is saved.
+        application: number of the application, or its name; a number that is not there is added
+            when it is saved.
 
     Raises:
-        ConfigurationError: the file cannot be read, or has no such software camera.
+        ConfigurationError: the file cannot be read, or has no such software camera; the camera has
+            no application of this name.
         MissingExtraError: the extra ``inspection`` is not installed.
 
     Attributes:
@@ -58,11 +67,12 @@ class Teaching:
         frames: address of the camera's frames.
     """
 
-    def __init__(self, path: str | Path, camera: str, application: int) -> None:
+    def __init__(self, path: str | Path, camera: str, application: int | str) -> None:
         self.path: Path = check_path(path, "path", "Teaching")
         self.camera: str = check_text(camera, "camera", "Teaching")
-        self.application: int = check_application(application, who="Teaching")
+        application = check_application_or_name(application, who="Teaching")
         software = self._software(self._read())
+        self.application: int = self._number(software["applications"], application)
         self.frames: str = Software.model_validate(software).frames_address(self.path.parent)
         found = software["applications"].get(self.application, {})
         self._entry: dict[str, Any] = found if isinstance(found, dict) else {}
@@ -161,6 +171,25 @@ class Teaching:
             return load_yaml(self._text(), what=str(self.path))
         except BadYamlError as exc:
             raise ConfigurationError(f"{self.path}: {exc}") from exc
+
+    def _number(self, applications: dict[Any, Any], application: int | str) -> int:
+        """Return the number of an application, which may be named by number, digits or name."""
+        if not isinstance(application, str) or (application.isascii() and application.isdigit()):
+            number = int(application)
+            return check_integer(number, "application", 1, MAX_APPLICATION_ID, "Teaching")
+        names = {
+            str(entry["name"]): number
+            for number, entry in applications.items()
+            if isinstance(entry, dict) and isinstance(number, int) and "name" in entry
+        }
+        if application not in names:
+            known = [f"{number} ({name})" for name, number in names.items()]
+            raise ConfigurationError(
+                f"{self.path}: {self.camera} has no application {application!r:.60}; there are "
+                f"{', '.join(known) or 'none with a name'}{did_you_mean(application, names)}; a "
+                "number adds one"
+            )
+        return names[application]
 
     def _software(self, whole: Any) -> dict[str, Any]:
         """Return the mapping of the camera's ``software:`` in a file."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from smartcam.interpreters._base import (
     Context,
-    Function,
     Interpreter,
     PlainInterpreter,
     Reader,
@@ -19,7 +18,6 @@ from smartcam.interpreters._base import (
 
 __all__ = [
     "Context",
-    "Function",
     "Interpreter",
     "PlainInterpreter",
     "Reader",

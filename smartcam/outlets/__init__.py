@@ -13,35 +13,31 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.outlets._entry import OutletAccount, OutletEntry
+    from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import Column, Outlet, OutletDesk
-    from smartcam.outlets._outlets import Outlets, OutletState
-    from smartcam.outlets._settings import OutletSettings, OutletsFile, Secret
-    from smartcam.outlets._stored import StoredResults, StoreQuestion
+    from smartcam.outlets._outlets import Outlets
+    from smartcam.outlets._settings import OutletSettings, OutletsFile
+    from smartcam.outlets._stored import StoreQuestion
 
 __all__ = [
     "Column",
     "Outlet",
-    "OutletAccount",
     "OutletDesk",
     "OutletEntry",
     "OutletSettings",
-    "OutletState",
     "Outlets",
     "OutletsFile",
-    "Secret",
     "StoreQuestion",
-    "StoredResults",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_entry": "OutletAccount OutletEntry",
+            "_entry": "OutletEntry",
             "_outlet": "Column OutletDesk Outlet",
-            "_outlets": "OutletState Outlets",
-            "_settings": "OutletSettings OutletsFile Secret",
-            "_stored": "StoredResults StoreQuestion",
+            "_outlets": "Outlets",
+            "_settings": "OutletSettings OutletsFile",
+            "_stored": "StoreQuestion",
         },
     )

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from smartcam.outlets._commands import do_command
-from smartcam.outlets._outlets import columns_of, stored_accounts
+from smartcam.outlets._outlets import OutletState, columns_of, stored_accounts
 from smartcam.outlets._settings import mistakes_of
 from smartcam.outlets._stored import read_store
 
-__all__ = ["columns_of", "do_command", "mistakes_of", "read_store", "stored_accounts"]
+__all__ = [
+    "OutletState",
+    "columns_of",
+    "do_command",
+    "mistakes_of",
+    "read_store",
+    "stored_accounts",
+]

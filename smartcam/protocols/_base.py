@@ -35,7 +35,7 @@ class Role(enum.Enum):
     @property
     def sends(self) -> Sender:
         """The sender of this side's messages."""
-        return Sender(self.value)
+        return Sender.CLIENT if self is Role.CLIENT else Sender.CAMERA
 
     @property
     def receives(self) -> Sender:

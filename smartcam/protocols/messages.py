@@ -66,6 +66,8 @@ __all__ = [
 class Sender(enum.Enum):
     """The side that sends a message."""
 
+    __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
+
     CLIENT = "client"
     CAMERA = "camera"
 

@@ -19,7 +19,6 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.recording._bags.conversion import write_bag
-    from smartcam.recording._bags.items import BagCounts
     from smartcam.recording._bags.recorder import BagRecorder
     from smartcam.recording._folders.recorder import FleetRecorder
     from smartcam.recording._folders.replay import FleetReplay
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from smartcam.recording._replays.replay import ReplayedCamera, replay
 
 __all__ = [
-    "BagCounts",
     "BagRecorder",
     "FleetRecorder",
     "FleetReplay",
@@ -49,7 +47,6 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_bags.conversion": "write_bag",
-            "_bags.items": "BagCounts",
             "_bags.recorder": "BagRecorder",
             "_folders.recorder": "FleetRecorder",
             "_folders.replay": "FleetReplay",

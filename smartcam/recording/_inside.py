@@ -8,11 +8,13 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.recording._bags.conversion import BagConversion
+    from smartcam.recording._bags.items import BagCounts
     from smartcam.recording._pictures.folder import file_name
     from smartcam.recording._pictures.judged import JudgedPictures
 
 __all__ = [
     "BagConversion",
+    "BagCounts",
     "JudgedPictures",
     "file_name",
 ]
@@ -21,6 +23,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_bags.items": "BagCounts",
             "_bags.conversion": "BagConversion",
             "_pictures.folder": "file_name",
             "_pictures.judged": "JudgedPictures",

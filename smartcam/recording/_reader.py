@@ -21,6 +21,7 @@ from smartcam.recording._folder import ENDING, FileName, files_of
 from smartcam.recording._judged import judged
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
+    ANNOTATIONS_SCHEMA,
     CAMERA_METADATA,
     EPOCH,
     FILE_METADATA,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.frames import Frame
+    from smartcam.frames._inside import Drawing
     from smartcam.recording._judged import JudgedResult
     from smartcam.recording._mcap.form import Item, Kind
     from smartcam.recording._mcap.records import Record
@@ -63,6 +65,9 @@ work."""
 VALUES_PER_BYTE = 100
 """Number of values for each byte that a larger file may have. Real recordings have less than one,
 since each message takes 16 bytes of index; tables of mostly zeros have ten."""
+
+MIN_POINT_BYTES = 2
+"""Least number of bytes that a point of a mark has."""
 
 T = TypeVar("T")
 
@@ -424,6 +429,8 @@ class _Scan:
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     remark: str = ""  # place and reason if the file stops being readable
     values: int = 0  # number of values in its messages so far
+    # number and marks of the last message of annotations, until the next picture
+    marks: tuple[int, tuple[Drawing, ...]] = (0, ())
     # data of the last frames, by camera and number
     bodies: LastBodies[tuple[str, int], str] = field(
         default_factory=LastBodies[tuple[str, int], str]
@@ -492,12 +499,12 @@ class _Scan:
                 kind = next((one for one in KINDS.values() if one.schema == name), None)
                 if kind is not None:
                     kinds[number] = kind
-                elif name in PICTURE_SCHEMAS:
+                elif name in (ANNOTATIONS_SCHEMA, *PICTURE_SCHEMAS):
                     kinds[number] = name
             case McapMessage(channel, sequence, data) if channel in kinds:
                 said = kinds[channel]
                 if isinstance(said, str):
-                    return self._picture(said, data)
+                    return self._picture(said, sequence, data, reader)
                 body = bytes(data)
                 self._count_values(count_values(body), reader.place)
                 fields = message_fields(body)
@@ -518,11 +525,18 @@ class _Scan:
                 pass
         return None
 
-    @staticmethod
-    def _picture(schema: str, data: memoryview) -> RecordedPicture:
+    def _picture(
+        self, schema: str, sequence: int, data: memoryview, reader: RecordReader
+    ) -> RecordedPicture | None:
+        """Return a picture with the marks that stand right before it; None of marks."""
         with from_part("frames", "pictures need"):
-            from smartcam.recording._pictures.messages import picture_of
-        return picture_of(schema, data)
+            from smartcam.recording._pictures import annotations, messages
+        if schema == ANNOTATIONS_SCHEMA:
+            self._count_values(len(data) // MIN_POINT_BYTES, reader.place)
+            self.marks = sequence, annotations.drawings_of(data)
+            return None
+        marks, self.marks = self.marks, (0, ())
+        return messages.picture_of(schema, data, *marks)
 
     def _find_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
         """Add a result's bytes, if they are in its frame."""

@@ -29,6 +29,8 @@ from smartcam.observers import Observer, RawFrame, TraceEntry
 from smartcam.recording._exclusive_files import opened
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
+    ANNOTATIONS,
+    ANNOTATIONS_SCHEMA,
     CAMERA_METADATA,
     FILE_METADATA,
     FORMAT,
@@ -643,14 +645,36 @@ class RecordingFile:
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import messages
 
+        marked_by = self._annotations(picture) if picture.frame.drawings else None
         schema = messages.schema_of(picture)
+        data = messages.picture_message(picture, marked_by)
+        self._foxglove(picture, PICTURES, schema, messages.schema_data, data)
+
+    def _annotations(self, picture: RecordedPicture) -> int:
+        """Write the marks of a picture, which comes next; return the number of the message."""
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._pictures import annotations
+
+        data = annotations.annotations_message(picture.frame)
+        schema_data = annotations.schema_data
+        return self._foxglove(picture, ANNOTATIONS, ANNOTATIONS_SCHEMA, schema_data, data)
+
+    def _foxglove(
+        self,
+        picture: RecordedPicture,
+        topic: str,
+        schema: str,
+        schema_data: Callable[[str], bytes],
+        data: bytes,
+    ) -> int:
+        """Write a message of Foxglove's of the time of a picture; return its number."""
         key = picture.camera, schema
         if key not in self._channels:
             if schema not in self._schemas:
-                data = messages.schema_data(schema)
-                self._schemas[schema] = self._writer.register_schema(schema, "protobuf", data)
+                described = schema_data(schema)
+                self._schemas[schema] = self._writer.register_schema(schema, "protobuf", described)
             self._channels[key] = channel = self._writer.register_channel(
-                f"/{picture.camera}/{PICTURES}",
+                f"/{picture.camera}/{topic}",
                 "protobuf",
                 self._schemas[schema],
                 {"camera": picture.camera},
@@ -658,9 +682,8 @@ class RecordingFile:
             self._numbers[channel] = 0
         channel = self._channels[key]
         self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
-        data = messages.picture_message(picture)
-        at = nanoseconds(picture.at)
-        self._writer.add_message(channel, at, data, number, packs=False)
+        self._writer.add_message(channel, nanoseconds(picture.at), data, number, packs=False)
+        return number
 
     def _channel(self, camera: str, kind: str) -> int:
         known = self._channels.get((camera, kind))

@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from smartcam.testing._logs import CameraLog
     from smartcam.testing._suites.interpreters import ContainerSample, InterpreterSuite
     from smartcam.testing._suites.protocols.cameras_under_test import (
-        COUNTER,
-        ECHO,
-        FREE,
-        OTHER,
-        SLOW,
-        SLOW_TIME,
         CameraKind,
         LiveCamera,
     )
@@ -34,12 +28,6 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._proxy import LinkProxy
 
 __all__ = [
-    "COUNTER",
-    "ECHO",
-    "FREE",
-    "OTHER",
-    "SLOW",
-    "SLOW_TIME",
     "Came",
     "CameraKind",
     "CameraLog",
@@ -62,8 +50,7 @@ if not TYPE_CHECKING:
         {
             "_logs": "CameraLog",
             "_suites.interpreters": "ContainerSample InterpreterSuite",
-            "_suites.protocols.cameras_under_test": "COUNTER ECHO FREE OTHER SLOW "
-            "SLOW_TIME CameraKind LiveCamera",
+            "_suites.protocols.cameras_under_test": "CameraKind LiveCamera",
             "_suites.protocols.conversations": "Came Conversation Sent",
             "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",
             "proxy._proxy": "LinkProxy",

@@ -12,7 +12,8 @@ from smartcam.exceptions import ConfigurationError, ConnectionClosedError
 from smartcam.web._errors import RefusedError
 
 if TYPE_CHECKING:
-    from smartcam.fleet import Fleet, ToldOutlet, ToldStore
+    from smartcam.fleet import Fleet
+    from smartcam.fleet._inside import ToldOutlet, ToldStore
 
 ANSWER_AGE: Final = 2.0
 """Seconds for which the answer for one page does for the others, too."""

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from smartcam.calibration.formats import SAMPLES, TRAJECTORIES, TRANSFORMS
-from smartcam.calibration.formats._cameras import FORMS
-from smartcam.calibration.formats._file_format import Format
 from tests.budgets.inputs import JSON, PAST_LOOKAHEAD, YAML
 from tests.budgets.parser import Make, Parser, fill_text, from_file
-from tests.calibration.inside import store
+from tests.calibration.inside import FORMS, Format, store
 
 _CSV = "#t [s],x [m],y [m],z [m],qx [],qy [],qz [],qw []\n"
 

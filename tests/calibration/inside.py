@@ -1,40 +1,105 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
+from smartcam.calibration._detection import charucos, corners
+from smartcam.calibration._detection.charucos import charuco_board
+from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_corners
+from smartcam.calibration._detection.grid_growing import (
+    MAX_SEEDS_TRIED,
+    _Grown,
+    alike_areas,
+    lattices,
+)
+from smartcam.calibration._detection.image import grey_image, scaled
+from smartcam.calibration._detection.markers import (
+    MAX_OUTLINES,
+    MAX_OUTLINES_OF_ALL_WINDOWS,
+    WINDOWS_PX,
+    Markers,
+    _outlines,
+    agreeing,
+    marker_finder,
+)
 from smartcam.calibration._files import store
-from smartcam.calibration._files.store import keep_backup, read, read_document, replace_file, write
-from smartcam.calibration._hand_eye.closed_forms import LINEAR
-from smartcam.calibration._hand_eye.equations import Setup
-from smartcam.calibration._homography import apply_homography, fit_homography
-from smartcam.calibration._lens.bundle import lens_values, with_lens
+from smartcam.calibration._files.store import (
+    BACKUPS,
+    keep_backup,
+    read,
+    read_document,
+    replace_file,
+    write,
+)
+from smartcam.calibration._hand_eye.closed_forms import (
+    LINEAR,
+    check_motion,
+    second_turn,
+    second_turns,
+    solve_linear,
+)
+from smartcam.calibration._hand_eye.equations import (
+    Observations,
+    PixelObservations,
+    PoseObservations,
+    RobotNoise,
+    RobotPoses,
+    Setup,
+    Solution,
+    adjust,
+    carried,
+    sums,
+    without_each,
+)
+from smartcam.calibration._homography import apply_homography, element_derivatives, fit_homography
+from smartcam.calibration._lens.bundle import (
+    Bundle,
+    Sight,
+    adjust_weighted,
+    leave_out,
+    lens_values,
+    residuals,
+    with_lens,
+)
+from smartcam.calibration._lens.bundle import adjust as bundle_adjust
+from smartcam.calibration._lens.coverage import Coverage, coverage
+from smartcam.calibration._lens.intrinsics import ViewFit
 from smartcam.calibration._lens.poses import half_turned
-from smartcam.calibration._printing.sheets import Rays
-from smartcam.calibration._solvers import CameraPosition2D, RealWorldPosition
-from smartcam.calibration.formats._cameras import CameraForm
+from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, choose_shape
+from smartcam.calibration._plane.calibration import PlaneModel
+from smartcam.calibration._plane.fitting import (
+    MODELS,
+    Fit,
+    ModelName,
+    Normalization,
+    Pairs,
+    fit,
+    held_out,
+)
+from smartcam.calibration._printing.page import (
+    Disc,
+    Label,
+    Polygon,
+    PrintedPage,
+    pdf,
+    rectangle,
+    svg,
+)
+from smartcam.calibration._printing.page_layout import BORDER_MM, RULER_MM
+from smartcam.calibration._printing.sheets import Rays, page_size
+from smartcam.calibration._solvers import CameraPosition2D, Poses, RealWorldPosition, Solver
+from smartcam.calibration._stereo.checks import check_apart, check_fit, remark_sides
+from smartcam.calibration.formats._cameras import (
+    FORMS,
+    CameraForm,
+    compose_camchain,
+    compose_camera_info,
+    compose_opencv,
+    parse_opencv,
+)
+from smartcam.calibration.formats._file_format import MAX_TEXT_BYTES, Format
+from smartcam.calibration.formats._plain import load_json, load_yaml, real
 from smartcam.calibration.simulation import _scenes
-from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._view_suggestions import outline
-
-__all__ = [
-    "LINEAR",
-    "CameraForm",
-    "CameraPosition2D",
-    "Journal",
-    "Rays",
-    "RealWorldPosition",
-    "Setup",
-    "_scenes",
-    "apply_homography",
-    "fit_homography",
-    "half_turned",
-    "keep_backup",
-    "lens_values",
-    "outline",
-    "read",
-    "read_document",
-    "replace_file",
-    "store",
-    "with_lens",
-    "write",
-]
+from smartcam.calibration.wizards import _journal
+from smartcam.calibration.wizards._journal import MAX_LINE_BYTES, Journal
+from smartcam.calibration.wizards._view_suggestions import Look, outline

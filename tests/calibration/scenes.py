@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration import CameraModel, Checkerboard, Transform, find_target
 from smartcam.calibration.simulation import HandEyeScene, hand_eye_scene, render
-from smartcam.exceptions import CalibrationError
 from tests.calibration.inside import apply_homography, fit_homography
+from tests.geometry.rigid import refused as refused
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from smartcam.calibration import TargetView
@@ -66,16 +62,6 @@ def check_pair(left_image: NDArray[np.uint8], right_image: NDArray[np.uint8], na
     assert (apart[:, 0] > 60).all(), name
     assert np.median(left.sigmas) < 0.03, name
     assert off_plane(left) < 4, name
-
-
-@contextmanager
-def refused(code: str, *texts: str) -> Iterator[None]:
-    """See that a calibration is refused with ``code``, and a text that holds ``texts``."""
-    with pytest.raises(CalibrationError) as caught:
-        yield
-    assert caught.value.code == code
-    for text in texts:
-        assert text in str(caught.value)
 
 
 # ---------------------------------------------------------------------- images of targets

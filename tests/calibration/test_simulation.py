@@ -16,9 +16,8 @@ from smartcam.calibration import (
     RobotSigmas,
     Transform,
 )
-from smartcam.calibration._detection.charucos import charuco_board
 from smartcam.calibration.simulation import around, render, view
-from tests.calibration.inside import Setup
+from tests.calibration.inside import Setup, charuco_board
 from tests.calibration.scenes import BENT, CAMERA, FACING, SHEET, STRAIGHT, facing, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]

@@ -23,9 +23,7 @@ from smartcam.calibration import (
     chain_of,
     fit_plane,
 )
-from smartcam.calibration._plane.calibration import PlaneModel
-from smartcam.calibration._solvers import Poses, Solver
-from tests.calibration.inside import CameraPosition2D, RealWorldPosition
+from tests.calibration.inside import CameraPosition2D, PlaneModel, Poses, RealWorldPosition, Solver
 from tests.geometry.rigid import (
     angles,
     localization,

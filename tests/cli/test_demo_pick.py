@@ -21,7 +21,6 @@ from smartcam._cli import demo_pick
 from smartcam._cli.demo_pallet import Grid, palletize
 from smartcam._cli.demo_pick import SimulatedRobot, nine_marks, pick
 from smartcam._cli.demo_table import DrawnTable, TablePart, TableRobot, radius_of
-from smartcam._cli.options import Options
 from smartcam.emulator import TablePose, TableScene
 from smartcam.emulator._inside import PIECES, TABLE_SIZE
 from smartcam.exceptions import ConfigurationError, MissingExtraError
@@ -29,6 +28,7 @@ from smartcam.geometry import PlacePattern
 from smartcam.inspection import PartModel, load_cell
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from tests.cli.commandline import run
+from tests.cli.inside import Options
 
 NEEDS_INSPECTION = pytest.mark.skipif(
     importlib.util.find_spec("cv2") is None, reason="needs the extra inspection"

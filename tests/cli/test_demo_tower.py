@@ -11,11 +11,11 @@ import pytest
 
 from smartcam._cli import demo_tower
 from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
-from smartcam._cli.options import Options
 from smartcam.depth import ColourRange
 from smartcam.depth._inside import BLOCK, TowerTable, WoodenBlock, laid, to_robot
 from smartcam.exceptions import FrameFormatError
 from tests.cli.commandline import run
+from tests.cli.inside import Options
 
 pytest.importorskip("cv2", reason="needs the extra depth")
 

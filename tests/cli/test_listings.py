@@ -13,7 +13,6 @@ from click.testing import CliRunner
 
 import smartcam
 from smartcam._cli.dissector import dissector
-from smartcam._cli.options import DIALECTS
 from smartcam._cli.smartcam import LISTED, TOPICS
 from smartcam._cli.smartcam import command as smartcam_command
 from smartcam._cli.smartcam_emulator import PROTOCOL
@@ -21,6 +20,7 @@ from smartcam._dissector import lua_source
 from smartcam.protocols import BVS
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 from tests.cli.commandline import each, run, run_emulator
+from tests.cli.inside import DIALECTS
 from tests.processes import Process, printed_by
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from smartcam.models import Connected, Reconnected
 from smartcam.recording import load_recording
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Process, wait_until
+from tests.processes import PATIENCE, Process, largest_file, wait_until
 from tests.wireshark import TSHARK, needs_tshark
 
 SESSIONS = (Connected, Reconnected)
@@ -148,18 +147,6 @@ def test_record_of_a_camera_that_sends_nothing_asks_for_every(tmp_path: Path) ->
     assert "the camera sends no results by itself" in first.err
     assert "while it is recorded: --every SECONDS" in first.err
     assert load_recording(tmp_path / "b.mcap").counts.results == 2
-
-
-@contextlib.contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Have files of this process refused to grow beyond ``size`` bytes."""
-    resource = pytest.importorskip("resource", reason="a limit of POSIX")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_record_to_a_disk_that_gets_full_ends_with_its_text(url: str, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 
 import smartcam
 from smartcam import Backoff, Camera, ConnectionLostError
-from smartcam._client import polling
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.models import Statistics
 from smartcam.observers import Observer, TraceEntry
@@ -25,6 +24,7 @@ from tests.client.camera_by_hand import (
     HandmadeBid,
     HandmadeCamera,
 )
+from tests.client.inside import polling
 from tests.handmade import until
 from tests.insides import inside
 

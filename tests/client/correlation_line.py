@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from smartcam import Status
-from smartcam._client.correlation import SentTrigger
 from tests.client.inside import (
     Correlation,
     Debt,
@@ -11,6 +10,7 @@ from tests.client.inside import (
     EvidenceByFence,
     EvidenceByStatus,
     Match,
+    SentTrigger,
     TriggerEvidence,
 )
 

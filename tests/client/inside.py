@@ -1,8 +1,9 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam._client import handshake
+from smartcam._client import handshake, link, polling
+from smartcam._client.connection import Connection
 from smartcam._client.correlation import (
     Correlation,
     Debt,
@@ -10,24 +11,15 @@ from smartcam._client.correlation import (
     EvidenceByFence,
     EvidenceByStatus,
     Match,
+    SentTrigger,
     TriggerEvidence,
+    _Owed,
 )
+from smartcam._client.dispatch import Dispatch
+from smartcam._client.doorbell import DirectFuture, Doorbell, outlast
 from smartcam._client.handshake import establish
-from smartcam._client.link import Chunk, Link
+from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, open_link, split
+from smartcam._client.requests import Requests
 from smartcam._client.results import PendingTrigger, Results
-
-__all__ = [
-    "Chunk",
-    "Correlation",
-    "Debt",
-    "EvidenceByAnswer",
-    "EvidenceByFence",
-    "EvidenceByStatus",
-    "Link",
-    "Match",
-    "PendingTrigger",
-    "Results",
-    "TriggerEvidence",
-    "establish",
-    "handshake",
-]
+from smartcam._client.triggering import FENCED_TRIGGER
+from smartcam._client.waits import StatusWaiter, Waits

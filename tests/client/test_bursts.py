@@ -23,14 +23,13 @@ from smartcam import (
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
-from smartcam._client.link import LARGEST_CHUNK, split
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.models import Localization, Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ResultBurst
 from tests.client.camera_by_hand import NUMBER, READY, RUNNING, TRIGGER, WAITING, HandmadeCamera
 from tests.client.clientkit import SHORT, balance, by_hand, cancelled, gone, hear, steps
-from tests.client.inside import Chunk
+from tests.client.inside import LARGEST_CHUNK, Chunk, split
 from tests.handmade import until
 from tests.insides import inside
 

@@ -12,10 +12,9 @@ import pytest
 
 import smartcam
 from smartcam import ConnectionClosedError, NotRunningError
-from smartcam._client.correlation import _Owed
 from smartcam.emulator import EmulatedCamera
 from tests.client.clientkit import balance
-from tests.client.inside import TriggerEvidence
+from tests.client.inside import TriggerEvidence, _Owed
 from tests.insides import inside
 
 if TYPE_CHECKING:

@@ -9,15 +9,14 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from smartcam._client import link as connection
-from smartcam._client.link import open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
-from tests.client.inside import Chunk, Link
+from tests.client.inside import Chunk, Link, open_link, outlast
+from tests.client.inside import link as connection
 from tests.handmade import (
     BUSY,
     CONNECT,
@@ -381,7 +380,7 @@ async def test_close_cancelled_drops_the_link(server: Listener) -> None:
     await asyncio.wait({closing})
     assert closing.cancelled()
     assert await peer.rest() == b""
-    assert link._closed.done()
+    assert link._closed
 
 
 async def test_close_after_the_peer_is_gone_returns_at_once(server: Listener) -> None:
@@ -396,7 +395,7 @@ async def test_close_while_the_transport_is_closing_waits_for_its_end(server: Li
     link, peer = await session(server)
     link._transport.close()
     await link.close(LIMIT)
-    assert link._closed.done()
+    assert link._closed
     await peer.rest()
 
 
@@ -595,7 +594,7 @@ async def test_udp_refused_port_is_lost() -> None:
         link.send(m.Connect())
         error = await lost(link)
         assert isinstance(error.__cause__, ConnectionRefusedError)
-        await until(link._closed.done)
+        await until(lambda: link._closed)
         await link.close(LIMIT)
 
 
@@ -611,7 +610,7 @@ async def test_udp_datagrams_that_have_come_are_taken_together_in_order() -> Non
         assert chunk.events == connection.MAX_DATAGRAMS_AT_ONCE * [RUNNING]
         assert await take(link, 12) == 12 * [RUNNING]
         link.abort()
-        await until(link._closed.done)
+        await until(lambda: link._closed)
         assert link._aside is None
 
 
@@ -631,7 +630,7 @@ async def test_udp_refusal_among_datagrams_is_told_behind_those_before_it(
     assert await take(link, 1) == [RUNNING]
     error = await lost(link)
     assert isinstance(error.__cause__, ConnectionRefusedError)
-    await until(link._closed.done)
+    await until(lambda: link._closed)
 
 
 async def test_udp_queue_full_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -660,3 +659,45 @@ async def test_trace_shows_what_is_left_of_an_unfinished_frame(server: Listener,
     assert [(entry.message, entry.hex) for entry in left] == [
         ("15 bytes that make no whole frame", STATUS[:15].hex())
     ]
+
+
+# ---------------------------------------------------------------------- the end of a task
+
+
+async def test_outlast_returns_when_the_task_has_failed_and_raises_nothing() -> None:
+    async def fail() -> None:
+        await asyncio.sleep(0)
+        raise ValueError("not for whoever waits")
+
+    task = asyncio.create_task(fail())
+    await outlast(task)
+    assert str(task.exception()) == "not for whoever waits"
+    await outlast(task)
+
+
+async def test_outlast_cancelled_leaves_the_task_and_the_others_that_wait_alone() -> None:
+    end = asyncio.Event()
+    task = asyncio.create_task(end.wait())
+    one, other = (asyncio.create_task(outlast(task)) for _ in range(2))
+    await asyncio.sleep(0)
+    one.cancel()
+    await asyncio.wait({one})
+    assert one.cancelled()
+    assert not task.done()
+    assert not other.done()
+    end.set()
+    await other
+    assert await task
+
+
+async def test_wait_closed_ends_at_its_timeout_for_each_that_waits(server: Listener) -> None:
+    link, peer = await session(server)
+    begin = asyncio.get_running_loop().time()
+    longer = asyncio.create_task(link.wait_closed(LIMIT))
+    await link.wait_closed(0.01)
+    assert asyncio.get_running_loop().time() - begin >= 0.01
+    assert not longer.done()
+    peer.close()
+    await take(link, 1)
+    await longer
+    link.abort()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import struct
+from typing import Any
 
 import pytest
 
-from smartcam import Backoff, InterpretationError, Status, TriggerTimeoutError
+from smartcam import Backoff, Camera, InterpretationError, Status, TriggerTimeoutError
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
     CONNECT,
@@ -60,6 +61,15 @@ def last(box: HandmadeCamera) -> int:
     """Return the number that was set last."""
     payload = [payload for one, payload in box.received if one == NUMBER][-1]
     return int.from_bytes(payload, "little")
+
+
+async def times_out(box: HandmadeCamera, camera: Camera[Any]) -> None:
+    """Have a trigger time out that the camera takes, and does not answer."""
+    trigger = box.script[TRIGGER]
+    box.script[TRIGGER] = box.takes
+    with pytest.raises(TriggerTimeoutError):
+        await camera.trigger(timeout=SHORT)
+    box.script[TRIGGER] = trigger
 
 
 @TRANSPORTS
@@ -226,11 +236,7 @@ async def test_numbers_of_the_emulator_keep_sensors_and_triggers_apart(transport
 @pytest.mark.parametrize("order", ["result first", "waiting first"])
 async def test_late_result_within_the_grace_needs_no_stop(order: str) -> None:
     async with by_hand() as (box, camera):
-        trigger = box.script[TRIGGER]
-        box.script[TRIGGER] = box.takes
-        with pytest.raises(TriggerTimeoutError):
-            await camera.trigger(timeout=SHORT)
-        box.script[TRIGGER] = trigger
+        await times_out(box, camera)
         mark = len(box.ids)
         triggering = asyncio.create_task(camera.trigger())
         await steps(10)
@@ -244,11 +250,7 @@ async def test_late_result_within_the_grace_needs_no_stop(order: str) -> None:
 
 async def test_late_result_that_does_not_come_is_made_impossible_after_the_grace() -> None:
     async with by_hand() as (box, camera):
-        trigger = box.script[TRIGGER]
-        box.script[TRIGGER] = box.takes
-        with pytest.raises(TriggerTimeoutError):
-            await camera.trigger(timeout=SHORT)
-        box.script[TRIGGER] = trigger
+        await times_out(box, camera)
         mark, loop = len(box.ids), asyncio.get_running_loop()
         begin = loop.time()
         assert (await camera.trigger()).raw == b"found"
@@ -258,11 +260,7 @@ async def test_late_result_that_does_not_come_is_made_impossible_after_the_grace
 
 async def test_grace_is_half_the_time_of_a_short_trigger() -> None:
     async with by_hand() as (box, camera):
-        trigger = box.script[TRIGGER]
-        box.script[TRIGGER] = box.takes
-        with pytest.raises(TriggerTimeoutError):
-            await camera.trigger(timeout=SHORT)
-        box.script[TRIGGER] = trigger
+        await times_out(box, camera)
         async with asyncio.timeout(SOON):
             assert (await camera.trigger(timeout=0.2)).raw == b"found"
 

@@ -11,13 +11,10 @@ import pytest
 
 import smartcam
 from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
-from smartcam._client import link
-from smartcam._client.doorbell import DirectFuture, Doorbell
-from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
 from tests.client.clientkit import balance, by_hand
-from tests.client.inside import handshake
+from tests.client.inside import LARGEST_CHUNK, DirectFuture, Doorbell, handshake, link
 from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted, until
 
 # ---------------------------------------------------------------------- what comes early
@@ -430,6 +427,31 @@ async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) ->
     await asyncio.sleep(0)
     assert await delivered(bell, lambda: outcome.set_result("here"), heard) == ["here"]
     assert await caller == "here"
+
+
+async def test_outcome_that_is_given_wakes_its_caller_at_once(bell: Doorbell) -> None:
+    heard, said = list[str](), asyncio.get_running_loop().create_future()
+    outcome: DirectFuture[str] = bell.outcome()
+    asking = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+
+    def give() -> None:
+        bell.give(outcome, "it")
+        said.set_result([*heard])
+
+    asyncio.get_running_loop().call_soon(give)
+    assert await said == ["it"]
+    await asking
+
+
+async def test_outcome_that_a_task_gives_wakes_its_caller_by_the_loop(bell: Doorbell) -> None:
+    heard = list[str]()
+    outcome: DirectFuture[str] = bell.outcome()
+    asking = asyncio.create_task(ask(outcome, heard))
+    await asyncio.sleep(0)
+    bell.give(outcome, "it")
+    assert heard == []
+    assert await asking == "it"
 
 
 async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import struct
 from datetime import datetime
 
@@ -273,3 +274,14 @@ async def test_result_comes_where_the_answer_to_its_trigger_is_lost_or_late(
     async with box, smartcam.connect(box.url, application=5, interpret_as="n: int32") as camera:
         assert (await camera.trigger(timeout=1.0)).value.n == 0
         assert camera.statistics().unclaimed == 0
+
+
+async def test_datagrams_of_strangers_are_nothing_to_the_camera_by_hand() -> None:
+    """Another test may have had its port before: what still comes for that one changes nothing."""
+    async with by_hand(box=UDP) as (box, camera):
+        before = list(box.received)
+        with socket.socket(type=socket.SOCK_DGRAM) as stranger:
+            for data in (b"\x80\xc9\x00\x01" * 7, b"", box.frame(TRIGGER)):
+                stranger.sendto(data, ("127.0.0.1", box.port))
+            assert (await camera.trigger()).raw == b"found"
+            assert box.received == [*before, (TRIGGER, b"")]

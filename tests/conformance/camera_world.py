@@ -9,8 +9,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from smartcam._loop_thread import LoopThread
-from smartcam.conformance.camera import Allow, CameraReport, ConformanceOptions, judge
+from smartcam.conformance.camera import Allow, ConformanceOptions, judge
 from smartcam.emulator import EmulatedCamera
+from tests.conformance.inside import CameraReport
 from tests.conformance.pace import is_first, slowed
 
 APPLICATION, OTHER = 5, 6

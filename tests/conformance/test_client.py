@@ -15,8 +15,8 @@ from smartcam.conformance.client import CHECKS, SCENES, CommandClient, FunctionC
 from smartcam.conformance.client._checks import Grade
 from smartcam.conformance.client._report import ClientFinding, judge
 from smartcam.conformance.client._runs import ClientRun
-from smartcam.conformance.client._tasks import Client
 from tests.client.clientkit import ask_again_after
+from tests.conformance.inside import Client
 from tests.conformance.pace import at_any_pace, is_first, slowed
 from tests.conformance.plain_client import plain_client
 

@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from smartcam.conformance.client import CommandClient, FunctionClient, Outcome, Task
-from smartcam.conformance.client._tasks import read_results
 from smartcam.exceptions import ConfigurationError
+from tests.conformance.inside import read_results
 from tests.conformance.pace import at_any_pace, slowed
 
 pytestmark = pytest.mark.real_time

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import pytest
 
 from smartcam.calibration import Transform
-from smartcam.depth import Cloud, Registration, register
+from smartcam.depth import Cloud, register
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def pair(shape: Shape, seed: int, noise: float = NOISE, count: int = 3000) -> tu
     return tuple(Cloud(one + rng.normal(0, noise, one.shape)) for one in (source, target))  # type: ignore[return-value]
 
 
-def error(found: Registration) -> Array:
+def error(found: Any) -> Array:
     """Return turn and shift (6,) from the truth to what was found, as the covariance has them."""
     return MOTION.rigid.after(found.pose.rigid)
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from smartcam._extras import load
-from smartcam.depth import Disparity, StereoMatcher
+from smartcam.depth import StereoMatcher
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from tests.depth.scenes import Scene, plane, step
 
@@ -42,7 +42,7 @@ def rms(values: NDArray[Any]) -> float:
     return float(np.sqrt(np.mean(values.astype(np.float64) ** 2)))
 
 
-def compared(found: Disparity, scene: Scene) -> Compared:
+def compared(found: Any, scene: Scene) -> Compared:
     error = found.pixels - scene.truth
     known = np.isfinite(found.pixels) & scene.seen
     fine = known & (found.sigma < MIN_COARSE_SIGMA_PX)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
-from smartcam.doctor import Finding, _state_checks, examine
+from smartcam.doctor import Finding, examine
+from tests.doctor.inside import _state_checks
 from tests.processes import PATIENCE
 
 if TYPE_CHECKING:
     import pytest
 
-    from smartcam.doctor._findings import Severity
-    from tests.doctor.inside import Exit
+    from tests.doctor.inside import Exit, Severity
 
 STEP = 1.0
 """Seconds of a step that is not meant to run out."""

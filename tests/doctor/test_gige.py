@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 from smartcam.doctor import examine
 from smartcam.exceptions import ConfigurationError
 from tests.frames.gige.camera import DESCRIPTION, Mischief, camera
+from tests.processes import network_namespace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -278,17 +278,7 @@ async def test_cancelled_examination_gives_the_camera_back() -> None:
 @pytest.fixture(scope="module")
 def namespace() -> list[str]:
     """Return the command that runs another one in a network namespace of its own."""
-    for program, package in (
-        ("arv-fake-gv-camera-0.8", "aravis-tools"),
-        ("ip", "iproute2"),
-        ("unshare", "util-linux"),
-    ):
-        if shutil.which(program) is None:
-            pytest.skip(f"needs {program}: apt-get install {package}")
-    for command in (["unshare", "-n"], ["unshare", "-r", "-n"]):
-        if subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0:  # noqa: S603
-            return command
-    pytest.skip("needs network namespaces: unshare -n is not allowed here")
+    return network_namespace("arv-fake-gv-camera-0.8", "aravis-tools")
 
 
 def there(namespace: list[str], situation: str) -> list[dict[str, Any]]:

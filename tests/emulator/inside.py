@@ -1,8 +1,17 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam.emulator._generators import generator_names
-from smartcam.emulator._links import _TcpLink
-
-__all__ = ["_TcpLink", "generator_names"]
+from smartcam.emulator._bvs.behaviour import behaviour_of
+from smartcam.emulator._client_link import MAX_INPUT_BYTES, SecondClientSession, Trace
+from smartcam.emulator._clock import NANOSECONDS
+from smartcam.emulator._generators import _FOUND, generator_names
+from smartcam.emulator._insight.commands import InSightCommands
+from smartcam.emulator._insight.device import InSightDevice
+from smartcam.emulator._insight.job import BUILTIN_JOBS, Control, make_job, shown
+from smartcam.emulator._links import TcpListener, _TcpLink
+from smartcam.emulator._scenario.timeline import MAX_AT_ONCE, MAX_PENDING, Timeline
+from smartcam.emulator.faults import _matching
+from smartcam.emulator.faults._base import WireFault
+from smartcam.emulator.faults._matching import FaultQueue
+from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam.emulator import Device, ManualClock, Quirks, Scenario
-from smartcam.emulator._bvs.behaviour import behaviour_of
-from smartcam.emulator._clock import NANOSECONDS
-from smartcam.emulator._insight.commands import InSightCommands
-from smartcam.emulator._insight.device import InSightDevice
-from smartcam.emulator._scenario.timeline import Timeline
-from tests.emulator.inside import generator_names
+from tests.emulator.inside import (
+    NANOSECONDS,
+    InSightCommands,
+    InSightDevice,
+    Timeline,
+    behaviour_of,
+    generator_names,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

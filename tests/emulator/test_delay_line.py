@@ -8,9 +8,9 @@ import pytest
 
 from smartcam.emulator import ManualClock, faults
 from smartcam.emulator._inside import DelayLine, Ending, Transmission
-from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
 from smartcam.protocols import Frame
 from smartcam.protocols._inside import HANDBOOK, Framer
+from tests.emulator.inside import WireMessage, apply_faults, cut, cut_datagram
 from tests.machines import THESIS
 
 

@@ -10,13 +10,12 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
 from smartcam.emulator._inside import MESSAGE_NAMES, BaseFault, DeviceFault
-from smartcam.emulator.faults import _matching as matching
-from smartcam.emulator.faults._base import WireFault
-from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
+from tests.emulator.inside import FaultQueue, WireFault
+from tests.emulator.inside import _matching as matching
 from tests.machines import MESSAGES
 
 EXAMPLES: list[dict[str, Any]] = [

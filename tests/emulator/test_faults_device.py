@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator._client_link import SecondClientSession
 from smartcam.models import Status
 from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import RawClient, UdpClient, heard
+from tests.emulator.inside import SecondClientSession
 from tests.handmade import until
 
 HELLO = (wire.CONNECTED, wire.WAITING)

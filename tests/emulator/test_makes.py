@@ -9,13 +9,13 @@ import pytest
 
 import smartcam.sync
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, Scenario
-from smartcam.emulator._generators import _FOUND
 from smartcam.emulator._inside import check_options, emulated_class, find_generator
 from smartcam.emulator._line_codec import _LineForm
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
 from smartcam.protocols import BVS
 from smartcam.registry import GENERATORS, PROTOCOLS
 from smartcam.testing import ThreadedCamera
+from tests.emulator.inside import _FOUND
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,11 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator._client_link import MAX_INPUT_BYTES
-from smartcam.emulator._links import TcpListener
-from smartcam.emulator.faults._base import WireFault
-from smartcam.emulator.faults._matching import FaultQueue
-from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
 from smartcam.models import Status
 from smartcam.protocols import Frame, Machine, Role
 from smartcam.protocols import Transport as CarriedBy
@@ -25,13 +20,21 @@ from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.builtins import BUILTIN_APPLICATIONS
 from tests.emulator.camera_wire import RawClient, UdpClient
-from tests.emulator.inside import _TcpLink
+from tests.emulator.inside import (
+    MAX_INPUT_BYTES,
+    FaultQueue,
+    TcpListener,
+    WireFault,
+    WireMessage,
+    _TcpLink,
+    apply_faults,
+)
 from tests.handmade import until
 from tests.machines import MESSAGES, THESIS
 
 if TYPE_CHECKING:
-    from smartcam.emulator._client_link import Trace
     from smartcam.emulator._inside import ClientLink, Clock
+    from tests.emulator.inside import Trace
 
 ECHO = Application(
     id=4, layout="s: string[2], b: bool", input="s: string[2], b: bool", generator="input"

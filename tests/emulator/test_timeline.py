@@ -13,15 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from smartcam.emulator import Cue, DeviceState, EmulatedCamera, ManualClock
+from smartcam.emulator import Cue, EmulatedCamera, ManualClock
 from smartcam.emulator._inside import RealClock
-from smartcam.emulator._scenario.timeline import MAX_AT_ONCE, MAX_PENDING, Timeline
+from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator.faults import Fault
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
+from tests.emulator.inside import MAX_AT_ONCE, MAX_PENDING, Timeline
 
 STOP = {"kind": "stop"}
 

@@ -7,7 +7,6 @@ import tracemalloc
 import pytest
 
 from smartcam.emulator import EmulatedCamera, LogEntry
-from smartcam.emulator._client_link import MAX_INPUT_BYTES
 from smartcam.emulator._traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, TrafficLog
 from smartcam.exceptions import FrameError, ResponseTimeoutError
 from smartcam.protocols import Frame
@@ -15,6 +14,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
+from tests.emulator.inside import MAX_INPUT_BYTES
 
 QUERY = Frame(0x30, b"")
 PEER = "127.0.0.1:5"

@@ -8,15 +8,12 @@ import struct
 from pathlib import Path
 
 from smartcam._zenoh import MAX_WAITING_BYTES
-from smartcam.fleet._agent.bundle import decode_bundle
-from smartcam.fleet._agent.summary import _read as read_summary
-from smartcam.fleet._bus import wire as _wire
-from smartcam.fleet._bus.address import CERTIFICATE_FILES
-from smartcam.fleet._frames.wire import decode_part
 from smartcam.fleet._inside import meets, read_identity
-from smartcam.fleet._json.plain import request_fields
 from tests.budgets.inputs import JSON
 from tests.budgets.parser import Make, Parser, fill, fill_text, grown
+from tests.fleet.inside import CERTIFICATE_FILES, decode_bundle, decode_part, request_fields
+from tests.fleet.inside import _read as read_summary
+from tests.fleet.inside import wire as _wire
 
 
 def _message(payload: bytes) -> None:

@@ -12,12 +12,10 @@ from smartcam._client._inside import TriggerRequest
 from smartcam._zenoh import BusLink
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet import FleetCamera, MemoryBus
-from smartcam.fleet._agent.shared import Carrier
-from smartcam.fleet._frames.camera_frames import FramesOf
 from smartcam.fleet._inside import Bus, Keys, ZenohEnd
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
-from tests.fleet.inside import Agent, MemoryEnd, Program
+from tests.fleet.inside import Agent, Carrier, FramesOf, MemoryEnd, Program
 from tests.processes import free_place
 
 FLEET = "plant"

@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._file.fleet_file import FramesEntry
-from smartcam.fleet._frames.camera_frames import SharedFrames
 from smartcam.frames import FrameDriver, FrameSource
 from tests.fleet.fleetkit import NAME, Plant, until
+from tests.fleet.inside import FramesEntry, SharedFrames
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.timed_loop import TimedLoop
 

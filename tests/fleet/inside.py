@@ -1,38 +1,58 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._agent.gate import Gate
-from smartcam.fleet._bus import zenoh
-from smartcam.fleet._bus.bus import Data, Handle, MemoryEnd, Publisher
-from smartcam.fleet._bus.log import AgentLog
-from smartcam.fleet._bus.wire import decode, decode_order, decode_outcome, encode
+from smartcam.fleet._agent import agent, workers
+from smartcam.fleet._agent.agent import Agent, CallNumbers
+from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
+from smartcam.fleet._agent.gate import Change, Gate, InLine
+from smartcam.fleet._agent.shared import Carrier
+from smartcam.fleet._agent.summary import _read
+from smartcam.fleet._agent.workers import Workers
+from smartcam.fleet._bus import wire, zenoh
+from smartcam.fleet._bus.address import CERTIFICATE_FILES, check_name, check_pattern
+from smartcam.fleet._bus.bus import BusQuestion, Data, Handle, MemoryEnd, Publisher, never
+from smartcam.fleet._bus.log import AgentLog, Feed
+from smartcam.fleet._bus.wire import (
+    ResultRun,
+    TriggerOrder,
+    decode,
+    decode_order,
+    decode_outcome,
+    decode_runs,
+    decode_state,
+    encode,
+    encode_order,
+    encode_outcome,
+    encode_runs,
+    encode_state,
+    encode_status,
+    timestamp,
+)
+from smartcam.fleet._file.fleet_file import FramesEntry
 from smartcam.fleet._file.standby import Standby
+from smartcam.fleet._frames import camera_frames, collector
+from smartcam.fleet._frames.camera_frames import FramesOf, SharedFrames
+from smartcam.fleet._frames.collector import FrameCollector, Incoming
+from smartcam.fleet._frames.wire import (
+    MAX_FRAME_BYTES,
+    FramePart,
+    decode_part,
+    encode_part,
+    to_fields,
+)
 from smartcam.fleet._json import plain
-from smartcam.fleet._program.caller import Caller
+from smartcam.fleet._json.plain import request_fields
+from smartcam.fleet._json.services import SERVICES, PlainRequest
+from smartcam.fleet._json.thesis import THESIS
+from smartcam.fleet._operations import metric_families
+from smartcam.fleet._operations.metric_families import _SUMS
+from smartcam.fleet._operations.trigger_counts import OUTCOMES, outcome_of
+from smartcam.fleet._program import fleet
+from smartcam.fleet._program.caller import Caller, Lease, Met
 from smartcam.fleet._program.program import Program
-from smartcam.fleet._program.program_name import ProgramName, in_words
-from smartcam.fleet._security import renewal
-
-__all__ = [
-    "Agent",
-    "AgentLog",
-    "Caller",
-    "Data",
-    "Gate",
-    "Handle",
-    "MemoryEnd",
-    "Program",
-    "ProgramName",
-    "Publisher",
-    "Standby",
-    "decode",
-    "decode_order",
-    "decode_outcome",
-    "encode",
-    "in_words",
-    "plain",
-    "renewal",
-    "zenoh",
-]
+from smartcam.fleet._program.program_name import ProgramName, in_words, names_of
+from smartcam.fleet._security import door, renewal
+from smartcam.fleet._security.access import RIGHTS, access_control, ros_rights
+from smartcam.fleet._security.certificates import MAX_BYTES, ROLES, context
+from smartcam.fleet._security.door import Door

@@ -32,6 +32,18 @@ COUNTER, TEXTS, LOCALIZATIONS, SILENT = 11, 12, 7, 13
 LAYOUT = "n: int32"
 
 
+async def ask_thesis(session: Any, service: str, fields: dict[str, Any]) -> dict[str, Any]:
+    """Return what a service of the thesis' interface answers to a program at plain Zenoh."""
+    payload = json.dumps({"camera_name": NAME, **fields}).encode()
+
+    def get() -> Any:
+        (reply,) = session.get(f"{PREFIX}/thesis/{service}", payload=payload, timeout=PATIENCE)
+        return json.loads(reply.ok.payload.to_bytes())
+
+    answer: dict[str, Any] = await asyncio.to_thread(get)
+    return answer
+
+
 def applications() -> list[Application]:
     """Return a counter from 1, one that sends two texts, and one that sends nothing."""
     counts: list[Any] = [{"n": number} for number in range(1, 100)]

@@ -12,9 +12,8 @@ from typing import Any
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
 from smartcam.fleet._inside import ZenohEnd, make_certificates
-from smartcam.fleet._security.access import access_control
-from smartcam.fleet._security.door import Door
 from tests.fleet.fleetkit import PATIENCE
+from tests.fleet.inside import Door, access_control
 from tests.processes import free_port
 
 NAMES = {

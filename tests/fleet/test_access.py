@@ -14,11 +14,8 @@ import pytest
 from smartcam.fleet._agent.calls import ACTIONS
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._inside import Keys, ZenohEnd, may_command, meets
-from smartcam.fleet._json.services import SERVICES
-from smartcam.fleet._json.thesis import THESIS
-from smartcam.fleet._security.access import RIGHTS, ros_rights
-from smartcam.fleet._security.certificates import ROLES
 from tests.fleet.fleetkit import PATIENCE, until
+from tests.fleet.inside import RIGHTS, ROLES, SERVICES, THESIS, ros_rights
 from tests.fleet.plantkit import WHO, certified, guarded, joined
 
 pytestmark = pytest.mark.real_time

@@ -11,9 +11,9 @@ import smartcam
 import smartcam.fleet
 from smartcam._zenoh import engine
 from smartcam.exceptions import ConfigurationError, MissingExtraError, UnsupportedError
-from smartcam.fleet._bus.address import check_name, check_pattern
 from smartcam.fleet._inside import FleetAddress
 from smartcam.settings import parse_address
+from tests.fleet.inside import check_name, check_pattern
 from tests.test_exports import newly_imported
 
 PARSED = [

@@ -18,16 +18,22 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.fleet import FleetServer, MemoryBus
-from smartcam.fleet._agent.gate import Change
-from smartcam.fleet._bus.bus import BusQuestion, never
 from smartcam.fleet._inside import Keys, meets
-from smartcam.fleet._json.services import SERVICES
-from smartcam.fleet._json.thesis import THESIS
-from smartcam.fleet._program import fleet as _fleet
 from smartcam.models import CameraEvent
 from tests import ROOT
 from tests.fleet.fleetkit import until
-from tests.fleet.inside import Data, Handle, MemoryEnd, Publisher
+from tests.fleet.inside import (
+    SERVICES,
+    THESIS,
+    BusQuestion,
+    Change,
+    Data,
+    Handle,
+    MemoryEnd,
+    Publisher,
+    never,
+)
+from tests.fleet.inside import fleet as _fleet
 from tests.fleet.plainkit import (
     COUNTER,
     NAME,

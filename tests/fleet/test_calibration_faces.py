@@ -10,7 +10,6 @@ import asyncio
 import base64
 import contextlib
 import functools
-import json
 import re
 import time
 from pathlib import Path
@@ -31,7 +30,7 @@ from smartcam.ros2 import Node, QoS
 from tests.calibration.scenes import SHEET
 from tests.calibration.wizards.bench import GRID, OFFSET, ROTATION, Bench, where
 from tests.calibration.wizards.test_hand_eye import CAMERA, TRUTH
-from tests.fleet.plainkit import NAME, PREFIX, zenoh_session
+from tests.fleet.plainkit import NAME, ask_thesis, zenoh_session
 from tests.processes import free_place
 from tests.ros1.bridge import Bridge
 
@@ -162,15 +161,7 @@ class JsonFace(Face):
         self._session = session
 
     async def ask(self, service: str, **fields: Any) -> dict[str, Any]:
-        payload = json.dumps({"camera_name": NAME, **fields}).encode()
-
-        def get() -> Any:
-            key = f"{PREFIX}/thesis/{service}"
-            (reply,) = self._session.get(key, payload=payload, timeout=PATIENCE)
-            return json.loads(reply.ok.payload.to_bytes())
-
-        answer: dict[str, Any] = await asyncio.to_thread(get)
-        return answer
+        return await ask_thesis(self._session, service, fields)
 
 
 def fields_of(value: Any) -> Any:

@@ -16,9 +16,8 @@ from smartcam._accepting import is_loopback
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
-from smartcam.fleet._bus.address import CERTIFICATE_FILES
 from smartcam.fleet._inside import MadeCertificate, ZenohEnd, make_certificates, read_identity
-from smartcam.fleet._security.certificates import MAX_BYTES, context
+from tests.fleet.inside import CERTIFICATE_FILES, MAX_BYTES, context
 
 YEAR = timedelta(days=365)
 

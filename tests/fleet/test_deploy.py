@@ -13,11 +13,11 @@ import pytest
 import yaml
 
 from smartcam.fleet import load_fleet
-from smartcam.fleet._operations import metric_families as families
 from smartcam.fleet._operations import metrics
-from smartcam.fleet._operations.trigger_counts import OUTCOMES
 from tests import ROOT
 from tests.cli.commandline import run
+from tests.fleet.inside import OUTCOMES
+from tests.fleet.inside import metric_families as families
 
 DEPLOY = ROOT / "deploy"
 

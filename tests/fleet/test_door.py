@@ -16,9 +16,9 @@ import pytest
 import smartcam
 import smartcam.fleet
 from smartcam.fleet._agent import server as _server
-from smartcam.fleet._security import door as _door
-from smartcam.fleet._security.door import Door
 from tests.fleet.fleetkit import PATIENCE, until
+from tests.fleet.inside import Door
+from tests.fleet.inside import door as _door
 from tests.fleet.inside import zenoh as _zenoh
 from tests.fleet.plantkit import certified, plant_file, url_of
 

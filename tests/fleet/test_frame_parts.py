@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._frames import collector as _frame_collector
-from smartcam.fleet._frames.collector import FrameCollector, Incoming
 from smartcam.fleet._frames.features import feature_fields, read_feature
 from smartcam.fleet._frames.sender import (
     MAX_UNCOUNTED_BYTES,
@@ -24,13 +22,22 @@ from smartcam.fleet._frames.sender import (
     WINDOW_BYTES,
     FrameSender,
 )
-from smartcam.fleet._frames.wire import MAX_FRAME_BYTES, FramePart, decode_part, encode_part
 from smartcam.fleet._inside import Keys
 from smartcam.frames import Feature
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
-from tests.fleet.inside import Data, MemoryEnd
+from tests.fleet.inside import (
+    MAX_FRAME_BYTES,
+    Data,
+    FrameCollector,
+    FramePart,
+    Incoming,
+    MemoryEnd,
+    decode_part,
+    encode_part,
+)
+from tests.fleet.inside import collector as _frame_collector
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.fleet.partner import partner
 from tests.frames.drivers import frame

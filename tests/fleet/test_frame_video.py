@@ -11,13 +11,13 @@ import pytest
 
 from smartcam import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.fleet import FleetFrame
-from smartcam.fleet._frames import collector as _frame_collector
 from smartcam.fleet._frames.video import KEY_EVERY, LATE_SECONDS, SharedVideo, VideoUnit
 from smartcam.frames import Codecs, Frame, FrameSource, find_format
 from smartcam.frames._inside import entry_point, read_stamp
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
+from tests.fleet.inside import collector as _frame_collector
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.frames.pictures import stripes, write_stamp

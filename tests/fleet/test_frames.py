@@ -24,14 +24,13 @@ from smartcam import (
 from smartcam.calibration import CameraModel
 from smartcam.fleet import FleetFrame
 from smartcam.fleet._frames import caller as _frame_caller
-from smartcam.fleet._frames import camera_frames as _frames
 from smartcam.fleet._frames import stream as _frame_stream
-from smartcam.fleet._frames.camera_frames import SharedFrames
-from smartcam.fleet._frames.wire import to_fields
 from smartcam.frames import Moment
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, PATIENCE, Plant, end_of, until
 from tests.fleet.framekit import FramePlant, looking
+from tests.fleet.inside import SharedFrames, to_fields
+from tests.fleet.inside import camera_frames as _frames
 from tests.frames.drivers import GoneError, frame
 from tests.timed_loop import TimedLoop
 

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from smartcam.fleet._bus.log import Feed
-from tests.fleet.inside import AgentLog
+from tests.fleet.inside import AgentLog, Feed
 
 
 class Things(NamedTuple):

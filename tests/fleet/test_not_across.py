@@ -62,6 +62,7 @@ async def test_statistics_have_what_came_to_this_program() -> None:
     async with EmulatedCamera(running=True) as box, connect("in_process", box.url) as camera:
         await camera.trigger()
         box.device.trigger()  # nobody listens here
+        await camera.query_application()  # its answer is behind the status that says so
         await camera.trigger(timeout=30)
         statistics = camera.statistics()
     assert (statistics.received, statistics.triggered, statistics.unclaimed) == (2, 2, 0)

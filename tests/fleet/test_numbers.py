@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import smartcam
 from smartcam import exceptions
-from smartcam.fleet._operations.metric_families import _SUMS as SUM_NAMES
-from smartcam.fleet._operations.trigger_counts import OUTCOMES, outcome_of
+from tests.fleet.inside import _SUMS as SUM_NAMES
+from tests.fleet.inside import OUTCOMES, outcome_of
 from tests.web.test_operations import ask, parser, watched, words_of
 
 

@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 
-from smartcam.fleet._json.services import SERVICES, PlainRequest
-from smartcam.fleet._json.thesis import THESIS
 from tests.argument_table import (
     JSON_FIELDS,
     JSON_KINDS,
@@ -16,6 +14,7 @@ from tests.argument_table import (
     JSON_SERVICES,
     JSON_THESIS,
 )
+from tests.fleet.inside import SERVICES, THESIS, PlainRequest
 from tests.fleet.plainkit import NAME, PREFIX, Plant, plant
 
 BASE: dict[str, dict[str, Any]] = {

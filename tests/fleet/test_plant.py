@@ -13,12 +13,11 @@ from smartcam import Result
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, RemoteProtocolError
 from smartcam.fleet import Fleet, FleetServer, MemoryBus
-from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
 from smartcam.fleet._inside import Keys
-from smartcam.fleet._program import fleet as _fleet
 from smartcam.fleet._program.exchange import Exchange
 from tests.fleet.fleetkit import PATIENCE, until
-from tests.fleet.inside import MemoryEnd, in_words
+from tests.fleet.inside import AgentBundle, MemoryEnd, decode_bundle, in_words
+from tests.fleet.inside import fleet as _fleet
 from tests.fleet.test_fleet import HELLO, file
 from tests.processes import free_place
 

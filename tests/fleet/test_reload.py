@@ -18,8 +18,8 @@ from smartcam.exceptions import (
     ConnectionLostError,
     SmartCamError,
 )
-from smartcam.fleet import Fleet, FleetChanges, FleetFile, FleetServer, MemoryBus
-from smartcam.fleet._agent.reload import LoadedFleet, changes_of, loaded
+from smartcam.fleet import Fleet, FleetFile, FleetServer, MemoryBus
+from smartcam.fleet._agent.reload import FleetChanges, LoadedFleet, changes_of, loaded
 from smartcam.models import Disconnected
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings, parse_address

@@ -18,7 +18,7 @@ from smartcam.fleet._inside import FleetAddress, RosSection
 from smartcam.ros1._inside import bridged
 from smartcam.ros2 import Node, QoS
 from tests.fleet.fleetkit import until
-from tests.fleet.plainkit import NAME, PATIENCE, PREFIX, zenoh_session
+from tests.fleet.plainkit import NAME, PATIENCE, PREFIX, ask_thesis, zenoh_session
 from tests.processes import free_place
 from tests.ros1.bridge import Bridge
 from tests.ros2.camerakit import BROKEN, PARTS, PIXELS, READ_AS, TEXTS, PartsCamera
@@ -165,15 +165,7 @@ class JsonFace(Face):
         await until(lambda: topics.results_out is not None and topics.results_out.publisher.heard)
 
     async def ask(self, service: str, fields: dict[str, Any]) -> dict[str, Any]:
-        payload = json.dumps({"camera_name": NAME, **fields}).encode()
-
-        def get() -> Any:
-            key = f"{PREFIX}/thesis/{service}"
-            (reply,) = self._session.get(key, payload=payload, timeout=PATIENCE)
-            return json.loads(reply.ok.payload.to_bytes())
-
-        answer: dict[str, Any] = await asyncio.to_thread(get)
-        return answer
+        return await ask_thesis(self._session, service, fields)
 
 
 class Ros2Face(Face):

@@ -19,17 +19,24 @@ import smartcam
 import smartcam.fleet
 from smartcam.exceptions import LocalProtocolError, ReservationLostError, TriggerTimeoutError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._agent import agent as _agent
-from smartcam.fleet._bus.wire import TriggerOrder, encode_order
-from smartcam.fleet._frames import camera_frames as _frames
 from smartcam.fleet._inside import Bus, Keys, meets
-from smartcam.fleet._json.services import SERVICES
-from smartcam.fleet._program.program_name import names_of
-from smartcam.fleet._security.access import RIGHTS
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, Plant, end_of, until
 from tests.fleet.framekit import FramePlant
-from tests.fleet.inside import ProgramName, decode, decode_outcome, encode, in_words
+from tests.fleet.inside import (
+    RIGHTS,
+    SERVICES,
+    ProgramName,
+    TriggerOrder,
+    decode,
+    decode_outcome,
+    encode,
+    encode_order,
+    in_words,
+    names_of,
+)
+from tests.fleet.inside import agent as _agent
+from tests.fleet.inside import camera_frames as _frames
 from tests.fleet.inside import plain as _plain
 from tests.fleet.plainkit import SILENT, plant
 from tests.fleet.plantkit import CAMERA, certified, joined, plant_file, url_of

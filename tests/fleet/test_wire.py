@@ -12,11 +12,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._bus.wire import (
+from tests.fleet.inside import (
     ResultRun,
     TriggerOrder,
+    decode,
+    decode_order,
+    decode_outcome,
     decode_runs,
     decode_state,
+    encode,
     encode_order,
     encode_outcome,
     encode_runs,
@@ -24,7 +28,6 @@ from smartcam.fleet._bus.wire import (
     encode_status,
     timestamp,
 )
-from tests.fleet.inside import decode, decode_order, decode_outcome, encode
 
 NUMBERS = st.integers(0, 2**32 - 1)
 CLOCKS = st.floats(-1e9, 1e9)

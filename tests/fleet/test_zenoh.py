@@ -27,6 +27,7 @@ from smartcam.fleet._inside import ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, until
+from tests.fleet.inside import zenoh
 from tests.fleet.partner import partner
 from tests.handmade import refusing
 from tests.processes import free_place, printed_by
@@ -505,6 +506,9 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
         heard = await heard_by(says, hears)
         session, done = says._session, threading.Event()
 
+        def waiting() -> int:
+            return hears._bytes - hears._taken_bytes
+
         def say() -> None:
             for _ in range(count):
                 session.put(
@@ -520,9 +524,9 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
             assert done.wait(PATIENCE)  # the loop does nothing else meanwhile
             thread.join()
             deadline = time.monotonic() + PATIENCE
-            while hears._bytes <= bound - size and time.monotonic() < deadline:
+            while waiting() <= bound - size and time.monotonic() < deadline:
                 time.sleep(0.01)  # noqa: ASYNC251 - that it does not run is the point
-        assert bound - size < hears._bytes <= bound
+        assert bound - size < waiting() <= bound
         await heard.come(bound // size)
         assert any("does not read" in record.message for record in caplog.records)
         caplog.clear()
@@ -530,8 +534,27 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
             while heard.payloads[-1] != b"last":  # as soon as it reads again, all is well
                 says.put("test/last", b"last")
                 await asyncio.sleep(0.05)
-        await until(lambda: not hears._bytes)  # of another last one
+        await until(lambda: not waiting())  # of another last one
         assert heard.payloads.count(bytes(size)) < count
+
+
+@pytest.mark.parametrize("idle", [0.0, 60.0])
+async def test_keys_that_are_used_again_have_publishers_within_a_bound(
+    idle: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh, "MAX_FREQUENT_KEYS", 2)
+    monkeypatch.setattr(zenoh, "IDLE_KEY_TIME", idle)
+    async with two_ends() as (hears, says):
+        heard = await heard_by(says, hears)
+        before, sent = len(says._declared), list[bytes]()
+        for number in range(40):
+            sent.append(b"%d" % number)
+            says.put(f"test/{number // 4 % 5}", sent[-1])
+            await asyncio.sleep(0.011)  # each by itself
+        await heard.come_all(sent)
+        assert set(says._frequent) == ({"test/3", "test/4"} if idle == 0 else {"test/0", "test/1"})
+        assert len(says._declared) == before + 2
+        assert all(one.used(0.0) is not None for one in says._frequent.values())
 
 
 async def test_end_that_is_closed_says_and_hears_nothing_and_can_be_closed_again() -> None:

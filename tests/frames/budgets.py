@@ -13,35 +13,43 @@ import zipfile
 from urllib.parse import urlsplit
 
 from smartcam.exceptions import SmartCamError
-from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES as MAX_BITMAP
-from smartcam.frames._codecs.jpeg import decode_jpeg
-from smartcam.frames._gige import description as _description
-from smartcam.frames._gige import expressions as _expressions
-from smartcam.frames._gige import gvcp as _gvcp
-from smartcam.frames._gige import setup as _setup
-from smartcam.frames._gige.assembler import Assembler
-from smartcam.frames._gige.event_channel import decode_events
-from smartcam.frames._gige.messages import cut_chunks
 from smartcam.frames._inside import GenicamFeatures, entry_point, jpeg_header, read_bitmap
-from smartcam.frames._streaming.rtp.assembling import MAX_ACCESS_UNIT_BYTES
-from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
-from smartcam.frames._streaming.rtp.h264 import units
-from smartcam.frames._streaming.rtp.h265 import H265Units
-from smartcam.frames._streaming.rtp.h265 import size_in as size_in_h265
-from smartcam.frames._streaming.rtp.jpeg import JpegUnits
-from smartcam.frames._streaming.rtp.packets import RtpPacket, parse_rtcp
-from smartcam.frames._streaming.rtp.parameters import picture_size
-from smartcam.frames._streaming.rtsp.addresses import target_of, wish_of
-from smartcam.frames._streaming.rtsp.authentication import _parts as digest_parts
-from smartcam.frames._streaming.rtsp.messages import ROOM, RequestParser, RtspError, RtspRequest
-from smartcam.frames._streaming.rtsp_client import answers as _answers
-from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
-from smartcam.frames._streaming.rtsp_client.description import described, url_of
-from smartcam.frames._streaming.rtsp_client.ways import options_of
-from smartcam.frames._video import multipart as _multipart
-from smartcam.frames._video import redirects as _redirects
 from tests.budgets.inputs import UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
+from tests.frames.inside import (
+    MAX_ACCESS_UNIT_BYTES,
+    ROOM,
+    Assembler,
+    Depacketizer,
+    H265Units,
+    JpegUnits,
+    RequestParser,
+    RtpPacket,
+    RtspError,
+    RtspRequest,
+    challenge_of,
+    cut_chunks,
+    decode_events,
+    decode_jpeg,
+    described,
+    options_of,
+    parse_rtcp,
+    picture_size,
+    target_of,
+    units,
+    url_of,
+    wish_of,
+)
+from tests.frames.inside import MAX_PIXEL_BYTES as MAX_BITMAP
+from tests.frames.inside import _parts as digest_parts
+from tests.frames.inside import answers as _answers
+from tests.frames.inside import description as _description
+from tests.frames.inside import expressions as _expressions
+from tests.frames.inside import gvcp as _gvcp
+from tests.frames.inside import multipart as _multipart
+from tests.frames.inside import redirects as _redirects
+from tests.frames.inside import setup as _setup
+from tests.frames.inside import size_in as size_in_h265
 
 
 def _rtsp(pieces: list[bytes]) -> None:

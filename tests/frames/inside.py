@@ -1,11 +1,72 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam.frames._gige.description import parse
-from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
+from smartcam.frames._codecs import pictures
+from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES
+from smartcam.frames._codecs.jpeg import decode_jpeg
+from smartcam.frames._codecs.pictures import to_jpegxl, to_png
+from smartcam.frames._gige import assembler, description, expressions, gvcp, setup
+from smartcam.frames._gige.assembler import MAX_OPEN_BLOCKS, Assembler, Resend
+from smartcam.frames._gige.description import locate, parse, unpack
+from smartcam.frames._gige.discovery import (
+    MAX_ANSWERS_OF_ONE_ADDRESS,
+    AnsweringCamera,
+    Network,
+    _Asking,
+    find,
+    networks,
+)
+from smartcam.frames._gige.event_channel import decode_events
+from smartcam.frames._gige.expressions import evaluate
+from smartcam.frames._gige.gvcp import DeviceInfo
+from smartcam.frames._gige.messages import MAX_CHUNKS, MessageFeatures, cut_chunks
+from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
+from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
+from smartcam.frames._streaming.rtp import packets
+from smartcam.frames._streaming.rtp.assembling import MAX_ACCESS_UNIT_BYTES, AccessUnit
+from smartcam.frames._streaming.rtp.depacketizer import MAX_PACKETS_AHEAD, Depacketizer
 from smartcam.frames._streaming.rtp.driver import RtpDriver
-from smartcam.frames._streaming.rtp.packets import RtpPacket, is_rtcp
-from smartcam.frames._v4l2 import discovery, system
-
-__all__ = ["Depacketizer", "RtpDriver", "RtpPacket", "discovery", "is_rtcp", "parse", "system"]
+from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets, units
+from smartcam.frames._streaming.rtp.h265 import H265Units, size_in
+from smartcam.frames._streaming.rtp.jpeg import JpegUnits
+from smartcam.frames._streaming.rtp.packets import (
+    Goodbye,
+    PacketsMissing,
+    PictureLost,
+    ReceiverReport,
+    RtpPacket,
+    SenderReport,
+    SourceDescription,
+    compound,
+    is_rtcp,
+    parse_rtcp,
+)
+from smartcam.frames._streaming.rtp.parameters import description as parameters_description
+from smartcam.frames._streaming.rtp.parameters import picture_size
+from smartcam.frames._streaming.rtp.parameters import size_in as parameters_size_in
+from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY, RtpStatistics
+from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970, ntp_time
+from smartcam.frames._streaming.rtsp import delivery, messages
+from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
+from smartcam.frames._streaming.rtsp.authentication import (
+    MAX_WRONG_ANSWERS,
+    Authentication,
+    PasswordGate,
+    _parts,
+)
+from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, _ControlPort, port_pair
+from smartcam.frames._streaming.rtsp.messages import ROOM, RequestParser, RtspError, RtspRequest
+from smartcam.frames._streaming.rtsp_client import answers
+from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
+from smartcam.frames._streaming.rtsp_client.description import described, url_of
+from smartcam.frames._streaming.rtsp_client.ways import options_of
+from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
+from smartcam.frames._synthetic import stripes, write_stamp
+from smartcam.frames._v4l2 import abi, discovery, system
+from smartcam.frames._v4l2.abi import Ioctl
+from smartcam.frames._v4l2.controls import DeviceControl
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
+from smartcam.frames._v4l2.driver import V4L2Driver
+from smartcam.frames._video import multipart, redirects
+from smartcam.frames._video.multipart import MAX_BETWEEN_BYTES, MAX_PICTURE_BYTES, PictureCutter

@@ -13,8 +13,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.frames._pixels.formats import PIXEL_FORMATS
-from smartcam.frames._synthetic import stripes, write_stamp
+from tests.frames.inside import PIXEL_FORMATS, stripes, write_stamp
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable

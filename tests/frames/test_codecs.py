@@ -22,9 +22,9 @@ from smartcam.exceptions import (
     MissingExtraError,
 )
 from smartcam.frames import Codecs, find_format
-from smartcam.frames._codecs import pictures
 from smartcam.frames._codecs.threads import MAX_LOOP_TIME, StreamRuns
 from smartcam.frames._inside import read_stamp
+from tests.frames.inside import pictures
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
 
 simplejpeg: Any = load("simplejpeg")

@@ -13,11 +13,9 @@ import pytest
 from smartcam import frames
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, find_format
-from smartcam.frames._codecs.pictures import to_jpegxl, to_png
-from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
-from smartcam.frames._pixels.formats import PIXEL_FORMATS
 from smartcam.frames._pixels.layouts import SampleLayout
 from smartcam.frames._video.frames import from_video
+from tests.frames.inside import MATRICES, PIXEL_FORMATS, to_jpegxl, to_png, yuv_to_rgb
 from tests.frames.pictures import frame_of
 
 if TYPE_CHECKING:

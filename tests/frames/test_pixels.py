@@ -19,8 +19,8 @@ from smartcam.exceptions import FrameFormatError, MissingExtraError
 from smartcam.frames import find_format
 from smartcam.frames._inside import Planes, YuvPairs
 from smartcam.frames._pixels import compiled
-from smartcam.frames._pixels.colours import MATRICES as COLOUR_MATRICES
-from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
+from tests.frames.inside import MATRICES as COLOUR_MATRICES
+from tests.frames.inside import PIXEL_FORMATS, with_matrix
 from tests.frames.pictures import frame_of, known_of
 
 if TYPE_CHECKING:

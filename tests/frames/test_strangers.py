@@ -11,12 +11,16 @@ import pytest
 
 from smartcam import frames
 from smartcam.frames import RtpSender
-from smartcam.frames._gige.discovery import MAX_ANSWERS_OF_ONE_ADDRESS, Network, _Asking
 from smartcam.frames._gige.stream import StreamSocket
-from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY
-from smartcam.frames._streaming.rtsp.delivery import _ControlPort
 from tests.frames.gige.camera import camera as gige_camera
-from tests.frames.inside import RtpPacket
+from tests.frames.inside import (
+    MAX_ANSWERS_OF_ONE_ADDRESS,
+    NEW_HOST_DELAY,
+    Network,
+    RtpPacket,
+    _Asking,
+    _ControlPort,
+)
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
 from tests.frames.rtp.ways import HOST, two_ports
 

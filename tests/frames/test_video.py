@@ -22,12 +22,16 @@ from smartcam.exceptions import (
     MissingExtraError,
 )
 from smartcam.frames import Codecs, Moment
-from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._inside import read_stamp
-from smartcam.frames._streaming.rtp.packets import SenderReport
-from smartcam.frames._streaming.rtp.reception import ntp_time
 from smartcam.frames._video import driver as video
-from smartcam.frames._video.multipart import MAX_BETWEEN_BYTES, MAX_PICTURE_BYTES, PictureCutter
+from tests.frames.inside import (
+    MAX_BETWEEN_BYTES,
+    MAX_PICTURE_BYTES,
+    PictureCutter,
+    SenderReport,
+    decode_jpeg,
+    ntp_time,
+)
 from tests.frames.pictures import (
     HEIGHT,
     MULTIPART,

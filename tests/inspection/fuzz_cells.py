@@ -19,14 +19,9 @@ import numpy as np
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection import Picture, Program, Teaching, load_cell
-from smartcam.inspection._camera import eyes
-from smartcam.inspection._camera.eyes import failed_values
-from smartcam.inspection._program import MAX_REASON_BYTES
-from smartcam.inspection._read import gs1
-from smartcam.inspection._read.gs1 import GS
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
-from tests.inspection.inside import elements
+from tests.inspection.inside import GS, MAX_REASON_BYTES, elements, eyes, failed_values, gs1
 
 if TYPE_CHECKING:
     from smartcam.inspection import Inspection

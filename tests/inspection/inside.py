@@ -1,7 +1,41 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
-from smartcam.inspection._read.gs1 import elements
-
-__all__ = ["elements"]
+from smartcam.inspection._camera import eyes
+from smartcam.inspection._camera.eyes import failed_values
+from smartcam.inspection._measure.edges import (
+    Choice,
+    Edge,
+    EdgeSettings,
+    PairChoice,
+    Polarity,
+    noise_of,
+)
+from smartcam.inspection._measure.features import (
+    FoundPoint,
+    FoundShape,
+    find_circle,
+    find_line,
+    find_pair,
+    find_point,
+    strip_between,
+)
+from smartcam.inspection._measure.fits import Edges, fit_circle, fit_line
+from smartcam.inspection._measure.planes import PIXELS, Plane, plane_of
+from smartcam.inspection._measure.strips import Sectors, Strips
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+from smartcam.inspection._measure.values import (
+    Value,
+    circle_of,
+    distance,
+    line_of,
+    point_of,
+    width,
+    with_calibration,
+)
+from smartcam.inspection._program import MAX_REASON_BYTES
+from smartcam.inspection._read import gs1
+from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
+from smartcam.inspection._read.gs1 import GS, elements
+from smartcam.inspection._read.tool import ReadSettings, ReadTool

@@ -202,21 +202,28 @@ async def test_a_source_that_is_not_there_yet_is_a_system_error_and_then_seen(
         assert (await triggered(camera)).level == desk.level
 
 
-async def test_a_stopped_run_never_answers_a_later_trigger(
-    cell: Path, desk: Desk, gate: Gate
-) -> None:
+@contextlib.asynccontextmanager
+async def stopped_run(cell: Path, gate: Gate) -> AsyncIterator[smartcam.Camera]:
+    """Give a camera that was stopped during a run, whose tool still works."""
     device = SoftwareDevice(load_cell(cell)["line1/cam1"])
     layouts = device.interpret_as
     async with (
         device,
         smartcam.connect(device.url, application=12, interpret_as=layouts, **LIMITS) as camera,
     ):
-        desk.level = 1
-        old = asyncio.ensure_future(triggered(camera))
+        trigger = asyncio.ensure_future(triggered(camera))
         await until(lambda: gate.reached)
         device.emulator.device.stop()  # by the camera's own pages
         with pytest.raises(NotRunningError):
-            await old
+            await trigger
+        yield camera
+
+
+async def test_a_stopped_run_never_answers_a_later_trigger(
+    cell: Path, desk: Desk, gate: Gate
+) -> None:
+    desk.level = 1
+    async with stopped_run(cell, gate) as camera:
         desk.level = 2
         await camera.start()
         new = asyncio.ensure_future(triggered(camera))
@@ -308,17 +315,7 @@ async def test_tools_that_do_not_end_give_a_result_and_keep_no_later_trigger(
 async def test_a_run_that_was_given_up_keeps_no_later_one_while_its_tool_goes_on(
     cell: Path, desk: Desk, gate: Gate
 ) -> None:
-    device = SoftwareDevice(load_cell(cell)["line1/cam1"])
-    layouts = device.interpret_as
-    async with (
-        device,
-        smartcam.connect(device.url, application=12, interpret_as=layouts, **LIMITS) as camera,
-    ):
-        trigger = asyncio.ensure_future(triggered(camera))
-        await until(lambda: gate.reached)
-        device.emulator.device.stop()  # by the camera's own pages
-        with pytest.raises(NotRunningError):
-            await trigger
+    async with stopped_run(cell, gate) as camera:
         await camera.switch_application(7)
         await camera.start()
         desk.level = 5

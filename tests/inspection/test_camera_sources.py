@@ -194,7 +194,11 @@ async def test_outlines_of_located_parts_are_in_a_fleets_frames(tmp_path: Path) 
     pictures = [one.picture for one in judged if one.picture is not None]
     assert len(judged) == 3
     assert pictures
-    assert all(one.array().ndim == 2 for one in pictures)  # as they came, for whoever tries again
+    assert all(one.array().ndim == 2 for one in pictures)  # as they came, to be judged again
+    for one in pictures:
+        *marks, verdict = one.drawings
+        assert "found" in {mark.role for mark in marks}
+        assert (verdict.kind, verdict.text) == ("text", "7: ok")
 
 
 @pytest.mark.parametrize(

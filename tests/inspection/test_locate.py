@@ -19,7 +19,6 @@ from smartcam.inspection import (
     PartModel,
     Picture,
     Region,
-    Symmetry,
     TeachingError,
     TeachingTrouble,
     load_cell,
@@ -155,7 +154,7 @@ def test_model_is_the_same_from_its_file(tmp_path: Path) -> None:
     model.write(tmp_path / "bolt.model")
     assert (tmp_path / "bolt.model").stat().st_size < 50_000
     again = PartModel.read(tmp_path / "bolt.model")
-    assert (again.name, again.symmetry) == ("bolt", Symmetry(1))
+    assert (again.name, again.symmetry.fold, again.symmetry.alike) == ("bolt", 1, ())
     part = PlacedPart(PARTS["bolt"], 95.2, 103.7, 1.2)
     first, second = (
         locate(Picture(drawn(part)), [one], PartSearch()).parts[0] for one in (model, again)
@@ -215,11 +214,32 @@ def test_pose_is_right_by_its_own_sigma(name: str, angle: float) -> None:
 
 
 @pytest.mark.long
-def test_scale_is_found() -> None:
-    part = PlacedPart(PARTS["tee"], 100.0, 104.4, -0.7, 1.17)
-    found = one_of(drawn(part, side=220), "tee", scales=(0.8, 1.25))
+@pytest.mark.parametrize(
+    ("scale", "scales"), [(1.17, (0.8, 1.25)), (0.5, (0.45, 0.55)), (1.9, (1.8, 2.2))]
+)
+def test_scale_is_found(scale: float, scales: tuple[float, float]) -> None:
+    part = PlacedPart(PARTS["tee"], 120.0, 124.4, -0.7, scale)
+    found = one_of(drawn(part, side=260), "tee", scales=scales)
     assert_right(found, "tee", part)
     assert 0 < found.sigmas[3] < 1e-3
+
+
+@pytest.mark.parametrize(
+    "scale", [1.02, *(pytest.param(one, marks=pytest.mark.long) for one in (0.98, 0.999))]
+)
+def test_part_of_another_size_is_right_by_its_own_sigma(scale: float) -> None:
+    part = PlacedPart(PARTS["bolt"], 100.0, 104.4, -0.7, scale)
+    found = one_of(drawn(part), "bolt")
+    assert_right(found, "bolt", part)
+    assert found.chi_square < 2
+
+
+def test_part_of_a_size_that_was_not_asked_for_is_told() -> None:
+    part = PlacedPart(PARTS["bolt"], 100.0, 104.4, -0.7, 1.045)
+    found = locate(Picture(drawn(part)), [model_of("bolt")], PartSearch())
+    assert not found.parts
+    assert found.nearest is not None
+    assert found.nearest.refusal == "its size is 1.045 of the taught one, expected 1"
 
 
 @pytest.mark.long
@@ -241,14 +261,29 @@ def test_light_noise_and_blur_may_change(look: Look) -> None:
 
 
 @pytest.mark.long
-def test_light_beyond_the_largest_level_moves_edges_and_is_in_sigma() -> None:
+@pytest.mark.parametrize("contrast", [200, 300])
+def test_light_beyond_the_largest_level_moves_edges_and_not_the_part(contrast: int) -> None:
     part = PlacedPart(PARTS["tee"], 104.2, 97.5, 0.6)
     (one,) = locate(
-        Picture(drawn(part, look=Look(dark=100, contrast=200))), [model_of("tee")], PartSearch()
+        Picture(drawn(part, look=Look(dark=100, contrast=contrast))),
+        [model_of("tee")],
+        PartSearch(),
     ).parts
-    assert math.dist(one.pose[:2], truth("tee", part)) < 4 * max(one.sigmas[:2])
-    assert one.chi_square > 10
-    assert 0.02 < one.sigmas[0] < 0.3
+    assert math.dist(one.pose[:2], truth("tee", part)) < 4 * max(one.sigmas[:2]) < 0.1
+    assert one.pose.scale == pytest.approx(1, abs=4 * one.sigmas[3] + 0.002)
+
+
+def test_part_that_is_seen_by_a_tilted_camera_is_right_by_its_own_sigma() -> None:
+    part, narrow = PlacedPart(PARTS["tee"], 104.2, 97.5, 0.6), 0.985  # of 10 degrees
+    light = shares((200, 200), [part], LOOK.blur)
+    squeeze = np.array([[narrow, 0, part.x * (1 - narrow)], [0, 1, 0]])
+    seen = cv2.warpAffine(light, squeeze, (200, 200), flags=cv2.INTER_CUBIC).astype(float)
+    found = one_of(photograph(seen, LOOK, np.random.default_rng(1)), "tee")
+    x, y = truth("tee", part)
+    off = found.pose.x - (part.x + narrow * (x - part.x)), found.pose.y - y
+    assert math.hypot(*off) < 4 * max(found.sigmas[:2]) < 0.04
+    assert abs(found.pose.angle - part.angle) < 5 * found.sigmas[2] < 0.003
+    assert found.score > 0.95
 
 
 def test_edges_of_weak_contrast_count_by_their_own_taught_contrast() -> None:

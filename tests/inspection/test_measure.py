@@ -15,21 +15,26 @@ from smartcam.calibration import CameraModel, calibrate_sheet, fit_plane
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames import Frame, Moment, find_format
 from smartcam.inspection import Inspection, Picture
-from smartcam.inspection._measure.edges import Edge
-from smartcam.inspection._measure.features import FoundPoint, FoundShape, strip_between
-from smartcam.inspection._measure.fits import Edges
-from smartcam.inspection._measure.planes import PIXELS, Plane, plane_of
-from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
-from smartcam.inspection._measure.values import (
+from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET, truth
+from tests.calibration.test_sheet import seen, touched
+from tests.inspection.inside import (
+    PIXELS,
+    Edge,
+    Edges,
+    FoundPoint,
+    FoundShape,
+    NotMeasuredError,
+    NoValueReason,
+    Plane,
     Value,
     distance,
     line_of,
+    plane_of,
     point_of,
+    strip_between,
     width,
     with_calibration,
 )
-from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET, truth
-from tests.calibration.test_sheet import seen, touched
 from tests.inspection.measurekit import HOLE, RADIUS, WIDE, plate, program
 
 ACROSS = "{across: [[40, 170], [170, 170]]}"

@@ -9,17 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smartcam.inspection._measure.edges import (
+from tests.inspection.inside import (
     Choice,
     Edge,
     EdgeSettings,
+    NotMeasuredError,
+    NoValueReason,
     PairChoice,
     Polarity,
+    Strips,
+    find_pair,
+    find_point,
     noise_of,
+    strip_between,
 )
-from smartcam.inspection._measure.features import find_pair, find_point, strip_between
-from smartcam.inspection._measure.strips import Strips
-from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
 from tests.inspection.rendering import Array, half_plane, photographed, pixel_means
 
 TURN = math.radians(12)

@@ -7,11 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.inspection._measure.features import FoundShape
-from smartcam.inspection._measure.fits import Edges, fit_circle, fit_line
-from smartcam.inspection._measure.planes import PIXELS
-from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
-from smartcam.inspection._measure.values import circle_of, line_of
+from tests.inspection.inside import (
+    PIXELS,
+    Edges,
+    FoundShape,
+    NotMeasuredError,
+    NoValueReason,
+    circle_of,
+    fit_circle,
+    fit_line,
+    line_of,
+)
 from tests.inspection.rendering import Array
 
 AHEAD = np.array([1.0, 0.0])

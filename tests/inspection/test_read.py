@@ -16,13 +16,11 @@ import zxingcpp
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
-from smartcam.inspection._read.codes import formats_of, read_codes
 from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
 from smartcam.inspection._read.patterns import TextPattern, TooLongError
-from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
-from tests.inspection.inside import elements
+from tests.inspection.inside import ReadSettings, ReadTool, elements, formats_of, read_codes
 from tests.inspection.proofs import codes
 
 if TYPE_CHECKING:

@@ -70,6 +70,20 @@ def test_a_line_of_its_own_keeps_its_quotes_and_comment(path: Path) -> None:
     assert line in path.read_text().splitlines()
 
 
+def test_an_application_may_be_named(path: Path) -> None:
+    assert [Teaching(path, "cam", one).application for one in ("glue", "7", 7, "12")] == [
+        7,
+        7,
+        7,
+        12,
+    ]
+    with pytest.raises(ConfigurationError, match=r"no application 'glu'; there are 7 \(glue\)"):
+        Teaching(path, "cam", "glu")
+    for number in (0, "0", "99999999999"):
+        with pytest.raises(ConfigurationError, match="expected an integer, 1 to 4294967295"):
+            Teaching(path, "cam", number)
+
+
 def test_a_new_application_is_added_and_loads(path: Path) -> None:
     Teaching(path, "cam", 12).save({"present": {"grey": [0, 9]}, "present two": {"grey": [3, 4]}})
     camera = load_cell(path)["cam"]

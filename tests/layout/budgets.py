@@ -7,10 +7,10 @@ from smartcam.fleet import load_fleet
 from smartcam.inspection import load_cell
 from smartcam.layout import Layout
 from smartcam.layout._inside import load, pack_texts
-from smartcam.layout._text import MAX_TEXT_CHARACTERS as MAX_LAYOUT
-from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS
 from tests.budgets.inputs import MERGED, PAST_LOOKAHEAD, YAML, laughs_of
 from tests.budgets.parser import Make, Parser, fill_text, from_file, grown
+from tests.layout.inside import MAX_TEXT_CHARACTERS as MAX_LAYOUT
+from tests.layout.inside import MAX_YAML_TEXT_CHARACTERS
 
 _LAYOUTS: dict[str, Make] = {
     "fields": fill_text("f{}: int8, ", tail="z: int8"),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam.layout import _compiled, _yaml_files
-from smartcam.layout._text import parse_text
+from tests.layout.inside import _compiled, _yaml_files, parse_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable

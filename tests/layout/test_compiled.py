@@ -12,8 +12,8 @@ import pytest
 from smartcam.exceptions import InterpretationError, LayoutError
 from smartcam.interpreters import resolve
 from smartcam.layout import Layout
-from smartcam.layout import _compiled as compiled
 from smartcam.layout._codec import RecordCodec
+from tests.layout.inside import _compiled as compiled
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,10 +10,10 @@ import pytest
 from smartcam.emulator import EmulatedCamera, load_scenario, load_scenarios
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
-from smartcam.layout import _yaml_files as yaml_files
-from smartcam.layout import _yamls as yamls
 from smartcam.layout._inside import BadYamlError, load
 from tests.layout.bombs import laughs, merges
+from tests.layout.inside import _yaml_files as yaml_files
+from tests.layout.inside import _yamls as yamls
 
 
 @pytest.mark.parametrize("text", [laughs(30), merges(40), laughs(9), "- a\n" * 6000])

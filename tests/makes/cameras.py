@@ -9,7 +9,7 @@ from typing import Any
 
 from smartcam.emulator import LineCamera
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
-from smartcam.testing import COUNTER, FREE, OTHER, SLOW, SLOW_TIME, CameraKind, LiveCamera
+from smartcam.testing import CameraKind, LiveCamera
 
 IV3_NUMBERS = "count: uint32, passed: bool, tool: uint16, tool_passed: bool, n: uint32"
 NUMBERS = [{"n": number} for number in range(10_000)]
@@ -70,10 +70,10 @@ def kind(name: str, make: Callable[[], LineCamera], query: str, **fields: Any) -
 def ifm(version: int) -> EmulatedIfm:
     return EmulatedIfm(
         applications=[
-            {"id": COUNTER, "processing_time": 0.0},
-            {"id": OTHER, "processing_time": 0.0},
-            {"id": SLOW, "processing_time": SLOW_TIME},
-            {"id": FREE, "processing_time": 0.005, "trigger": "continuous"},
+            {"id": LiveCamera.COUNTER, "processing_time": 0.0},
+            {"id": LiveCamera.OTHER, "processing_time": 0.0},
+            {"id": LiveCamera.SLOW, "processing_time": LiveCamera.SLOW_TIME},
+            {"id": LiveCamera.FREE, "processing_time": 0.005, "trigger": "continuous"},
         ],
         defaults={"parts": NUMBERS},
         version=version,
@@ -85,7 +85,9 @@ IFM_KINDS = (
         "ifm v3",
         lambda: ifm(3),
         "dialect=v3",
-        applications=frozenset({COUNTER, OTHER, SLOW, FREE}),
+        applications=frozenset(
+            {LiveCamera.COUNTER, LiveCamera.OTHER, LiveCamera.SLOW, LiveCamera.FREE}
+        ),
         numbers_with_sequence="n: uint32",
         raw_request="S?",
         foreign_request=0x30,
@@ -94,7 +96,9 @@ IFM_KINDS = (
         "ifm v3, asynchronous triggers",
         lambda: ifm(3),
         "dialect=v3&trigger=async",
-        applications=frozenset({COUNTER, OTHER, SLOW, FREE}),
+        applications=frozenset(
+            {LiveCamera.COUNTER, LiveCamera.OTHER, LiveCamera.SLOW, LiveCamera.FREE}
+        ),
         numbers_with_sequence="n: uint32",
         raw_request="S?",
         foreign_request=0x30,
@@ -103,7 +107,7 @@ IFM_KINDS = (
         "ifm v4",
         lambda: ifm(4),
         "dialect=v4",
-        applications=frozenset({COUNTER, OTHER, SLOW}),
+        applications=frozenset({LiveCamera.COUNTER, LiveCamera.OTHER, LiveCamera.SLOW}),
         numbers_with_sequence="n: uint32",
         raw_request="S?",
         foreign_request=0x30,
@@ -113,10 +117,12 @@ IV3_KINDS = (
     kind(
         "IV3",
         lambda: EmulatedIv3(
-            programs=(COUNTER, OTHER), parts=[(n,) for n in range(10_000)], processing_time=0.0
+            programs=(LiveCamera.COUNTER, LiveCamera.OTHER),
+            parts=[(n,) for n in range(10_000)],
+            processing_time=0.0,
         ),
         "dialect=lines",
-        applications=frozenset({COUNTER, OTHER}),
+        applications=frozenset({LiveCamera.COUNTER, LiveCamera.OTHER}),
         numbers=IV3_NUMBERS,
         numbers_with_sequence=IV3_NUMBERS,
         raw_request="RT",
@@ -128,8 +134,8 @@ SR_KINDS = (
     kind(
         "SR",
         lambda: EmulatedSr(codes=list(map(str, range(10_000))), reading_time=0.0),
-        f"dialect=lines&bank={COUNTER}",
-        applications=frozenset({COUNTER}),
+        f"dialect=lines&bank={LiveCamera.COUNTER}",
+        applications=frozenset({LiveCamera.COUNTER}),
         numbers="read: bool, n: uint32",
         numbers_with_sequence="read: bool, n: uint32",
         raw_request="NUM",

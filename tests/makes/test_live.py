@@ -8,7 +8,7 @@ import pytest
 
 import smartcam
 from smartcam.exceptions import OvertriggeredError
-from smartcam.testing import SLOW, CameraKind, CameraSuite
+from smartcam.testing import CameraKind, CameraSuite, LiveCamera
 from tests.handmade import until
 from tests.makes.cameras import IFM_KINDS, IV3_KINDS, SR_KINDS
 
@@ -27,7 +27,7 @@ class TestIfm(CameraSuite):
             async with (
                 camera_kind.open() as live,
                 smartcam.connect(
-                    live.url, application=SLOW, interpret_as=camera_kind.numbers
+                    live.url, application=LiveCamera.SLOW, interpret_as=camera_kind.numbers
                 ) as camera,
             ):
                 if not camera.capabilities.unasked_results:
@@ -48,7 +48,7 @@ class TestIfm(CameraSuite):
             async with (
                 camera_kind.open() as live,
                 smartcam.connect(
-                    live.url, application=SLOW, interpret_as=camera_kind.numbers
+                    live.url, application=LiveCamera.SLOW, interpret_as=camera_kind.numbers
                 ) as camera,
             ):
                 task = asyncio.create_task(camera.trigger())

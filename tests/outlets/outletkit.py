@@ -6,12 +6,11 @@ import asyncio
 import json
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from smartcam.exceptions import OutletError
 from smartcam.models import Result
-from smartcam.outlets import Outlet, OutletDesk, OutletEntry, OutletSettings
+from smartcam.outlets import Outlet, OutletEntry, OutletSettings
 
 
 def result(
@@ -73,11 +72,3 @@ async def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
     async with asyncio.timeout(seconds):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-
-
-DESK = OutletDesk(lambda _camera, _application: ())
-
-
-def folder_of(path: Path) -> Path:
-    """Return the folder of spools below a test's folder."""
-    return path / "outlets"

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.outlets import OutletAccount, OutletEntry
+from smartcam.outlets import OutletEntry
+from smartcam.outlets._entry import OutletAccount
 from smartcam.outlets._spool import ROW_BYTES, Spool, read_account
 
 

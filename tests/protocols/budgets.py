@@ -9,12 +9,10 @@ from smartcam.models import Status
 from smartcam.protocols import FramedDialect, LineDialect, LineMachine, Machine, Role, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
-from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES
-from smartcam.protocols._insight.words import MAX_LINE_BYTES
 from tests.budgets.inputs import LINE_ROWS, TEXT_LINES, UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, streamed
 from tests.machines import B16, BID, THESIS
-from tests.protocols.inside import NATIVE, InSightMachine
+from tests.protocols.inside import MAX_IMAGE_BYTES, MAX_LINE_BYTES, NATIVE, InSightMachine
 
 
 def _session(dialect: FramedDialect, role: Role, transport: Transport, pieces: list[bytes]) -> None:

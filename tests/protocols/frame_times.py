@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
-from smartcam.protocols._framed import frame_age, framing
-from smartcam.protocols._framed.machine import Machine
+from tests.protocols.inside import Machine, frame_age, framing
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from smartcam.protocols import Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Event
-from smartcam.protocols._insight.dialect import InSightDialect
-from tests.protocols.inside import NATIVE, InSightMachine
+from tests.protocols.inside import NATIVE, InSightDialect, InSightMachine
 
 if TYPE_CHECKING:
     from smartcam.protocols import Frame

@@ -9,9 +9,9 @@ from smartcam.models import Status
 from smartcam.protocols import FramedDialect, LinkFailed, Machine, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._framed.dialect import MAX_SURPLUS_BYTES
-from smartcam.protocols._framed.frame_age import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event
 from tests.machines import B16, DIALECTS, THESIS, camera, client, label
+from tests.protocols.inside import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
 from tests.strategies import over
 
 RESULT, UNKNOWN = 0x20, 0x77

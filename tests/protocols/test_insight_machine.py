@@ -16,9 +16,15 @@ from smartcam.models import Status
 from smartcam.protocols import INSIGHT, Frame, LinkEnded, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Event
-from smartcam.protocols._insight.machine import MAX_READ_BYTES, Command, Piece, Reply
-from smartcam.protocols._insight.words import MAX_LINE_BYTES
-from tests.protocols.inside import NATIVE, InSightMachine
+from tests.protocols.inside import (
+    MAX_LINE_BYTES,
+    MAX_READ_BYTES,
+    NATIVE,
+    Command,
+    InSightMachine,
+    Piece,
+    Reply,
+)
 from tests.protocols.insight_lines import (
     BITMAP,
     DIGITS,

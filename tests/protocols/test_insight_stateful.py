@@ -17,9 +17,8 @@ from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import State
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ONLINE, Event
-from smartcam.protocols._insight.machine import Command, Reply
-from smartcam.protocols._insight.words import command_reader
 from tests.emulator.parts import insight, pass_time
+from tests.protocols.inside import Command, Reply, command_reader
 from tests.protocols.insight_lines import LOGIN, Talk, with_cells
 
 REQUESTS: list[m.Message] = [

@@ -12,9 +12,15 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.protocols._inside import StatusCode, words
-from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES, AnswerReader, CommandAnswer
-from smartcam.protocols._insight.words import AnswerForm, Cell, hex_lines
 from smartcam.protocols._line_reader import LineReader
+from tests.protocols.inside import (
+    MAX_IMAGE_BYTES,
+    AnswerForm,
+    AnswerReader,
+    Cell,
+    CommandAnswer,
+    hex_lines,
+)
 from tests.protocols.insight_lines import BITMAP, DIGITS, IMAGE_LINES, crc
 
 # ---------------------------------------------------------------------- cells

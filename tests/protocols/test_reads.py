@@ -22,9 +22,9 @@ from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import Frame, FramedDialect, HeaderLayout, LinkFailed, Machine, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed import framing, machine
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Framer, Policy, ResultBurst
 from tests.machines import DIALECTS, THESIS, client, label, one_by_one
+from tests.protocols.inside import framing, machine
 
 LARGE, FIRST_READ, MAX_READ, ALIKE = 32, 32, 128, 3
 SIZES = st.one_of(

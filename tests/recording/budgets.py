@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 
 from smartcam.frames import Frame, Moment, find_format
 from smartcam.recording import load_recording
-from smartcam.recording._mcap import form as _form
-from smartcam.recording._mcap import records as _records
-from smartcam.recording._pictures.messages import picture_message
 from tests.budgets.parser import Make, Parser, fill, from_file
+from tests.recording.inside import form as _form
+from tests.recording.inside import picture_message
+from tests.recording.inside import records as _records
 
 
 def _record(opcode: int, body: bytes) -> bytes:

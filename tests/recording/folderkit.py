@@ -14,17 +14,21 @@ import pytest
 from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
-from smartcam.recording._folder import FileName, files_of
-from smartcam.recording._folders import files as folder_files
-from smartcam.recording._folders import pictures as folder_pictures
-from smartcam.recording._folders import writer as folder_writer
-from smartcam.recording._judged import PictureMatcher
-from smartcam.recording._mcap.form import RecordedPicture
-from smartcam.recording._recorder import MAX_WAITING_BYTES
-from smartcam.recording._replays.pictures import ReplayedPictures
-from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
+from tests.recording.inside import (
+    MAX_WAITING_BYTES,
+    FileName,
+    PictureMatcher,
+    RecordedPicture,
+    ReplayedPictures,
+    Take,
+    TakeList,
+    files_of,
+)
 from tests.recording.inside import _recorder as recorder
+from tests.recording.inside import files as folder_files
+from tests.recording.inside import pictures as folder_pictures
+from tests.recording.inside import writer as folder_writer
 
 __all__ = [
     "MAX_WAITING_BYTES",

@@ -43,8 +43,8 @@ from smartcam.models import (
     StatusChanged,
     jsonable,
 )
-from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording, write_bag
-from smartcam.recording._bags.items import topic_of_camera
+from smartcam.recording import BagRecorder, Recorder, load_recording, write_bag
+from smartcam.recording._bags.items import BagCounts, topic_of_camera
 from smartcam.recording._inside import BagConversion
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
 from tests.recording.inside import nanoseconds as recorded_time

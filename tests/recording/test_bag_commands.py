@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from smartcam.calibration import fit_plane
 from smartcam.recording import load_recording
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import Process, wait_until
+from tests.processes import Process, largest_file, wait_until
 from tests.recording.bagkit import on, read, read_by_rosbags, read_raw
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -187,18 +187,6 @@ def numbers(path: Path) -> list[int]:
                 case _:
                     pass
     return found
-
-
-@contextlib.contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Have files of this process refused to grow beyond ``size`` bytes."""
-    resource = pytest.importorskip("resource", reason="a limit of POSIX")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.long

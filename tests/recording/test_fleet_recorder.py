@@ -24,13 +24,7 @@ from smartcam.observers import RawFrame
 from smartcam.protocols import BVS
 from smartcam.protocols.messages import Sender
 from smartcam.recording import FleetRecorder, Recorder, load_recording
-from smartcam.recording._folder import RecordingFolder
-from smartcam.recording._folders import files as folder_files
-from smartcam.recording._folders import writer as folder_writer
-from smartcam.recording._folders.files import FolderFiles, Limits
 from smartcam.recording._folders.track import CameraTrack
-from smartcam.recording._mcap.form import GAP, load_compress
-from smartcam.recording._replays.schedule import plan_replay
 from smartcam.recording._state import RecordedState
 from tests.fleet.fleetkit import NumberedCamera, trigger_request
 from tests.recording.folderkit import (
@@ -44,6 +38,16 @@ from tests.recording.folderkit import (
     server,
     until,
 )
+from tests.recording.inside import (
+    GAP,
+    FolderFiles,
+    Limits,
+    RecordingFolder,
+    load_compress,
+    plan_replay,
+)
+from tests.recording.inside import files as folder_files
+from tests.recording.inside import writer as folder_writer
 from tests.recording.recordingkit import URL, at, container, frame, session
 
 pytestmark = pytest.mark.real_time

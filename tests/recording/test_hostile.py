@@ -23,12 +23,19 @@ from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamErro
 from smartcam.models import Connected, Disconnected, Status, StatusChanged
 from smartcam.recording import Recorder, ReplayedCamera, load_recording, write_pcap
 from smartcam.recording import _reader as reader
-from smartcam.recording._mcap import form as forms
-from smartcam.recording._mcap import records as bounds
-from smartcam.recording._mcap.form import FORMAT, MAX_VALUES, PICTURE_SCHEMAS, RecordedPicture
-from smartcam.recording._pictures import messages as pictures
-from smartcam.recording._replays import schedule as plans
-from tests.recording.inside import KINDS, message_fields, message_of
+from tests.recording.inside import (
+    FORMAT,
+    KINDS,
+    MAX_VALUES,
+    PICTURE_SCHEMAS,
+    RecordedPicture,
+    message_fields,
+    message_of,
+)
+from tests.recording.inside import form as forms
+from tests.recording.inside import messages as pictures
+from tests.recording.inside import records as bounds
+from tests.recording.inside import schedule as plans
 from tests.recording.picturekit import VARIED, all_formats, same, shot
 from tests.recording.recordingkit import at, container, frame, session, status, write
 

@@ -22,7 +22,7 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._replays.schedule import Change, ReplayPlan, Take, plan_replay
+from tests.recording.inside import Change, ReplayPlan, Take, plan_replay
 from tests.recording.recordingkit import URL, at, container, frame, session, status, write
 
 WAITS = ("RUNNING", "WAITING_FOR_TRIGGER")

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import RosMessageError
-from smartcam.ros1._json_messages import Raw, encoded, ros1_name, to_json
 from smartcam.ros2 import RosTypes
-from tests.ros1.inside import from_json
+from tests.ros1.inside import Raw, encoded, from_json, ros1_name, to_json
 
 TYPES = RosTypes()
 HEADER = {"seq": 0, "stamp": {"secs": 3, "nsecs": 4}, "frame_id": "cam3"}

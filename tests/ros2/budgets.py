@@ -5,10 +5,9 @@ from __future__ import annotations
 import struct
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros2._node.tokens import Entity
-from smartcam.ros2._types.definitions import parse_message
 from tests.budgets.inputs import ros_types
 from tests.budgets.parser import Make, Parser, fill, fill_text, grown
+from tests.ros2.inside import Entity, parse_message
 
 _DEFINITIONS: dict[str, Make] = {
     "fields": fill_text("int32 f{}\n"),

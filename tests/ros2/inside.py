@@ -1,11 +1,21 @@
-"""Names behind the wall of the room that several of its tests use."""
+"""Names behind the wall of the room that its kits or several of its tests use."""
 
 from __future__ import annotations
 
+from smartcam.ros2._cameras.image_messages import (
+    ENCODINGS,
+    array_fields,
+    compressed_fields,
+    compression,
+    header_fields,
+    image_fields,
+    prepared,
+)
+from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
 from smartcam.ros2._cameras.results import CameraResults
 from smartcam.ros2._node.attachment import Attachment
-from smartcam.ros2._node.qos import PARAMETERS
-from smartcam.ros2._node.tokens import Entity
-from smartcam.ros2._types.built_in import MESSAGES
-
-__all__ = ["MESSAGES", "PARAMETERS", "Attachment", "CameraResults", "Entity"]
+from smartcam.ros2._node.qos import PARAMETERS, SENSOR_DATA
+from smartcam.ros2._node.tokens import Entity, gid_of
+from smartcam.ros2._types.built_in import MESSAGES, SERVICES
+from smartcam.ros2._types.definitions import INTEGERS, NUMBERS, parse_message, parse_service
+from smartcam.ros2._types.stores import stored

@@ -33,8 +33,6 @@ SET_BOOL = "std_srvs/srv/SetBool"
 NO_RCLPY = "needs rclpy, which the step ros_native_short of .ci/run installs"
 NEEDS_RCLPY = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason=NO_RCLPY)
 WAYS = ["zenoh", pytest.param("rclpy", marks=NEEDS_RCLPY)]
-ZENOH_ONLY = pytest.mark.parametrize("way", ["zenoh"], indirect=True)
-"""Mark of a test of what smartcam's own wire format alone has."""
 
 DOMAIN = 1 + os.getpid() % 100
 """Number of a domain of DDS that no other process of tests has at the same time, as a rule."""

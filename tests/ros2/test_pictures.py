@@ -32,13 +32,12 @@ from smartcam.exceptions import (
 from smartcam.frames import FrameSource, find_format
 from smartcam.ros2 import Node, frame_from
 from smartcam.ros2._cameras import picture_stream
-from smartcam.ros2._cameras.image_messages import header_fields
 from smartcam.ros2._cameras.lens import as_path
-from smartcam.ros2._cameras.lens_messages import lens_fields
 from smartcam.ros2._cameras.pictures import CameraPictures
 from smartcam.ros2._inside import DRIVER
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.processes import free_place
+from tests.ros2.inside import header_fields, lens_fields
 from tests.ros2.roskit import soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
@@ -430,11 +429,6 @@ class LastPicture:
         if self.waits:
             raise FrameTimeoutError("no answer")
         return self.file
-
-
-def images_of(node: Node) -> list[str]:
-    ends = [one.name for one in node.graph if one.kind == "MP"]
-    return [name for name in ends if name.endswith("/image_raw")]
 
 
 async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: Path) -> None:

@@ -22,17 +22,18 @@ from smartcam.ros2._cameras.cloud_messages import (
     depth_fields,
     points_of,
 )
-from smartcam.ros2._cameras.image_messages import (
+from tests.frames.pictures import RAW_FORMATS as RAW
+from tests.ros2.inside import (
     ENCODINGS,
     array_fields,
     compressed_fields,
     compression,
     header_fields,
     image_fields,
+    lens_fields,
+    lens_from,
     prepared,
 )
-from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
-from tests.frames.pictures import RAW_FORMATS as RAW
 
 TYPES = RosTypes("jazzy")
 IMAGE = TYPES.message("sensor_msgs/msg/Image")

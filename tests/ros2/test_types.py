@@ -12,9 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2 import RosTypes
-from smartcam.ros2._types.built_in import SERVICES
-from smartcam.ros2._types.definitions import parse_message, parse_service
-from tests.ros2.inside import MESSAGES
+from tests.ros2.inside import MESSAGES, SERVICES, parse_message, parse_service
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical", "rolling")
 

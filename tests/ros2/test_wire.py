@@ -17,9 +17,7 @@ from smartcam._ros_names import as_name, check_namespace, check_node, resolve
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2 import QoS
 from smartcam.ros2._inside import DRIVER, LATCHED
-from smartcam.ros2._node.qos import SENSOR_DATA
-from smartcam.ros2._node.tokens import gid_of
-from tests.ros2.inside import PARAMETERS, Attachment, Entity
+from tests.ros2.inside import PARAMETERS, SENSOR_DATA, Attachment, Entity, gid_of
 
 STRING = "std_msgs::msg::dds_::String_"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from smartcam.ros2._inside import MessageField
-from smartcam.ros2._types.definitions import INTEGERS, NUMBERS
-from smartcam.ros2._types.stores import stored
+from tests.ros2.inside import INTEGERS, NUMBERS, stored
 
 if TYPE_CHECKING:
     import random

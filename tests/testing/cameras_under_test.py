@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
-from smartcam.testing import COUNTER, ECHO, FREE, OTHER, SLOW, SLOW_TIME, CameraKind, LiveCamera
+from smartcam.testing import CameraKind, LiveCamera
 
 FREE_RATE = 200.0
 """Runs per second of ``FREE``."""
@@ -18,18 +18,18 @@ FREE_RATE = 200.0
 
 _RUN = {"layout": "n: uint32 @sequence", "generator": "sequence", "load_time": 0.0}
 _APPLICATIONS: list[dict[str, Any]] = [
-    {**_RUN, "id": COUNTER, "processing_time": 0.0},
-    {**_RUN, "id": OTHER, "processing_time": 0.0},
-    {**_RUN, "id": SLOW, "processing_time": SLOW_TIME},
+    {**_RUN, "id": LiveCamera.COUNTER, "processing_time": 0.0},
+    {**_RUN, "id": LiveCamera.OTHER, "processing_time": 0.0},
+    {**_RUN, "id": LiveCamera.SLOW, "processing_time": LiveCamera.SLOW_TIME},
     {
-        "id": ECHO,
+        "id": LiveCamera.ECHO,
         "layout": "n: uint32",
         "input": "n: uint32",
         "generator": "input",
         "load_time": 0.0,
         "processing_time": 0.0,
     },
-    {**_RUN, "id": FREE, "rate": FREE_RATE, "processing_time": 0.0},
+    {**_RUN, "id": LiveCamera.FREE, "rate": FREE_RATE, "processing_time": 0.0},
 ]
 
 
@@ -103,15 +103,20 @@ def _runs_before(run: int) -> int:
 
 
 _JOBS: list[dict[str, Any]] = [
-    {**_JOB, "file": f"{COUNTER}counter.job", "cells": {"A2": _runs_before}},
-    {**_JOB, "file": f"{OTHER}other.job", "cells": {"A2": _runs_before}},
+    {**_JOB, "file": f"{LiveCamera.COUNTER}counter.job", "cells": {"A2": _runs_before}},
+    {**_JOB, "file": f"{LiveCamera.OTHER}other.job", "cells": {"A2": _runs_before}},
     {
         **_JOB,
-        "file": f"{SLOW}slow.job",
+        "file": f"{LiveCamera.SLOW}slow.job",
         "cells": {"A2": _runs_before},
-        "processing_time": SLOW_TIME,
+        "processing_time": LiveCamera.SLOW_TIME,
     },
-    {**_JOB, "file": f"{FREE}free.job", "cells": {"A2": _runs_before}, "rate": FREE_RATE},
+    {
+        **_JOB,
+        "file": f"{LiveCamera.FREE}free.job",
+        "cells": {"A2": _runs_before},
+        "rate": FREE_RATE,
+    },
 ]
 
 

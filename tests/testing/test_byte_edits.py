@@ -23,7 +23,7 @@ from smartcam.testing.proxy import (
     Stall,
 )
 from smartcam.testing.proxy._byte_edits import BOTH_STALL, CUT, RESET, STALL, Edit, Editor
-from smartcam.testing.proxy._rules import PointRule, RangeRule
+from tests.testing.inside import PointRule, RangeRule
 
 DATA = b"0123456789"
 

@@ -31,7 +31,7 @@ from smartcam.testing.proxy import (
     Stall,
 )
 from smartcam.testing.proxy import _log as log
-from smartcam.testing.proxy._rules import MAX_COPY_BYTES, MAX_HOLD_BYTES
+from tests.testing.inside import MAX_COPY_BYTES, MAX_HOLD_BYTES
 from tests.testing.proxykit import HOST, MESSAGE, SHORT, client, linked, target
 
 if TYPE_CHECKING:

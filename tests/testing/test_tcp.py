@@ -34,8 +34,8 @@ from smartcam.testing.proxy import (
 )
 from smartcam.testing.proxy import _directions as directions
 from smartcam.testing.proxy import _tcp as tcp
-from smartcam.testing.proxy._rules import Direction
 from tests.handmade import until
+from tests.testing.inside import Direction
 from tests.testing.proxykit import (
     HOST,
     MESSAGE,

@@ -14,8 +14,8 @@ from smartcam import ConfigurationError
 from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import Entry, Late, Lose, Reorder, Repeat, Rule
 from smartcam.testing.proxy import _udp as udp
-from smartcam.testing.proxy._rules import Direction
 from tests.handmade import until
+from tests.testing.inside import Direction
 from tests.testing.proxykit import HOST, SHORT, Mailbox, mailbox
 
 FIVE = [b"1", b"2", b"3", b"4", b"5"]

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from smartcam.web._connections import Visitor, Visitors
-from smartcam.web._errors import RefusedError
-from smartcam.web._routes import CallBody, _parsed, _validate
 from tests.budgets.inputs import JSON
 from tests.budgets.parser import Make, Parser, fill, fill_text, streamed
+from tests.web.inside import CallBody, RefusedError, Visitor, Visitors, _parsed, _validate
 
 
 class _Item(CallBody):

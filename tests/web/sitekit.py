@@ -13,7 +13,7 @@ import aiohttp
 
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.web import EmulatorSite
-from smartcam.web._site import Site
+from tests.web.inside import Site
 
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 

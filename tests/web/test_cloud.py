@@ -16,8 +16,8 @@ import pytest
 from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import CloudSite
-from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SLOW, packed, thinned
 from tests.handmade import until
+from tests.web.inside import MAX_VIEWERS, PROTOCOL, SLOW, packed, thinned
 from tests.web.inside import _clouds as clouds_module
 from tests.web.sitekit import TOKEN, Caller
 

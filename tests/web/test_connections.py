@@ -16,14 +16,18 @@ import pytest
 
 import smartcam
 from smartcam._accepting import Places
-from smartcam.web import _connections as connections
-from smartcam.web import _emulator as emulator
-from smartcam.web import _routes as routes
-from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD_BYTES, Visitor
-from smartcam.web._emulator import MAX_WAITING_CHANGES
-from smartcam.web._routes import MAX_BODY_BYTES
-from smartcam.web._streams import MAX_STREAMS
 from tests.handmade import until
+from tests.web.inside import (
+    MAX_BODY_BYTES,
+    MAX_CONNECTIONS,
+    MAX_HEAD_BYTES,
+    MAX_STREAMS,
+    MAX_WAITING_CHANGES,
+    Visitor,
+)
+from tests.web.inside import _connections as connections
+from tests.web.inside import _emulator as emulator
+from tests.web.inside import _routes as routes
 from tests.web.sitekit import TOKEN, Raw, World, served
 
 HALF = b"GET /api HTTP/1.1\r\nHost: localhost\r\nX-Slow: "

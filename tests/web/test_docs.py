@@ -15,20 +15,31 @@ import pytest
 from smartcam._meanings import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from smartcam.emulator import EmulatedCamera
 from smartcam.web import EmulatorSite
-from smartcam.web import _emulator as emulator
-from smartcam.web import _routes as routes
-from smartcam.web import _serialize as serialize
-from smartcam.web import _streams as streams
-from smartcam.web._fleet import LINGER, MAX_CAMERAS
-from smartcam.web._fleet import MAX_VIEWERS as MAX_FLEET_VIEWERS
-from smartcam.web._fleet_rows import BAD_SECONDS, MAX_QUEUE
-from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS
-from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
-from smartcam.web._history import BAR_SECONDS, MAX_BARS, MAX_PICTURES
-from smartcam.web._live import MAX_NEWS
-from smartcam.web._live_view import MAX_RESULTS
-from smartcam.web._pictures import MAX_VIEWERS
 from tests import ROOT
+from tests.web.inside import (
+    ALIVE_INTERVAL,
+    BAD_SECONDS,
+    BAR_SECONDS,
+    BUCKET,
+    LINGER,
+    MAX_BARS,
+    MAX_CAMERAS,
+    MAX_NEWS,
+    MAX_PICTURES,
+    MAX_QUEUE,
+    MAX_RESULTS,
+    MAX_ROWS,
+    PERIOD,
+    SERIES,
+    SORTS,
+    Filter,
+)
+from tests.web.inside import FLEET_MAX_VIEWERS as MAX_FLEET_VIEWERS
+from tests.web.inside import PICTURES_MAX_VIEWERS as MAX_VIEWERS
+from tests.web.inside import _emulator as emulator
+from tests.web.inside import _routes as routes
+from tests.web.inside import _serialize as serialize
+from tests.web.inside import _streams as streams
 from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
@@ -38,7 +49,6 @@ PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
 FLEET_PAGE = (ROOT / "docs" / "fleet-page.md").read_text(encoding="utf-8")
 LIVE_PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
 FRAMES_PAGE = (ROOT / "docs" / "frames.md").read_text(encoding="utf-8")
-WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
 CURL = [
     line
     for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)

@@ -17,15 +17,23 @@ from smartcam.layout import Layout
 from smartcam.layout._inside import ShownUnits
 from smartcam.models import Header, Localization, Pose, Position, Quaternion, Status
 from smartcam.web import FleetSite
-from smartcam.web import _fleet_view as view_module
-from smartcam.web._fleet import CALLS, MAX_VIEWERS
-from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT_BYTES, MAX_QUEUE, line_of
-from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS, PROTOCOL
-from smartcam.web._fleet_view import BUCKET
-from smartcam.web._streams import SLOW
-from smartcam.web._verdicts import judged
 from tests.handmade import until
+from tests.web.inside import (
+    ALIVE_INTERVAL,
+    BAD_SECONDS,
+    BUCKET,
+    CALLS,
+    MAX_KEPT_BYTES,
+    MAX_QUEUE,
+    MAX_ROWS,
+    judged,
+    line_of,
+)
+from tests.web.inside import FLEET_MAX_VIEWERS as MAX_VIEWERS
+from tests.web.inside import FLEET_SOCKET_PROTOCOL as PROTOCOL
+from tests.web.inside import STREAMS_SLOW as SLOW
 from tests.web.inside import _fleet as site_module
+from tests.web.inside import _fleet_view as view_module
 from tests.web.madeup import AT, READY, MadeUpFleet, names
 from tests.web.sitekit import TOKEN, Caller, Raw
 

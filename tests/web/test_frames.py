@@ -18,14 +18,16 @@ import pytest
 from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExtraError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite, _jpeg
-from smartcam.web import _pictures as pictures_module
 from smartcam.web._frames import CALLS
 from smartcam.web._inside import is_whole_jpeg, picture
 from smartcam.web._jpeg import TABLES, jpeg
-from smartcam.web._pictures import MAX_VIEWERS, PROTOCOL, Press
-from smartcam.web._streams import SLOW
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.handmade import until
+from tests.web.inside import PICTURES_MAX_VIEWERS as MAX_VIEWERS
+from tests.web.inside import PICTURES_PROTOCOL as PROTOCOL
+from tests.web.inside import STREAMS_SLOW as SLOW
+from tests.web.inside import Press
+from tests.web.inside import _pictures as pictures_module
 from tests.web.sitekit import TOKEN, Caller, Raw
 
 simplejpeg = pytest.importorskip("simplejpeg", reason="needs the extra frames")

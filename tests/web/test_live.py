@@ -18,26 +18,25 @@ from smartcam.fleet import FleetFile
 from smartcam.layout import Layout
 from smartcam.models import Localization, Pose, Position, Quaternion, Result
 from smartcam.web import FleetSite, LiveSite
-from smartcam.web._history import (
+from tests.handmade import until
+from tests.web.inside import (
     BAR_SECONDS,
     MAX_BARS,
     MAX_FAILURES,
-    MAX_PICTURES,
-    SHIFT_SECONDS,
-    SLOT_SECONDS,
-    ShiftHistory,
-)
-from smartcam.web._live import CALLS, MAX_NEWS
-from smartcam.web._live_view import (
+    MAX_NEWS,
     MAX_PARTS,
+    MAX_PICTURES,
     MAX_RESULTS,
     MAX_SHOWN_RAW_BYTES,
     MAX_VALUE_CHARACTERS,
+    SHIFT_SECONDS,
+    SLOT_SECONDS,
+    ShiftHistory,
     ShownResult,
     shown_value,
+    verdicts,
 )
-from smartcam.web._verdicts import verdicts
-from tests.handmade import until
+from tests.web.inside import LIVE_CALLS as CALLS
 from tests.web.sitekit import TOKEN, Caller, Listener, Raw
 
 if TYPE_CHECKING:

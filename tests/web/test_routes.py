@@ -17,11 +17,16 @@ from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
-from smartcam.web._emulator import CALLS, MAX_PARTS
-from smartcam.web._routes import MAX_BODY_BYTES
-from smartcam.web._serialize import MAX_HEX_BYTES, MAX_TOLD_BYTES, MAX_VALUES_BYTES
 from smartcam.web._shapes import OUTLINES, SIDE
-from smartcam.web._streams import Streams
+from tests.web.inside import EMULATOR_CALLS as CALLS
+from tests.web.inside import EMULATOR_MAX_PARTS as MAX_PARTS
+from tests.web.inside import (
+    MAX_BODY_BYTES,
+    MAX_HEX_BYTES,
+    MAX_TOLD_BYTES,
+    MAX_VALUES_BYTES,
+    Streams,
+)
 from tests.web.sitekit import Raw, served
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import pytest
 import smartcam
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Status
-from smartcam.web import _streams as streams
 from smartcam.web._feed import MAX_LOG_NEWS, Watcher
-from smartcam.web._streams import MAX_STREAMS, News
 from tests.handmade import until
+from tests.web.inside import MAX_STREAMS, News
+from tests.web.inside import _streams as streams
 from tests.web.sitekit import Raw, World, served
 
 

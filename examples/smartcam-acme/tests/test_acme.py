@@ -11,7 +11,6 @@ from smartcam.exceptions import FrameError, TriggerTimeoutError, UnsupportedErro
 from smartcam.protocols import messages as m
 from smartcam.registry import PROTOCOLS
 from smartcam.testing import (
-    COUNTER,
     Came,
     CameraKind,
     Conversation,
@@ -79,7 +78,7 @@ class TestAcme(ProtocolSuite):
         CameraKind(
             name="Acme",
             open=put_up,
-            applications=frozenset({COUNTER}),
+            applications=frozenset({LiveCamera.COUNTER}),
             numbers_with_sequence="n: uint32",
             raw_request=None,
             silent_request=None,

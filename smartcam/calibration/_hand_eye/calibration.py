@@ -110,6 +110,10 @@ ROUNDING_ERROR_M = 1e-7
 MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
 
+MAX_MOVED_SPREAD = 0.25
+"""Poses that were left out agree on a move of camera or target if they are at most this part of it
+apart. A sheet pushed by 20 mm before the last three of fourteen views put points 22 mm off."""
+
 MIN_GOOD_POSES = 5
 """At least this many poses must be left after leaving out those that belong to other views."""
 
@@ -235,6 +239,8 @@ def calibrate_hand_eye(
     result = _without_bad(problem, asked, named, [transforms[i] for i in order], ordered)
     _check_scale(result.target_scale, most_scale)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
+    if remarks:
+        strays = [one for one in strays if one.code != Code.WRONG_LENS]
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
         warnings=(*result.warnings, *remarks, *of_sheet, *strays),
@@ -436,7 +442,8 @@ def _without_bad(
         kept = _bad_view(result, index, named[number], "is used all the same")
         remarks.setdefault(number, kept)
     errors, left_out = np.full((2, problem.count), np.nan)
-    for number in np.setdiff1d(np.arange(problem.count), used).tolist():
+    unused = np.setdiff1d(np.arange(problem.count), used).tolist()
+    for number in unused:
         (off,) = result.point_errors([robot_poses[number]], [seen[number]])
         if np.isfinite(off).all():
             errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
@@ -448,8 +455,37 @@ def _without_bad(
         errors=errors,
         leave_one_out=left_out,
         used=tuple(np.isin(np.arange(problem.count), used).tolist()),
-        warnings=(*_size_remark(some, asked), *_remarks(some, result), *remarks.values()),
+        warnings=(
+            *_size_remark(some, asked),
+            *_remarks(some, result),
+            *_moved_remark(problem.taken(unused), result, [named[i] for i in unused]),
+            *remarks.values(),
+        ),
     )
+
+
+def _moved_remark(
+    unused: Problem, result: HandEyeCalibration, named: Sequence[str]
+) -> Iterator[Remark]:
+    """Yield a remark if the poses that were left out agree on another place of camera or target."""
+    if unused.count < 2:
+        return
+    between, seen = unused.robot.between, unused.poses.scaled(result.target_scale)
+    camera, target = result.camera_pose.rigid, result.target_pose.rigid
+    arm = float(np.median(np.linalg.norm(seen.translation, axis=1)))
+    by_carrier = {"target": (target, between.inverse() @ (camera @ seen))}
+    by_carrier["camera"] = (camera, between @ (target @ seen.inverse()))
+    for what, (place, others) in by_carrier.items():
+        steps = place.before(others) * np.repeat([arm, 1.0], 3)
+        middle = np.median(steps, axis=0)
+        apart = np.linalg.norm(steps - middle, axis=1)
+        if float(apart.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle)):
+            yield Code.POOR_FIT.remark(
+                f"the {what} seems to have moved by {1e3 * np.linalg.norm(middle[3:]):.3g} mm: "
+                f"{', '.join(named)} were left out, and agree on another place of it than all "
+                "others; which of both holds now, they cannot tell"
+            )
+            return
 
 
 def _near(
@@ -646,7 +682,7 @@ def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Rema
         return []
     before, after = given.matrix[0, 0], adjusted.matrix[0, 0]
     return [
-        Code.POOR_FIT.remark(
+        Code.WRONG_LENS.remark(
             f"expected the lens as it was given, got one that fits far better: fx {after:.1f} px "
             f"instead of {before:.1f} px; the calibration's camera is that one"
         )

@@ -377,9 +377,10 @@ def adjust(
 ) -> Solution:
     """Minimize the weighted squares by Levenberg and Marquardt's steps.
 
-    The ``cost`` of the result is infinite if the target begins behind the camera. If ``noise`` is
-    None, the robot's poses are exact. The fit ends when a step gains less than the part ``gain`` of
-    the cost plus ROUNDING_COST, since exact samples leave only rounding errors to gain.
+    The ``cost`` of the result is infinite if the target begins behind the camera, or ends where
+    nothing determines the poses. If ``noise`` is None, the robot's poses are exact. The fit ends
+    when a step gains less than the part ``gain`` of the cost plus ROUNDING_COST, since exact
+    samples leave only rounding errors to gain.
     """
     spread = seen if noise is None else seen.spread(noise.shared)
     change = start.change if start.change.size else np.zeros(seen.extra)
@@ -394,7 +395,11 @@ def adjust(
     )
     if not math.isfinite(normal.cost):
         return at
-    return dataclasses.replace(at, cost=normal.cost, information=normal.reduced()[0])
+    try:
+        information = normal.reduced()[0]
+    except np.linalg.LinAlgError:  # poses and views so wrong that a target is in the camera
+        return dataclasses.replace(at, cost=math.inf)
+    return dataclasses.replace(at, cost=normal.cost, information=information)
 
 
 def _stepped(at: Solution, step: Array, corrections: Array) -> Solution:

@@ -38,6 +38,7 @@ from smartcam.calibration._hand_eye.equations import (
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
 from smartcam.calibration._least_squares import solve_scaled
 from smartcam.calibration._statistics import Noise
+from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Rigid
 
 if TYPE_CHECKING:
@@ -376,7 +377,10 @@ def _candidate(method: str, besides: str, problem: Problem, solution: Solution) 
     found = Candidate(method, besides, problem, solution)
     if problem.count > MIN_POSES:
         found.others = without_each(problem.robot, problem.seen, solution)
-        found.off = problem.off(found.others)
+        try:
+            found.off = problem.off(found.others)
+        except CalibrationError:  # without one of the views no lens is left
+            return None
     return found
 
 

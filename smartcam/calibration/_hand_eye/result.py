@@ -13,7 +13,13 @@ from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
 from smartcam.calibration._hand_eye.model_selection import on_plane, point_errors
 from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view, half_turned
 from smartcam.calibration._targets import resized
-from smartcam.calibration._verdict import VIEW_CURES, Allowed, judge
+from smartcam.calibration._verdict import (
+    VIEW_CURES,
+    Allowed,
+    CalibrationVerdict,
+    Judgement,
+    judge,
+)
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import CameraModel, Code, Transform
 from smartcam.geometry._inside import Array, as_motion, as_points, check_finite
@@ -25,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from smartcam.calibration._targets import Target
-    from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 
 KIND = "hand-eye"
 """Name of these calibrations' files in the store."""
@@ -163,7 +168,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         held_out, codes = self.held_out_error, {one.code for one in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
         several = "s" * (len(left_out) > 1)
-        return judge(
+        found = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
             [one for one in self.warnings if not (left_out and one.code == Code.BAD_VIEW)],
             worst=1 + self.worst,
@@ -172,6 +177,13 @@ class HandEyeCalibration(storage.SavedCalibration):
             more="take more views",
             where=f" without view{several} {', '.join(left_out)}" if left_out else "",
         )
+        if found.verdict.level != "good" or self.used[-1]:
+            return found
+        text = (
+            "Not known how good: the last view does not fit, and may show that something moved: "
+            "take more views"
+        )
+        return Judgement(CalibrationVerdict("unknown", text), option="more")
 
     @property
     def rotation_error(self) -> float:

@@ -58,7 +58,7 @@ from smartcam.geometry._inside import Array, as_points, as_vector
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -78,6 +78,10 @@ same mistake (shown by simulation)."""
 MAX_TOUCH_SIGMAS = 4.0
 """A touch further than this many sigmas from the mean of its point's touches is remarked on: noise
 alone does it once in a thousand."""
+
+MAX_MOVED_SPREAD = 0.2
+"""Touches that were left out are off by the same move if they are at most this part of it apart. A
+sheet pushed by 3 to 50 mm before the last two to four of nine touches was called good."""
 
 MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
@@ -643,7 +647,10 @@ def fit_plane(
         warnings=findings(evidence),
     )
     remarks = [] if order is None else [order.remark(1 + once.first)]
-    remarks += [_left_out(found, index, parts[index]) for index in found.outliers]
+    remarks += [
+        *_moved_remark(missed[off], 1 + once.first[off]),
+        *(_left_out(found, index, parts[index]) for index in found.outliers),
+    ]
     apart = np.linalg.norm(beside, axis=1)
     if apart.max() > MAX_TOUCH_SIGMAS * most:
         text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"
@@ -656,6 +663,24 @@ def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
     result = whole.copy()
     result[at] = values
     return result
+
+
+def _moved_remark(missed: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
+    """Yield a remark if the touches that were left out are off by the same way.
+
+    ``missed`` (N, 3): their distances from where the others say, metres. ``numbers``: of the
+    points, from 1.
+    """
+    if len(missed) < 2:
+        return
+    middle = missed.mean(axis=0)
+    apart = np.linalg.norm(missed - middle, axis=1)
+    if float(apart.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle)):
+        yield Code.POOR_FIT.remark(
+            f"points {', '.join(map(str, numbers.tolist()))} are left out, and all lie "
+            f"{1e3 * float(np.linalg.norm(middle)):.3g} mm off to one side: the sheet or the tip "
+            "moved between the touches, and which of both holds now, they cannot tell"
+        )
 
 
 def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:

@@ -145,7 +145,7 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2; Cook and
     # Weisberg, Residuals and Influence in Regression (1982), chapter 2.
     left, singular, right = np.linalg.svd(scaled, full_matrices=False)
-    condition = float(singular[-1] / singular[0])
+    condition = float(singular[-1] / singular[0]) if singular[0] > 0.0 else 0.0
     if condition < MIN_CONDITION:
         raise Code.COLLINEAR.refusal(
             f"{name}: expected points that determine all {model.parameters} parameters "
@@ -176,6 +176,7 @@ def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Arra
     root = np.sqrt(pairs.weights)[:, None, None]
     weighted = (root * jacobian).reshape(-1, model.parameters)
     lengths = np.linalg.norm(weighted, axis=0)
+    lengths[lengths == 0.0] = 1.0  # nothing depends on this parameter
     return weighted / lengths, lengths
 
 

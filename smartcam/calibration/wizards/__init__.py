@@ -10,17 +10,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
     from smartcam.calibration.wizards._pictures import PictureFolder
     from smartcam.calibration.wizards._plane import plane_wizard
-    from smartcam.calibration.wizards._sequence import (
-        PendingStep,
-        StepAnswer,
-        Wizard,
-        WizardSession,
-        ask,
-    )
+    from smartcam.calibration.wizards._sequence import Wizard, WizardSession, ask
     from smartcam.calibration.wizards._services import CalibrationService
     from smartcam.calibration.wizards._sheet import sheet_wizard
     from smartcam.calibration.wizards._steps import (
-        Answers,
         Flag,
         Number,
         Option,
@@ -32,15 +25,12 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._verification import drift_wizard
 
 __all__ = [
-    "Answers",
     "CalibrationService",
     "Flag",
     "Number",
     "Option",
-    "PendingStep",
     "PictureFolder",
     "Step",
-    "StepAnswer",
     "Text",
     "Wizard",
     "WizardSession",
@@ -60,10 +50,10 @@ if not TYPE_CHECKING:
             "_hand_eye": "hand_eye_wizard",
             "_pictures": "PictureFolder",
             "_plane": "plane_wizard",
-            "_sequence": "PendingStep StepAnswer Wizard WizardSession ask",
+            "_sequence": "Wizard WizardSession ask",
             "_services": "CalibrationService",
             "_sheet": "sheet_wizard",
-            "_steps": "Answers Flag Number Option Step Text as_lists from_lists",
+            "_steps": "Flag Number Option Step Text as_lists from_lists",
             "_verification": "drift_wizard",
         },
     )

@@ -22,6 +22,8 @@ MAX_MARKS = 25
 Localize = Callable[[], Awaitable[list[Localization]]]
 """Function that takes a picture and returns the localizations in it."""
 
+Vector = tuple[float, float, float]
+
 
 @dataclass(frozen=True, slots=True)
 class Mark:
@@ -43,6 +45,16 @@ class Mark:
         name = self.feature if self.feature.isprintable() else repr(self.feature)
         factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """A touch of a point by the robot's tip."""
+
+    mark: Mark  # mark that the camera sees at the point; for a ray, its origin
+    robot: Vector  # position of the tip in the robot's base, metres
+    tool_z: Vector | None  # direction of the tool's axis; None if it is not known
+    what: str = "mark"  # ``mark``, or the letter of a point of the rays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

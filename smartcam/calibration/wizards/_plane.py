@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
-    from smartcam.calibration.wizards._marks import Localize
+    from smartcam.calibration.wizards._marks import Localize, Touch
     from smartcam.calibration.wizards._points import Calibrated
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
-    from smartcam.calibration.wizards._touches import ReadRobot, Touch
+    from smartcam.calibration.wizards._touches import ReadRobot
 
 
 def plane_wizard(

@@ -29,15 +29,7 @@ from smartcam.calibration._verdict import CURES, Judgement, refused
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
-from smartcam.calibration.wizards._touches import (
-    ALLOWED,
-    SIDE,
-    SIDES,
-    SIGMA,
-    UNIT,
-    Touch,
-    Touches,
-)
+from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIDES, SIGMA, UNIT, Touches
 from smartcam.calibration.wizards._usage import usage
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code
@@ -50,7 +42,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.load import AnyCalibration
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
     from smartcam.calibration._plane.calibration import PlaneCalibration
-    from smartcam.calibration.wizards._marks import Mark
+    from smartcam.calibration.wizards._marks import Mark, Touch
     from smartcam.calibration.wizards._steps import Answers, Input
     from smartcam.geometry._inside import Array
 

@@ -49,10 +49,11 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration._targets import Target
+    from smartcam.calibration.wizards._marks import Touch
     from smartcam.calibration.wizards._pictures import Pictures, TakePicture
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
-    from smartcam.calibration.wizards._touches import ReadRobot, Touch
+    from smartcam.calibration.wizards._touches import ReadRobot
 
 DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
 """Directions in which the outermost points of a target lie, the origin first."""

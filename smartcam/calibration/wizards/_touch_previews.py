@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
-    from smartcam.calibration.wizards._marks import Mark
-    from smartcam.calibration.wizards._touches import Touch
+    from smartcam.calibration.wizards._marks import Mark, Touch
     from smartcam.geometry._inside import Array
 
 HEAT_MAP_CELLS = 24

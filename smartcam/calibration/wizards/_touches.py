@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration.wizards._marks import Mark, choose
+from smartcam.calibration.wizards._marks import Mark, Touch, Vector, choose
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Number, Option, Step
 from smartcam.calibration.wizards._touch_previews import before
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 ReadRobot = Callable[[], Awaitable[Pose]]
 """Function that returns the pose of the robot's tip in the robot's base, metres; its z points out
 of the tool."""
-
-Vector = tuple[float, float, float]
 
 UNITS: Mapping[str, float] = {"mm": 1e-3, "m": 1.0}
 """Metres per unit, for the units that coordinates of the robot may be typed in."""
@@ -77,16 +75,6 @@ SIDE = Option(
     | {"-z": "down: -z of the robot", "unknown": "not known"},
 )
 """Input for one of :data:`SIDES`."""
-
-
-@dataclass(frozen=True, slots=True)
-class Touch:
-    """A touch of a point by the robot's tip."""
-
-    mark: Mark  # mark that the camera sees at the point; for a ray, its origin
-    robot: Vector  # position of the tip in the robot's base, metres
-    tool_z: Vector | None  # direction of the tool's axis; None if it is not known
-    what: str = "mark"  # ``mark``, or the letter of a point of the rays
 
 
 @dataclass(eq=False)

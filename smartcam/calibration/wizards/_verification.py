@@ -46,7 +46,7 @@ CHECKS = "smartcam.checks/1"
 """Name of the format of a file of checks, in its first line."""
 
 KNOCK_M = 0.001
-"""Shift of a camera that was knocked, metres: a check should notice it."""
+"""Shift of a knocked camera, metres, in the direction that is hardest to notice."""
 
 NOTICED_SHARE = 0.95
 """Part of all checks that should notice such a knock."""
@@ -96,20 +96,13 @@ def drift_wizard(
     return Wizard(name=WIZARD, version=1, script=script, steps=5)
 
 
-def touches_needed(
-    calibration: PlaneCalibration,
-    camera_point: ArrayLike,
-    *,
-    knock: float = KNOCK_M,
-    noticed: float = NOTICED_SHARE,
-) -> int | None:
+def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> int | None:
     """Return the number of touches of one mark that are needed to notice a knock.
 
     The result is None if :data:`MAX_TOUCHES` are not enough, since the calibration itself is too
-    uncertain there. ``camera_point`` (2,): place of the mark for the camera. ``knock``: shift of
-    the camera's plane, metres, in the direction that is hardest to notice. ``noticed``: part of all
-    checks, 0 to 1, that must find it. Raises SHAPE or NOT_FINITE; UNVERIFIED if the touches' sigma
-    is not known; MissingExtraError: SciPy is not installed.
+    uncertain there. ``camera_point`` (2,): place of the mark for the camera. Raises SHAPE or
+    NOT_FINITE; UNVERIFIED if the touches' sigma is not known; MissingExtraError: SciPy is not
+    installed.
     """
     known = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
     sigma = calibration.touch_sigma or 0.0
@@ -117,8 +110,11 @@ def touches_needed(
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
         variance = known + sigma**2 / count
-        shift = min(knock**2 / max(variance, knock**2 / _MAX_SHIFT), _MAX_SHIFT)
-        if _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift) >= noticed:
+        shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
+        if (
+            _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
+            >= NOTICED_SHARE
+        ):
             return count
     return None
 

@@ -17,13 +17,11 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.conformance.camera._judging import judge
     from smartcam.conformance.camera._options import Allow, ConformanceOptions
-    from smartcam.conformance.camera._report import CameraReport
     from smartcam.conformance.camera._suite import CameraConformance
 
 __all__ = [
     "Allow",
     "CameraConformance",
-    "CameraReport",
     "ConformanceOptions",
     "judge",
 ]
@@ -34,7 +32,6 @@ if not TYPE_CHECKING:
         {
             "_judging": "judge",
             "_options": "Allow ConformanceOptions",
-            "_report": "CameraReport",
             "_suite": "CameraConformance",
         },
     )

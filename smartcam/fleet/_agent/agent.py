@@ -33,6 +33,7 @@ from smartcam.fleet._agent.claims import Claims
 from smartcam.fleet._agent.host import Host
 from smartcam.fleet._agent.shared import Owner
 from smartcam.fleet._agent.summary import Summaries
+from smartcam.fleet._agent.workers import Workers
 from smartcam.fleet._bus.errors import late, to_fields
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._bus.wire import (
@@ -230,6 +231,7 @@ class Agent:
         # running questions, by program
         self._questions: collections.Counter[str] = collections.Counter()
         self._numbers = 0
+        self._workers = Workers()
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
         self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
@@ -285,6 +287,8 @@ class Agent:
             handle.close()
         for program in [*self._programs]:
             self._forget(program, going_back=False)
+        for task in self._workers.close():
+            self._own(task)
         for task in tuple(self._tasks):
             task.cancel()
         try:
@@ -619,7 +623,9 @@ class Agent:
         if guest is not None and left is not None:
             owner, entered = Owner(guest.number, number), guest.entered
             call = ProgramCall(host, program, owner, {}, [], left, entered, order, reservation)
-            self._start(said, call, guest, True)
+            worker = self._workers.take()
+            guest.begin(True, number, worker.task)
+            worker.do(partial(self._do, said, call, guest, True))
 
     def _admit(
         self,

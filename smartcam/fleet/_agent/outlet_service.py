@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._agent.agent import Agent
     from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
     from smartcam.fleet._bus.keys import Keys
-    from smartcam.outlets import OutletState
+    from smartcam.outlets._inside import OutletState
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 

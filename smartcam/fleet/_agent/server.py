@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
     from smartcam.inspection import SoftwareDevice
     from smartcam.observers import Observer
-    from smartcam.outlets import OutletState
+    from smartcam.outlets._inside import OutletState
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -406,7 +406,7 @@ class FleetServer(Server):
         teller = JudgedResults(
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
-            lambda result, judged: observers.picture(result, judged.frame),
+            lambda result, judged: observers.picture(result, judged.marked_frame),
             kept=0,
         )
         device.eyes.viewers.add(teller.take)

@@ -215,7 +215,10 @@ class Feed(Generic[NumberedT]):
         """Take messages that the agent sent by itself; ``following`` is its next number."""
         if epoch == self.epoch and self.expected and not self.lacking:
             for thing in things:
-                if thing.number > self.expected:
+                if thing.number == self.expected:
+                    self.expected = thing.next
+                    self._take(thing)
+                elif thing.number > self.expected:
                     self._hold(epoch, thing)
                 elif thing.next > self.expected:
                     self._have(thing)
@@ -267,7 +270,10 @@ class Feed(Generic[NumberedT]):
     def _go_on(self, following: int) -> None:
         """Take held messages that are next; request the missing ones before the rest."""
         self.lacking = False
-        self._announced = max(self._announced, following)
+        if following > self._announced:
+            self._announced = following
+        if not self._held and following <= self.expected:
+            return
         held = self._now_held()
         while held and held[0].number <= self.expected:
             thing = held.popleft()

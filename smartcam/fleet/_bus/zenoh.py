@@ -56,6 +56,13 @@ MAX_EXPRESS_MESSAGES = 8
 """Number of messages in that time that are each sent at once. The engine has room for 16 packets of
 a kind: the next messages are sent in packets of many, up to a millisecond later."""
 
+MAX_FREQUENT_KEYS = 64
+"""Largest number of keys with a publisher of their own, which routers have to know."""
+
+IDLE_KEY_TIME = 10.0
+"""Seconds without use after which a key loses its publisher to another key. The publisher's end
+would overtake messages that still wait for room."""
+
 SENDERS = 8
 """Threads that send messages that may have to wait; a program that does not read blocks one."""
 
@@ -77,6 +84,8 @@ class ZenohEnd(ZenohSession, Bus):
         self._doubtful = 0  # messages that may have been dropped, and are not sent again yet
         self._behind: collections.Counter[str] = collections.Counter()
         self._calm_since, self._said = -BURST_PERIOD, 0
+        # keys that are used again and again, in the order of their last use
+        self._frequent: dict[str, _FrequentKey] = {}
         zenoh = self._zenoh
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
@@ -137,6 +146,7 @@ class ZenohEnd(ZenohSession, Bus):
         looking, self._looking = self._looking, None
         if looking is not None:
             looking.cancel()
+        self._frequent.clear()
         await super().close()
 
     async def look_at_certificates(self) -> Identity:
@@ -208,17 +218,46 @@ class ZenohEnd(ZenohSession, Bus):
         self._said += 1
         # a single message is sent at once, a burst together: there is not room for many
         express = self._said <= MAX_EXPRESS_MESSAGES
-        # a router, and a peer, has one to each listening end
-        way = "" if self._link.mode == "client" else key
-        if len(payload) > MAX_DIRECT_BYTES or self._doubtful or way in self._behind:
-            self._hand_over(way, session, key, payload, express)
+        waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
+        if waits or (self._behind and self._way(key) in self._behind):
+            self._hand_over(self._way(key), session, key, payload, express)
             return
         try:
-            session.put(key, payload, **self._dropping[express])
+            publisher = self._publisher_of(key, begun) if express else None
+            if publisher is None:
+                session.put(key, payload, **self._dropping[express])
+            else:
+                publisher.put(payload)
         except self._zenoh.ZError as exc:  # it ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
         if self._loop.time() - begun >= ROOM_TIMEOUT:
-            self._hand_over(way, session, key, payload, express, doubtful=True)
+            self._hand_over(self._way(key), session, key, payload, express, doubtful=True)
+
+    def _way(self, key: str) -> str:
+        """Return the name of the queue in which a message is sent in order."""
+        # a router, and a peer, has one to each who listens
+        return "" if self._link.mode == "client" else key
+
+    def _publisher_of(self, key: str, now: float) -> Any:
+        """Return the engine's publisher of a key that is used again; None for other keys.
+
+        The engine then need not look for the key's subscribers at each message.
+
+        Raises:
+            ZError: the session ends meanwhile.
+        """
+        frequent = self._frequent
+        known = frequent.pop(key, None)
+        if known is not None:
+            frequent[key] = known
+            return known.used(now)
+        if len(frequent) >= MAX_FREQUENT_KEYS:
+            oldest = next(iter(frequent))
+            if now - frequent[oldest].used_at < IDLE_KEY_TIME:
+                return None
+            frequent.pop(oldest).close()
+        frequent[key] = _FrequentKey(self, key, self._dropping[True], now)
+        return None
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         if self._session is not None:
@@ -427,12 +466,41 @@ class ZenohEnd(ZenohSession, Bus):
         begun = self._loop.time()
         quietly(publisher.put, payload)
         if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
-            way = "" if self._link.mode == "client" else urgent_key
-            self._hand_over(way, session, urgent_key, payload, False, doubtful=True)
+            self._hand_over(
+                self._way(urgent_key), session, urgent_key, payload, False, doubtful=True
+            )
 
 
 class _OnBus(ZenohDeclared, Handle):
     pass
+
+
+class _FrequentKey(_OnBus):
+    """A key that is used again and again; from its second use on it has a publisher.
+
+    Args:
+        end: the end that uses it.
+        key: the key.
+        how: the engine's options of the publisher.
+        now: loop time.
+
+    Attributes:
+        used_at: loop time of the last use.
+    """
+
+    def __init__(self, end: ZenohEnd, key: str, how: dict[str, Any], now: float) -> None:
+        super().__init__(end)
+        self.used_at: float = now
+        self._key, self._options = key, how
+        self._declares = False
+
+    def used(self, now: float) -> Any:
+        """Return the publisher; None while there is none."""
+        self.used_at = now
+        if not self._declares:
+            self._declares = True
+            self.of(lambda session: session.declare_publisher(self._key, **self._options))
+        return self._it
 
 
 class _ZenohPublisher(Publisher):

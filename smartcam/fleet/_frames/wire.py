@@ -18,7 +18,7 @@ from smartcam.frames import Frame, FrameTrigger, Moment
 
 if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Data
-    from smartcam.frames import RateStatistics
+    from smartcam.frames._inside import RateStatistics
     from smartcam.geometry import CameraModel
 
 MAX_FRAME_BYTES = 1 << 28

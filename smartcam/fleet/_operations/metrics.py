@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._agent.server import FleetServer
     from smartcam.frames import SourceStatistics
     from smartcam.models import Statistics
-    from smartcam.outlets import OutletState
+    from smartcam.outlets._inside import OutletState
 
 SLICE = 24
 """Number of cameras that are read at a time, which takes half a millisecond."""

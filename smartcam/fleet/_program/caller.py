@@ -33,7 +33,7 @@ from smartcam.fleet._security.certificates import may_command
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam._client._inside import TriggerRequest
+    from smartcam._client._inside import Outcome, TriggerRequest
     from smartcam.fleet._bus.bus import Handle
     from smartcam.fleet._program.program import Program, Reply
     from smartcam.protocols import Counters
@@ -122,6 +122,7 @@ class Caller:
         end: reason why there will be no further agent.
         linked: whether the agent has a session with the camera, as far as is known.
         leases: the reservations whose blocks run, oldest first, by the calls that made them.
+        streamed: whether this program takes all results of the camera.
     """
 
     def __init__(
@@ -144,6 +145,8 @@ class Caller:
         self.end: LinkError | None = None
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
+        self.streamed: bool = False
+        self._commands_to = "", ""  # the agent called last, and the key of commands to it
         self._epochs: dict[str, int] = {}  # epochs of agents that have answered
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
@@ -548,12 +551,11 @@ class Caller:
         """Send a call, and return the reply; ``deadline`` is that of this side."""
         self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
-        waiting = program.expect(number, self)
-        timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
+        waiting = program.expect(number, self, deadline)
         try:
             self.counters.bytes_sent += program.put(key, payload)
             self.counters.frames_sent += 1
-            reply = await waiting
+            reply: Reply = await waiting
         except TimeoutError as exc:
             self._cancel(key, number)
             raise self._silence(do, deadline - begun) from exc
@@ -561,7 +563,6 @@ class Caller:
             self._cancel(key, number)
             raise
         finally:
-            timer.cancel()
             program.forget(number)
         self.counters.frames_received += 1
         if isinstance(reply, TriggerReply):
@@ -597,12 +598,12 @@ class Caller:
         """
         program, met = self.program, self.met
 
-        def say() -> tuple[int, asyncio.Future[Reply]]:
+        def say() -> tuple[int, Outcome]:
             number = program.next_call()
             program.send(key, {"call": number, **fields})
             return number, program.expect(number, self)
 
-        async def repeat(number: int, answer: asyncio.Future[Reply]) -> None:
+        async def repeat(number: int, answer: Outcome) -> None:
             while True:
                 try:
                     async with asyncio.timeout(INSIST_AFTER):
@@ -654,7 +655,9 @@ class Caller:
     def _key(self, agent: str, do: str) -> str:
         program, camera = self.program, self.camera
         if do in COMMANDS:
-            return program.keys.command(agent, camera)
+            if self._commands_to[0] != agent:
+                self._commands_to = agent, program.keys.command(agent, camera)
+            return self._commands_to[1]
         return program.keys.ask(program.role, agent, camera)
 
     def _silence(self, do: str, waited: float) -> SmartCamError:
@@ -670,11 +673,6 @@ class Caller:
             f"done is unknown{self._perhaps(do)}",
             waited=waited,
         )
-
-
-def _expire(waiting: asyncio.Future[Reply]) -> None:
-    if not waiting.done():
-        waiting.set_exception(TimeoutError())
 
 
 def _unknown(error: LinkError) -> LinkError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -455,6 +456,9 @@ class FleetCamera(Camera[ValueT]):
         """Process an event of the camera, with its present state."""
         if self._closed is not None:
             return
+        if said["kind"] == "Status" and self._changes_status_only(said):
+            self._take_status(_status(said["status"]), said)
+            return
         at = _time(said)
         linked = bool(said.get("connected"))
         if said["kind"] == "Removed":
@@ -487,7 +491,19 @@ class FleetCamera(Camera[ValueT]):
                 )
             )
         if status is not None and linked:
-            self._take_status(Status(int(status)), at, said["kind"])
+            self._take_status(_status(int(status)), said)
+
+    def _changes_status_only(self, said: dict[str, Any]) -> bool:
+        """Return True if an event leaves all but the camera's status as it is known."""
+        application = said.get("application")
+        return (
+            self._linked
+            and not self._trying
+            and "trying" not in said
+            and said.get("connected") is True
+            and said.get("status") is not None
+            and (application is None or application == self._active)
+        )
 
     def _take_notice(self, said: dict[str, Any], at: datetime) -> None:
         """Publish a notice from the camera."""
@@ -526,18 +542,20 @@ class FleetCamera(Camera[ValueT]):
         self._listeners.publish(event(camera=self.name, at=at, url=self.url))
         self._stir(self._status or Status(0))
 
-    def _take_status(self, status: Status, at: datetime, kind: str) -> None:
-        previous = self._status
+    def _take_status(self, status: Status, said: dict[str, Any]) -> None:
+        listeners, previous = self._listeners, self._status
         self._status = status
-        if kind == "Status":
-            self._listeners.offer_status(status, asyncio.get_running_loop().time())
+        if said["kind"] == "Status":
+            if listeners.hears_statuses:
+                listeners.offer_status(status, asyncio.get_running_loop().time())
         elif status == previous:
             return
-        if status != previous and self._listeners.sees_events:
-            self._listeners.publish(
-                StatusChanged(camera=self.name, at=at, status=status, previous=previous)
+        if status != previous and listeners.sees_events:
+            listeners.publish(
+                StatusChanged(camera=self.name, at=_time(said), status=status, previous=previous)
             )
-        self._stir(status)
+        if self._watching:
+            self._stir(status)
 
     # ------------------------------------------------------------------ what is known
 
@@ -635,14 +653,16 @@ class FleetCamera(Camera[ValueT]):
             timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
         deadline = self._deadline(timeout)
-        await self._met_first(deadline)
+        if self.opening is not None:
+            await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(request, application, expected, number, timeout)
             receiver.take_told(reply)
-            await self._reach(reply.states, reply.batch.following, deadline)
+            if not receiver.has(reply.states, reply.batch.following):
+                await self._reach(reply.states, reply.batch.following, deadline)
             return receiver.outcomes(own, reply.batch)
         finally:
             del receiver.own[number]
@@ -873,6 +893,10 @@ class FleetCamera(Camera[ValueT]):
         arguments: dict[str, Any] = {"message_id": message_id, "answered": answered}
         reply = await self._do("request", timeout, [payload], **arguments)
         return reply.blobs[0] if reply.blobs else None
+
+
+_status = functools.lru_cache(maxsize=256)(Status)
+"""Return the status with given bits; a new object costs more than a look at the last ones."""
 
 
 def _time(said: dict[str, Any]) -> datetime:

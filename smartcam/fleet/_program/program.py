@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any, NamedTuple
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+from smartcam._client._inside import DeadlineTimer, Outcome, make_doorbell
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import (
     ConfigurationError,
@@ -38,11 +40,29 @@ LAST_LOOK_TIMEOUT = 1.0
 Reply = BusMessage | TriggerReply
 
 
-class Pending(NamedTuple):
-    """A call whose reply has not come."""
+class Called(Protocol):
+    """A camera that calls are made to.
 
-    camera: object
-    reply: asyncio.Future[Reply]
+    Attributes:
+        streamed: whether this program takes all results of the camera; they are handed on before
+            the caller of a trigger goes on.
+    """
+
+    streamed: bool
+
+
+class Pending(NamedTuple):
+    """A call whose reply has not come.
+
+    Attributes:
+        camera: the camera that is called.
+        reply: the future of the reply.
+        deadline: loop time until which the reply is waited for.
+    """
+
+    camera: Called
+    reply: Outcome
+    deadline: float
 
 
 class Program:
@@ -75,9 +95,11 @@ class Program:
         self._guest = guest
         self._fleet, self._camera = fleet, camera
         self._called = called
-        self._name = ProgramName.new(ANYONE, called)
+        self._set_name(ProgramName.new(ANYONE, called))
         self._calls = 0
         self._pending: dict[int, Pending] = {}
+        self._expiry = DeadlineTimer(self._expire)
+        self._expires_at = math.inf  # no later than the first deadline of those pending
         self._declared: list[Handle] = []
         self.frames: FrameCollector = FrameCollector(self)
 
@@ -88,18 +110,23 @@ class Program:
             ConnectFailedError: no bus is found within ``timeout`` seconds, or no fleet on it.
             ConfigurationError: there are several fleets.
         """
-        deadline = asyncio.get_running_loop().time() + timeout
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout
+        self._bell = make_doorbell(loop)
         if not self._guest:
             await self.bus.open(timeout)
         self.keys = Keys(self._fleet or await self._find(deadline, timeout))
         if self.bus.identity is not None:
             called = self._called or self.bus.identity.name or None
-            self._name = ProgramName.new(self.bus.identity.role, called)
+            self._set_name(ProgramName.new(self.bus.identity.role, called))
         self._declared = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
             self.bus.be_present(self.keys.program(self.token)),
         ]
         return self
+
+    def _set_name(self, name: ProgramName) -> None:
+        self._name, self._token = name, name.token
 
     @property
     def name(self) -> str:
@@ -109,7 +136,7 @@ class Program:
     @property
     def token(self) -> str:
         """The program's name and secret, in the form for agents."""
-        return self._name.token
+        return self._token
 
     @property
     def role(self) -> str:
@@ -147,9 +174,10 @@ class Program:
 
     async def close(self) -> None:
         """Leave the bus, and end running calls. Idempotent."""
-        for _, reply in [*self._pending.values()]:
-            if not reply.done():
-                reply.set_exception(ConnectionClosedError("closed"))
+        for pending in [*self._pending.values()]:
+            if not pending.reply.done():
+                pending.reply.set_exception(ConnectionClosedError("closed"))
+        self._expiry.cancel()
         declared, self._declared = self._declared, []
         self.frames.close()
         for handle in declared:
@@ -171,19 +199,42 @@ class Program:
         self.bus.put(key, payload)
         return len(payload)
 
-    def expect(self, number: int, camera: object) -> asyncio.Future[Reply]:
-        """Return the future of the reply to a call; :meth:`forget` the call in the end."""
-        reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        self._pending[number] = Pending(camera, reply)
+    def expect(self, number: int, camera: Called, deadline: float = math.inf) -> Outcome:
+        """Return the future of the reply to a call; :meth:`forget` the call in the end.
+
+        Without a reply by ``deadline`` (loop time) it raises :exc:`TimeoutError`.
+        """
+        reply = self._bell.outcome()
+        self._pending[number] = Pending(camera, reply, deadline)
+        if deadline < self._expires_at:
+            self._expires_at = deadline
+            self._expiry.set(deadline)
         return reply
 
     def forget(self, number: int) -> None:
         """Drop a call whose reply is not awaited any more."""
         self._pending.pop(number, None)
+        if not self._pending:
+            self._expires_at = math.inf
+            self._expiry.clear()
 
-    def fail(self, camera: object, error: Callable[[], SmartCamError]) -> None:
+    def _expire(self) -> None:
+        """End the calls whose deadline is over, and wait for the next one."""
+        now, first = asyncio.get_running_loop().time(), math.inf
+        for _, reply, deadline in self._pending.values():
+            if reply.done():
+                continue
+            if deadline <= now:
+                reply.set_exception(TimeoutError())
+            else:
+                first = min(first, deadline)
+        self._expires_at = first
+        if first < math.inf:
+            self._expiry.set(first)
+
+    def fail(self, camera: Called, error: Callable[[], SmartCamError]) -> None:
         """End all calls to a camera: there will be no replies."""
-        for owner, reply in self._pending.values():
+        for owner, reply, _ in self._pending.values():
             if owner is camera and not reply.done():
                 reply.set_exception(error())
 
@@ -200,5 +251,9 @@ class Program:
         except (ProtocolError, KeyError, TypeError) as exc:
             logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)
             return
-        if pending is not None and not pending.reply.done():
+        if pending is None or pending.reply.done():
+            return
+        if pending.camera.streamed:
             pending.reply.set_result(message)
+        else:
+            self._bell.give(pending.reply, message)

@@ -16,6 +16,7 @@ from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from datetime import datetime
 
     from smartcam._client._inside import Interpretation, Interpreted
     from smartcam.fleet._bus.wire import ResultRun
@@ -27,8 +28,16 @@ def singles(run: ResultRun) -> Iterator[ResultRun]:
         yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
 
 
-def interpreted(run: ResultRun, interpretation: Interpretation, camera: str) -> Interpreted:
+def interpreted(
+    run: ResultRun, interpretation: Interpretation, camera: str, at: datetime | None = None
+) -> Interpreted:
     """Return the contents of the one container of ``run``.
+
+    Args:
+        run: run of one container.
+        interpretation: interpretation of the container.
+        camera: name of the camera.
+        at: time of receipt, if it is known already.
 
     Raises:
         InterpretationError: the container does not fit the interpretation.
@@ -41,12 +50,14 @@ def interpreted(run: ResultRun, interpretation: Interpretation, camera: str) -> 
     (data,) = run.payloads
     container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
     return interpretation(
-        container, run.endian, camera=camera, number=run.number, at=run.received_at
+        container, run.endian, camera=camera, number=run.number, at=at or run.received_at
     )
 
 
-def as_result(run: ResultRun, camera: str, value: Any, sequence: int | None) -> Result[Any]:
-    """Return the one container of ``run`` as a result with this value."""
+def as_result(
+    run: ResultRun, camera: str, value: Any, sequence: int | None, at: datetime | None = None
+) -> Result[Any]:
+    """Return the one container of ``run`` as a result with this value; ``at``: time of receipt."""
     latency = None if math.isnan(run.latency) else run.latency
     return Result(
         camera,
@@ -54,7 +65,7 @@ def as_result(run: ResultRun, camera: str, value: Any, sequence: int | None) -> 
         sequence,
         run.number,
         run.trigger_time,
-        run.received_at,
+        at or run.received_at,
         latency,
         run.payloads[0],
         value,

@@ -36,15 +36,17 @@ FILL_TIMEOUT = 5.0
 
 
 class ToldState(NamedTuple):
-    """An event of the camera, and its state after the event."""
+    """An event of the camera, and its state after the event.
+
+    Attributes:
+        number: number of the event.
+        next: number of the event after it.
+        said: fields of the event and of the camera's state.
+    """
 
     number: int
+    next: int
     said: dict[str, Any]
-
-    @property
-    def next(self) -> int:
-        """The number after this state's."""
-        return self.number + 1
 
     @property
     def size(self) -> int:
@@ -63,7 +65,8 @@ def state(data: bytes) -> ToldState:
         ValueError: the bytes are not an event.
     """
     said = decode_state(data)
-    return ToldState(said["number"], said)
+    number: int = said["number"]
+    return ToldState(number, number + 1, said)
 
 
 class FleetListeners(Listeners):
@@ -217,12 +220,13 @@ class Receiver:
             return
         program = self._caller.program
         key = program.keys.results(self._camera)
-        self._since = since
+        self._since, self._caller.streamed = since, True
         self._handles["results"] = program.bus.subscribe(key, self._hear_results)
         self._begin("find", self._find())
 
     def _leave_results(self) -> None:
         self._handles.pop("results").close()
+        self._caller.streamed = False
         self._results.stop()
         self._wake(everyone=True)
 
@@ -473,10 +477,11 @@ class Receiver:
         return True
 
     def _interpret(self, run: ResultRun, interpretation: Interpretation) -> Result:
-        value, sequence, empty_slots = interpreted(run, interpretation, self._name)
+        at = run.received_at
+        value, sequence, empty_slots = interpreted(run, interpretation, self._name, at)
         if empty_slots:
             self._counters.skip(empty_slots)
-        return as_result(run, self._name, value, sequence)
+        return as_result(run, self._name, value, sequence, at)
 
     def _wrong_application(self, run: ResultRun, expected: int) -> WrongApplicationError:
         return WrongApplicationError(

@@ -162,7 +162,8 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return await self._png(judged, limit, drawn=drawn)
 
     def _tell_picture(self, result: Result[Any], judged: Judged) -> None:
-        self._observers.picture(result, judged.frame)
+        if self._observers.see_pictures:
+            self._observers.picture(result, judged.marked_frame)
 
     async def _picture(self, timeout: float, *, drawn: bool) -> bytes:
         self._require_session()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam.backoff import Backoff
 from smartcam.emulator._inside import Inspector
 from smartcam.exceptions import FrameSourceError, SmartCamError
+from smartcam.frames._inside import changed
 from smartcam.inspection._camera.tool_thread import ToolThread
 from smartcam.inspection._program import MAX_REASON_BYTES
 
@@ -62,6 +63,13 @@ class Judged(NamedTuple):
     frame: Frame
     inspection: Inspection | None
     application: int
+
+    @property
+    def marked_frame(self) -> Frame:
+        """The frame, with the marks of the tools as its drawings."""
+        if self.inspection is None:
+            return self.frame
+        return changed(self.frame, drawings=self.inspection.drawings)
 
 
 @dataclass(eq=False, slots=True)

@@ -94,7 +94,7 @@ class JudgedDriver(FrameDriver):
             sink.ended(FrameSourceError(f"{self.name}: {exc!r}", source=self.name))
 
     async def _frame(self, judged: Judged) -> Frame:
-        return await asyncio.to_thread(_drawn, judged) if self._drawn else judged.frame
+        return await asyncio.to_thread(_drawn, judged) if self._drawn else judged.marked_frame
 
 
 def judged_source(eyes: Eyes, *, drawn: bool) -> FrameSource:

@@ -47,6 +47,11 @@ RANGE_MARGIN: Final = math.radians(1.0)
 """Angle, and part of the scale, by which a fitted pose may lie beside what was asked for."""
 
 
+SIZE_MARGIN: Final = 0.03
+"""Part of the size by which a part may be larger or smaller than the one size that was asked for:
+its pose says its own size, so that it is right."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PartSearch:
     """The poses that are looked for, and what counts as found.
@@ -226,7 +231,7 @@ class _SearchedPicture:
             search.least_score,
             model.symmetry.fold != 0,
         )
-        return fit_pose(self._levels, model.segments, model.bands, start, use)
+        return fit_pose(self._levels, model.segments, model.bands_at(start.scale), start, use)
 
     def _fitted(
         self,
@@ -245,11 +250,16 @@ class _SearchedPicture:
         refusal = ""
         if part.score < search.least_score:
             refusal = _too_little(part.score, fine, search)
-        elif not _in_ranges(pose, model, search):
+        elif not _is_in_angles(pose, model, search):
+            low, high = np.degrees(search.angles).tolist()
             refusal = (
-                f"it is turned by {math.degrees(pose.angle):.1f} degrees and scaled by "
-                f"{pose.scale:.3f}, which was not asked for"
+                f"it is turned by {math.degrees(pose.angle):.1f} degrees, expected {low:.4g} to "
+                f"{high:.4g}"
             )
+        elif not _is_in_scales(pose, search):
+            low, high = search.scales
+            wanted = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+            refusal = f"its size is {pose.scale:.3f} of the taught one, expected {wanted}"
         elif allowed is not None and not allowed((pose.x, pose.y)):
             refusal = "its reference is outside of the region"
         return dataclasses.replace(part, refusal=refusal)
@@ -343,15 +353,20 @@ def _unfitted(model: PartModel, one: RoughPlace, search: PartSearch, why: str) -
     )
 
 
-def _in_ranges(pose: PixelPose, model: PartModel, search: PartSearch) -> bool:
-    """Return True if a pose is one of those that are looked for."""
+def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool:
+    """Return True if a pose is turned by one of the angles that are looked for."""
     low, high = search.angles
-    if model.symmetry.fold and high - low < model.symmetry.period - 1e-9:
-        off = math.remainder(pose.angle - (low + high) / 2, model.symmetry.period)
-        if abs(off) > (high - low) / 2 + RANGE_MARGIN:
-            return False
+    if not model.symmetry.fold or high - low >= model.symmetry.period - 1e-9:
+        return True
+    off = math.remainder(pose.angle - (low + high) / 2, model.symmetry.period)
+    return abs(off) <= (high - low) / 2 + RANGE_MARGIN
+
+
+def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
+    """Return True if a pose has one of the sizes that are looked for."""
     least, most = search.scales
-    return least * (1 - RANGE_MARGIN) <= pose.scale <= most * (1 + RANGE_MARGIN)
+    margin = SIZE_MARGIN if least == most else RANGE_MARGIN
+    return least * (1 - margin) <= pose.scale <= most * (1 + margin)
 
 
 def _is_enough(found: Sequence[LocatedPart], one: RoughPlace, search: PartSearch) -> bool:

@@ -61,6 +61,21 @@ MIN_SEEN: Final = 6
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
 """Standard deviation of an angle of which nothing is known, in radians."""
 
+SIZE_SIGMA: Final = 0.02
+"""Standard deviation, in parts of its size, of a part that is looked for in one size only: another
+height or another camera makes it larger or smaller, and a pose of the wrong size is off."""
+
+STRETCH_SIGMA: Final = 0.01
+"""Standard deviation of what a part is longer in one direction and shorter across, in parts of its
+size, as seen by a camera that is tilted."""
+
+GROWTH_SIGMA_PX: Final = 0.3
+"""Standard deviation of what all edges lie nearer to their brighter side, pixels: too much light,
+or a camera that tells bright levels less well, makes what is bright larger."""
+
+FIRST_CHANGED_STEP: Final = 2
+"""Number of the first step that fits what may differ from the taught part, too."""
+
 MAX_INVERSE: Final = 1e8
 """Largest element of the inverse of the scaled equations; above it the edges leave a pose open."""
 
@@ -71,9 +86,43 @@ class FineSettings(NamedTuple):
     contrast: Array  # (N,), grey levels from the darker to the brighter side at least
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
-    scaled: bool = False  # whether the scale is fitted
+    scaled: bool = False  # whether the scale is anything; else it is near that of the start
     least_score: float = 0.0  # of a pose whose ground matters
     turned: bool = True  # whether the angle is fitted; that of a round part is not
+
+
+class PartShape(NamedTuple):
+    """How a part differs from the taught one, besides its pose."""
+
+    pose: PixelPose
+    stretch: float = 0.0  # longer along the taught x and shorter along y, in parts
+    shear: float = 0.0  # the same along the diagonals
+    growth: float = 0.0  # pixels of the picture that edges are nearer to their brighter side
+
+    def moved(self, move: Array) -> PartShape:
+        """Return the shape after a move (7,)."""
+        x, y, angle, scale, stretch, shear, growth = move.tolist()
+        old = self.pose
+        pose = PixelPose(old.x + x, old.y + y, old.angle + angle, old.scale * (1 + scale))
+        return PartShape(pose, self.stretch + stretch, self.shear + shear, self.growth + growth)
+
+    def offsets(self, segments: Segments) -> Array:
+        """Return how far each edge is off its place across, (N,), pixels of the picture."""
+        changes = _changes(segments, self.pose.scale)
+        offsets: Array = changes @ [self.stretch, self.shear, self.growth]
+        return offsets
+
+
+class Expected(NamedTuple):
+    """What is known of a part before it is seen: its scale, and how little it is changed."""
+
+    scale: float
+    sigmas: Array  # (4,), of size, stretch, shear (parts) and growth (pixels); infinite: unknown
+
+    def off(self, shape: PartShape) -> Array:
+        """Return how far a shape is off what is expected, (4,)."""
+        size = shape.pose.scale / self.scale - 1
+        return np.array([size, shape.stretch, shape.shear, shape.growth])
 
 
 class FinePose(NamedTuple):
@@ -97,29 +146,35 @@ def fit_pose(
 
     ``levels`` (H, W) is the picture.
     """
-    pose, free = start, np.array([True, True, use.turned, use.scaled])
+    shape = PartShape(start)
+    size = math.inf if use.scaled else SIZE_SIGMA
+    sigmas = np.array([size, STRETCH_SIGMA, STRETCH_SIGMA, GROWTH_SIGMA_PX])
+    expected = Expected(start.scale, sigmas)
     widened, pixels = 0.0, pixels_in(bands, _matrix(start), levels)
     for number in range(MAX_STEPS):
         if 0 < number < 4:
-            pixels = pixels_in(bands, _matrix(pose), levels)
+            pixels = pixels_in(bands, _matrix(shape.pose), levels)
         first = FIRST_BLURS_PX[number] if number < len(FIRST_BLURS_PX) else None
-        fit, blurs = _steps(pixels, segments, pose, widened, first)
-        rows, weights, _, _ = _equations((fit, blurs), segments, pose, use, number)
-        solved = _solve(rows, fit.shifts, weights, free)
+        fit, blurs = _steps(pixels, segments, shape, widened, first)
+        rows, weights, _, _ = _equations((fit, blurs), segments, shape.pose, use, number)
+        changed = number >= FIRST_CHANGED_STEP
+        free = np.array([True, True, use.turned, use.scaled or changed, *[changed] * 3])
+        solved = _solve((rows, fit.shifts, weights), free, expected.off(shape), expected.sigmas)
         if solved is None:
             return None
         move, _ = solved
-        pose = _moved(pose, move)
+        shape = shape.moved(move)
         if first is None:
             widened = _widened(widened, fit.widening, float(np.median(blurs)))
         if number >= 4 and float(np.abs(rows @ move).max()) < STILL_PX:
             break
-    return _result(pixels, segments, pose, widened, use, free)
+    return _result(pixels, segments, shape, widened, use, expected)
 
 
-def _moved(pose: PixelPose, move: Array) -> PixelPose:
-    x, y, angle, scale = move.tolist()
-    return PixelPose(pose.x + x, pose.y + y, pose.angle + angle, pose.scale * (1 + scale))
+def _changes(segments: Segments, scale: float) -> Array:
+    """Return what stretch, shear and growth move each edge across by, (N, 3)."""
+    (x, y), (u, v) = segments.middles.T, segments.normals.T
+    return np.column_stack([scale * (u * x - v * y), scale * (u * y + v * x), np.ones_like(x)])
 
 
 def _matrix(pose: PixelPose) -> Array:
@@ -131,14 +186,14 @@ def _matrix(pose: PixelPose) -> Array:
 def _steps(
     pixels: BandPixels,
     segments: Segments,
-    pose: PixelPose,
+    shape: PartShape,
     widened: float,
     first: float | None,
     ground: Ground | None = None,
     noise: float = 0.0,
 ) -> tuple[StepFit, Array]:
-    """Return the steps in all bands at a pose, and the blurs that they were fitted with."""
-    places, blurs = _places(pixels, segments, pose, widened)
+    """Return the steps in all bands of a part, and the blurs that they were fitted with."""
+    places, blurs = _places(pixels, segments, shape, widened)
     if first is not None:
         blurs = np.full_like(blurs, first)
     count, own = len(segments.halves), blurs[pixels.owners]
@@ -148,14 +203,15 @@ def _steps(
 
 
 def _places(
-    pixels: BandPixels, segments: Segments, pose: PixelPose, widened: float
+    pixels: BandPixels, segments: Segments, shape: PartShape, widened: float
 ) -> tuple[tuple[Array, Array], Array]:
     """Return the places of pixels across and along their edges (P,), and the edges' blurs (N,)."""
+    pose = shape.pose
     across, along = segments.places(pose.from_picture(pixels.points), pixels.owners)
     blurs = segments.blurs * pose.scale
     blurs = np.sqrt(np.maximum(blurs**2 + widened, MIN_BLUR_PX**2))
-    moved = segments.moved_by(widened / pose.scale**2)
-    return (pose.scale * (across - moved[pixels.owners]), pose.scale * along), blurs
+    moved = pose.scale * segments.moved_by(widened / pose.scale**2) + shape.offsets(segments)
+    return (pose.scale * across - moved[pixels.owners], pose.scale * along), blurs
 
 
 def _widened(widened: float, growth: float, blur: float) -> float:
@@ -172,7 +228,7 @@ def _equations(
     use: FineSettings,
     number: int,
 ) -> tuple[Array, Array, float, NDArray[np.bool_]]:
-    """Return the rows (N, 4) and weights (N,) of the steps, the noise, and which are edges."""
+    """Return the rows (N, 7) and weights (N,) of the steps, the noise, and which are edges."""
     fit, blurs = steps
     edges, noise = _edges(fit, use)
     cos, sin = math.cos(pose.angle), math.sin(pose.angle)
@@ -180,7 +236,8 @@ def _equations(
     normals = segments.normals @ turn
     arms = pose.scale * segments.middles @ turn
     crossed = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
-    rows = np.column_stack([normals, crossed, (normals * arms).sum(axis=1)])
+    sized = (normals * arms).sum(axis=1)
+    rows = np.column_stack([normals, crossed, sized, _changes(segments, pose.scale)])
     sigmas = _sigmas(fit, segments, pose, noise, blurs)
     weights = np.where(edges & np.isfinite(sigmas), 1 / np.maximum(sigmas, 1e-6) ** 2, 0.0)
     if number < 3:  # before the pose is near, what is noisy says as much as what is not
@@ -226,30 +283,42 @@ def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blu
     return np.sqrt(own * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
 
 
+Equations = tuple["Array", "Array", "Array"]
+"""Rows (N, 7), shifts (N,) and weights (N,)."""
+
+
 def _solve(
-    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
-    """Return the robust solution (4,) and its covariance (4, 4); None: too little is seen."""
+    """Return the robust solution (7,) and its covariance (7, 7); None: too little is seen.
+
+    ``off`` (4,): how far size, stretch, shear and growth are off what is expected, by ``sigmas``.
+    """
+    rows, shifts, weights = equations
     used = weights > 0
     if np.count_nonzero(used) < MIN_SEEN:
         return None
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
     for _ in range(4):
-        solved = _least_squares(a, y, w * robust, free)
+        solved = _least_squares((a, y, w * robust), free, off, sigmas)
         if solved is None:
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
         robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
-    return _least_squares(a, y, w * robust, free)
+    return _least_squares((a, y, w * robust), free, off, sigmas)
 
 
 def _least_squares(
-    rows: Array, values: Array, weights: Array, free: NDArray[np.bool_]
+    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
-    a = rows[:, free] * np.sqrt(weights)[:, None]
-    square = a.T @ a
+    rows, values, weights = equations
+    weighted = rows * weights[:, None]
+    square, right = rows.T @ weighted, weighted.T @ values
+    square[range(3, 7), range(3, 7)] += 1 / sigmas**2
+    right[3:] -= off / sigmas**2
+    square, right = square[np.ix_(free, free)], right[free]
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
     try:
@@ -259,8 +328,8 @@ def _least_squares(
     if not np.abs(inverse).max() < MAX_INVERSE:
         return None
     inverse = inverse / np.outer(scale, scale)
-    found, covariance = np.zeros(4), np.zeros((4, 4))
-    found[free] = inverse @ (a.T @ (values * np.sqrt(weights)))
+    found, covariance = np.zeros(7), np.zeros((7, 7))
+    found[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
     return found, covariance
 
@@ -268,14 +337,15 @@ def _least_squares(
 def _result(
     pixels: BandPixels,
     segments: Segments,
-    pose: PixelPose,
+    shape: PartShape,
     widened: float,
     use: FineSettings,
-    free: NDArray[np.bool_],
+    expected: Expected,
 ) -> FinePose | None:
     """Return the pose with what the steps at it say."""
-    fit, blurs = steps = _steps(pixels, segments, pose, widened, None)
-    rows, weights, noise, edges = _equations(steps, segments, pose, use, MAX_STEPS)
+    free = np.array([True, True, use.turned, True, True, True, True])
+    fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
+    rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
     # as much of each edge counts as it is where it should be, and a step
     off = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
     seen = edges & (off <= 1)
@@ -284,24 +354,27 @@ def _result(
     wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     ground = None
     if score >= use.least_score:
-        places, _ = _places(pixels, segments, pose, widened)
+        places, _ = _places(pixels, segments, shape, widened)
         ground = ground_beside(places, blurs[pixels.owners], pixels, segments, seen)
         for _ in range(GROUND_STEPS if ground is not None else 0):
-            fit, _ = _steps(pixels, segments, pose, widened, None, ground, noise)
-            again = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
+            fit, _ = _steps(pixels, segments, shape, widened, None, ground, noise)
+            again = _equations((fit, blurs), segments, shape.pose, use, MAX_STEPS)
             rows, weights, noise = again[0], np.where(seen, again[1], 0.0), again[2]
-            solved = _solve(rows, fit.shifts, weights, free)
+            told = rows, fit.shifts, weights
+            solved = _solve(told, free, expected.off(shape), expected.sigmas)
             if solved is None:
                 return None
-            pose = _moved(pose, solved[0])
-    settled = _settled(rows, fit.shifts, np.where(seen, weights, 0.0), free)
+            shape = shape.moved(solved[0])
+    told = rows, fit.shifts, np.where(seen, weights, 0.0)
+    settled = _settled(told, free, expected.off(shape), expected.sigmas)
     if settled is None:
         return None
     move, covariance, kept, chi_square = settled
-    if ground is not None:
-        left = (fit.shifts - rows @ move) * np.sqrt(weights)
-        covariance = covariance * common_error(segments, left, kept)
-    pose = _moved(pose, move)
+    left = (fit.shifts - rows @ move) * np.sqrt(weights)
+    covariance = covariance * common_error(segments, left, kept, sure=ground is not None)
+    pose = shape.moved(move).pose
+    if covariance[3, 3] == 0:
+        pose = pose._replace(scale=expected.scale)
     covariance[3] *= pose.scale
     covariance[:, 3] *= pose.scale
     if not use.turned:
@@ -320,30 +393,57 @@ def _result(
 
 
 def _settled(
-    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
-    """Return the last move of a pose (4,), its covariance, and the segments that it follows from.
+    """Return the last move (7,), the pose's covariance (4, 4), and the segments it follows from.
 
     Besides, the squares of their shifts in parts of what they may have; None: too few agree.
     """
-    off = np.abs(shifts) * np.sqrt(weights)
+    rows, shifts, weights = equations
+    away = np.abs(shifts) * np.sqrt(weights)
     kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
     if kept.any():  # where the whole part is not quite the taught one, as in too much light
-        spread = max(1.4826 * float(np.median(off[kept])), 1.0)
+        spread = max(1.4826 * float(np.median(away[kept])), 1.0)
     for _ in range(3):
-        kept = (weights > 0) & (off <= CUT * spread)
+        kept = (weights > 0) & (away <= CUT * spread)
         if np.count_nonzero(kept) < MIN_SEEN:
             return None
-        freedom = max(int(kept.sum()) - int(free.sum()), 1)
-        chi_square = float((off[kept] ** 2).sum()) / freedom
+        freedom = max(int(kept.sum()) - 4, 1)
+        chi_square = float((away[kept] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
-    solved = _least_squares(rows[kept], shifts[kept], weights[kept], free)
+    misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part is not quite the taught one
+    told = rows[kept], shifts[kept], weights[kept]
+    solved = _changed(told, free, off, sigmas, max(chi_square, 1.0))
     if solved is None:
         return None
     move, covariance = solved
-    if chi_square > 1 + 4 * math.sqrt(2 / freedom):  # the part is not quite the taught one
-        covariance = covariance * chi_square
-    return move, covariance, kept, chi_square
+    return move, covariance[:4, :4] * (chi_square if misfit else 1.0), kept, chi_square
+
+
+def _changed(
+    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array, chi_square: float
+) -> tuple[Array, Array] | None:
+    """Return the solution in which the part is as it is expected where it may be.
+
+    What the edges say of a change beyond their own error says how large that change may be.
+    """
+    rows, shifts, weights = equations
+    solved = _least_squares(equations, free, off, sigmas)
+    if solved is None:
+        return None
+    move, covariance = solved
+    by_edges = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
+    beyond = (off + move[3:]) ** 2 - chi_square * by_edges
+    none = (beyond <= 0) & np.isfinite(sigmas)
+    known = np.minimum(np.sqrt(np.maximum(beyond, 1e-12)), sigmas)
+    known = np.where(np.isfinite(sigmas), known, sigmas)
+    shifts = shifts + rows[:, 3:] @ np.where(none, off, 0.0)
+    kept = free.copy()
+    kept[3:] &= ~none
+    solved = _least_squares((rows, shifts, weights), kept, off, known)
+    if solved is not None:
+        solved[0][3:][none] = -off[none]
+    return solved
 
 
 def _of_weights(weights: Array) -> Array:

@@ -42,6 +42,9 @@ COMMON_PX, COMMON_DIRECTION = 24.0, 0.5
 """Distance in pixels, and cosine of the angle between the normals, of edges that may have errors in
 common."""
 
+CHANCES: Final = 3.0
+"""Standard deviations by which neighbours agree in their errors that have one in common."""
+
 LEAST_PART: Final = 1e-4
 """Least standard deviation of a slope, as a share of the noise."""
 
@@ -114,16 +117,21 @@ def fit_on_ground(
     )
 
 
-def common_error(segments: Segments, shifts: Array, kept: NDArray[np.bool_]) -> float:
+def common_error(
+    segments: Segments, shifts: Array, kept: NDArray[np.bool_], *, sure: bool
+) -> float:
     """Return the factor of a pose's variance for errors that neighbours have in common.
 
-    ``shifts`` (N,): in parts of their standard deviations.
+    ``shifts`` (N,): in parts of their standard deviations. ``sure``: there are such errors; else
+    there are where they are more than chance.
     """
     middles, normals, z = segments.middles[kept], segments.normals[kept], shifts[kept]
     near = np.linalg.norm(middles[:, None] - middles, axis=2) <= COMMON_PX
     near &= normals @ normals.T >= COMMON_DIRECTION
     np.fill_diagonal(near, val=False)
-    return max(1.0, 1 + float(z @ near @ z) / max(float(z @ z), 1e-9))
+    common = float(z @ near @ z) / max(float(z @ z), 1e-9)
+    chance = math.sqrt(2 * int(near.sum())) / max(len(z), 1)
+    return 1 + max(common, 0.0) if sure or common > CHANCES * chance else 1.0
 
 
 def _step(across: Array, blurs: Array) -> tuple[Array, Array]:

@@ -32,7 +32,13 @@ from smartcam.inspection._locate.edges import (
 )
 from smartcam.inspection._locate.fine import FineSettings, fit_pose
 from smartcam.inspection._locate.outlines import MM, drawn_outline, read_outline
-from smartcam.inspection._locate.segments import BLURS_PX2, Bands, Segments, make_bands
+from smartcam.inspection._locate.segments import (
+    BAND_PX,
+    BLURS_PX2,
+    Bands,
+    Segments,
+    make_bands,
+)
 from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
@@ -90,6 +96,10 @@ LEVEL_RESPONSE: Final = 0.8
 
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
+
+MAX_BAND_STEP: Final = 4
+"""Largest number of steps of the square root of two by which the bands of a smaller part are
+wider."""
 
 MAX_CONTOURS, MAX_CONTOUR_CORNERS, MIN_CONTOUR_PX = 12, 150, 8
 """Contours of a part that are shown at most, their corners at most, and their pixels at least."""
@@ -276,10 +286,16 @@ class PartModel:
         some = [self.segments.some(one) for one in self.levels]
         return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
 
+    def bands_at(self, scale: float) -> Bands:
+        """Return the pixels beside the segments: about as far in the picture of a smaller part."""
+        step = min(max(round(-2 * math.log2(scale)), 0), MAX_BAND_STEP)
+        if step not in self._bands:
+            self._bands[step] = make_bands(self.segments, self.outline, BAND_PX * 2 ** (step / 2))
+        return self._bands[step]
+
     @cached_property
-    def bands(self) -> Bands:
-        """The pixels beside the segments."""
-        return make_bands(self.segments, self.outline)
+    def _bands(self) -> dict[int, Bands]:
+        return {}
 
     @cached_property
     def hull(self) -> Array:

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 BAND_PX: Final = 4.0
-"""Pixels of a band to each side of its segment, in the picture that was taught."""
+"""Pixels of a band to each side of its segment, in the picture that was taught, of a part that is
+about as large as there or larger."""
 
 MIN_BLUR_PX: Final = 0.35
 """Least standard deviation of an edge's blur, in pixels, with the pixels' own area in it."""
@@ -97,12 +98,15 @@ class Bands(NamedTuple):
     corner: tuple[int, int]  # place of the first label, pixels from the reference
 
 
-def make_bands(segments: Segments, others: Array) -> Bands:
-    """Return the bands of segments; ``others`` (M, 2) are edges beside them, which end bands."""
+def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Bands:
+    """Return the bands of segments; ``others`` (M, 2) are edges beside them, which end bands.
+
+    ``reach``: pixels of a band to each side of its segment.
+    """
     cv2 = load("cv2", "inspection needs")
     points, owners = segments.curve()
-    low = np.floor(points.min(axis=0) - BAND_PX - 2).astype(int)
-    size = np.ceil(points.max(axis=0) + BAND_PX + 2).astype(int) - low + 1
+    low = np.floor(points.min(axis=0) - reach - 2).astype(int)
+    size = np.ceil(points.max(axis=0) + reach + 2).astype(int) - low + 1
     seeds = np.full((int(size[1]), int(size[0])), -2, np.int32)
     at = np.rint(points - low).astype(int)
     seeds[at[:, 1], at[:, 0]] = owners
@@ -118,10 +122,10 @@ def make_bands(segments: Segments, others: Array) -> Bands:
     owner_of = np.full(int(nearest.max()) + 1, -1, np.int32)
     owner_of[nearest[free == 0]] = seeds[free == 0]
     labels = owner_of[nearest]
-    rows, columns = np.nonzero((labels >= 0) & (distance <= BAND_PX + 1))
+    rows, columns = np.nonzero((labels >= 0) & (distance <= reach + 1))
     mine = labels[rows, columns].astype(np.intp)
     across, along = segments.places(np.column_stack([columns, rows]) + low, mine)
-    within = (np.abs(across) <= BAND_PX) & (np.abs(along) <= segments.halves[mine] + 0.5)
+    within = (np.abs(across) <= reach) & (np.abs(along) <= segments.halves[mine] + 0.5)
     kept = np.full(labels.shape, -1, np.int16)
     kept[rows[within], columns[within]] = mine[within]
     return Bands(kept, (int(low[0]), int(low[1])))

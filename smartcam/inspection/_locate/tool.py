@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.inspection._finding import Drawing, Finding
+from smartcam.frames._inside import Drawing
+from smartcam.inspection._finding import Finding
 from smartcam.inspection._locate.find import Located, LocatedPart, PartSearch, locate
 from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.settings import MAX_PARTS, LocateSettings
@@ -18,8 +19,8 @@ from smartcam.inspection._picture import Picture
 from smartcam.inspection._tool import Tool
 
 if TYPE_CHECKING:
+    from smartcam.frames._inside import Role
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._finding import Role
     from smartcam.inspection._measure.planes import Plane
     from smartcam.inspection._tool import ToolSetup, View
 
@@ -83,7 +84,7 @@ class Locate(Tool[LocateSettings]):
                 )
             )
         for model in self.models:  # worked out now, for the same reason
-            _ = model.bands, model.coarse, model.contours
+            _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
         self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS

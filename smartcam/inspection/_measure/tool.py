@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.inspection._finding import Drawing, Finding
+from smartcam.frames._inside import Drawing
+from smartcam.inspection._finding import Finding
 from smartcam.inspection._measure.edges import MAX_WIDTH_PX, EdgeSettings
 from smartcam.inspection._measure.features import (
     FoundPoint,
@@ -55,8 +56,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from smartcam.frames._inside import Role
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._finding import Role
     from smartcam.inspection._measure.fits import Circle, Line, ShapeFit
     from smartcam.inspection._measure.strips import Strips
     from smartcam.inspection._measure.values import Feature

@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection._finding import Drawing, Finding
+from smartcam.frames._inside import Drawing
+from smartcam.inspection._finding import Finding
 from smartcam.inspection._places import PixelPose
 from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
 from smartcam.inspection._read.ladder import CodeSearch, read_again

@@ -373,6 +373,13 @@ class FramedDialect(Dialect):
         return found
 
     @cached_property
+    def _lengths(self) -> dict[Sender, dict[int, range]]:
+        return {
+            sender: {number: codec.lengths for number, codec in codecs.items()}
+            for sender, codecs in self._decoders.items()
+        }
+
+    @cached_property
     def _answers(self) -> dict[int, int | None]:
         found: dict[int, int | None] = {}
         for row in self.table:
@@ -568,7 +575,7 @@ class FramedDialect(Dialect):
 
     def lengths(self, sender: Sender) -> dict[int, range]:
         """Return the lengths that the bodies of one sender's messages may have, by their ids."""
-        return {number: codec.lengths for number, codec in self.decoders(sender).items()}
+        return self._lengths[sender]
 
     def knows(self, sender: Sender, message_id: int) -> bool:
         """Return True if this sender has a message with this id."""

@@ -75,6 +75,9 @@ class HeaderLayout:
     max_payload: int = field(init=False)
     id_first: bool = field(init=False, repr=False)
     _fields: struct.Struct = field(init=False, repr=False, compare=False)
+    _readers: dict[int, Read] = field(
+        init=False, repr=False, compare=False, default_factory=dict[int, "Read"]
+    )
 
     def __post_init__(self) -> None:
         fields = struct.Struct("<" + 2 * self.code)
@@ -97,8 +100,12 @@ class HeaderLayout:
 
     def reader(self, more: int = 0) -> Read:
         """Return a reader of headers: magic, the two numbers, and ``more`` bytes after them."""
-        behind = f"{more}s" if more else ""
-        return struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}").unpack_from
+        reader = self._readers.get(more)
+        if reader is None:
+            behind = f"{more}s" if more else ""
+            form = struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}")
+            reader = self._readers[more] = form.unpack_from
+        return reader
 
 
 class Framer:

@@ -5,8 +5,8 @@ is a JSON object with the field names of the public models; a field that is None
 viewers such as Foxglove take a field's type from the schema and do not support null. The schemas
 use only types that Foxglove supports (``type`` is always one word).
 
-With pictures there is a fifth topic, ``/CAMERA/pictures``, with Foxglove's messages of Protocol
-Buffers: see ``_pictures``.
+With pictures there is a fifth topic, ``/CAMERA/pictures``, and for the marks on them
+``/CAMERA/annotations``, both with Foxglove's messages of Protocol Buffers: see ``_pictures``.
 """
 
 from __future__ import annotations
@@ -556,3 +556,9 @@ PICTURES = "pictures"
 
 PICTURE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo")
 """Schemas of pictures, which another distribution of smartcam reads."""
+
+ANNOTATIONS = "annotations"
+"""Last part of the topic of marks on pictures."""
+
+ANNOTATIONS_SCHEMA = "foxglove.ImageAnnotations"
+"""Schema of marks on a picture."""

@@ -8,19 +8,30 @@ times, the number, the lost frames. So the frame that is read equals the frame t
 from __future__ import annotations
 
 import math
-import struct
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
 from smartcam.recording._mcap.form import MAX_CAPTURE_TIME, MAX_NAME_CHARACTERS, RecordedPicture
+from smartcam.recording._pictures.protobuf import (
+    BYTES,
+    TIMESTAMP,
+    Fields,
+    WireField,
+    encoded,
+    file_set,
+    message,
+    tag,
+    timestamp,
+    values_of,
+    varint,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from smartcam.frames import PixelFormat
+    from smartcam.frames._inside import Drawing
 
 MAX_SIDE_PX: Final = 1 << 20
 """Largest number of pixels along a side of a picture that is written or read."""
@@ -51,21 +62,7 @@ _ENCODINGS: Final = {
 
 _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": "h264"}
 
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
-
-_TYPES: Final = {"double": 1, "uint64": 4, "fixed32": 7, "string": 9, "message": 11, "bytes": 12}
-"""Types of fields, by Protocol Buffers' numbers."""
-
-
-class WireField(NamedTuple):
-    """A field of a message: its number, its type, and for a message the type's name."""
-
-    number: int
-    type: str
-    of: str = ""
-
-
-_STAMP = WireField(1, "message", ".google.protobuf.Timestamp")
+_STAMP = WireField(1, "message", TIMESTAMP)
 
 _OURS: Final = {
     "pixel_format": WireField(101, "string"),
@@ -84,11 +81,13 @@ _OURS: Final = {
     "result_number": WireField(114, "uint64"),
     "stride": WireField(115, "fixed32"),
     "result_received": WireField(116, "double"),
+    "annotations_from": WireField(117, "uint64"),
 }
 """smartcam's fields: attributes of a frame, pictures that the recorder left out before it, number
-and arrival of its result."""
+and arrival of its result, and the number of the message in ``/CAMERA/annotations`` with its
+marks."""
 
-SCHEMAS: Final[dict[str, dict[str, WireField]]] = {
+SCHEMAS: Final[dict[str, Fields]] = {
     RAW: {
         "timestamp": _STAMP,
         "frame_id": WireField(7, "string"),
@@ -155,8 +154,12 @@ def check_readable(frame: Frame) -> None:
     form.check(frame.data, frame.width, frame.height, frame.stride)
 
 
-def picture_message(picture: RecordedPicture) -> bytes:
+def picture_message(picture: RecordedPicture, annotations_from: int | None = None) -> bytes:
     """Return the message of a picture.
+
+    Args:
+        picture: the picture.
+        annotations_from: number of the message with its marks, which is right before it.
 
     Raises:
         FrameFormatError: the message could not be read again.
@@ -166,7 +169,7 @@ def picture_message(picture: RecordedPicture) -> bytes:
     name = schema_of(picture)
     data = memoryview(frame.data).cast("B")
     values: dict[str, Any] = {
-        "timestamp": _stamp(frame.utc),
+        "timestamp": timestamp(frame.utc),
         "frame_id": picture.camera,
         "pixel_format": frame.format.name,
         "picture_width": frame.width,
@@ -184,6 +187,7 @@ def picture_message(picture: RecordedPicture) -> bytes:
         "result_number": picture.result_number,
         "stride": frame.stride,
         "result_received": received and received.timestamp(),
+        "annotations_from": annotations_from,
     }
     padding = b""
     if name == RAW:
@@ -195,43 +199,11 @@ def picture_message(picture: RecordedPicture) -> bytes:
     else:
         values["format"] = _COMPRESSIONS.get(frame.format.name, frame.format.name)
     fields = SCHEMAS[name]
-    parts = [
-        _field(fields[key], value) for key, value in values.items() if value not in (None, 0, "")
-    ]
+    head = message(fields, values)
     if frame.device_time == 0:
-        parts.append(_field(fields["device_time"], 0.0))
-    size = _varint(data.nbytes + len(padding))
-    return b"".join((*parts, _tag(fields["data"].number, _BYTES), size, data, padding))
-
-
-def _field(field: WireField, value: Any) -> bytes:
-    if field.type == "double":
-        return _tag(field.number, _FIXED64) + struct.pack("<d", value)
-    if field.type == "fixed32":
-        return _tag(field.number, _FIXED32) + struct.pack("<I", value)
-    if field.type == "uint64":
-        return _tag(field.number, _VARINT) + _varint(value)
-    data: bytes = value.encode("utf-8", "replace") if field.type == "string" else value
-    return _tag(field.number, _BYTES) + _varint(len(data)) + data
-
-
-def _stamp(utc: float) -> bytes:
-    """Return a time as google.protobuf.Timestamp."""
-    seconds, nanoseconds = divmod(max(0, round(utc * 1e9)), 1_000_000_000)
-    return _tag(1, _VARINT) + _varint(seconds) + _tag(2, _VARINT) + _varint(nanoseconds)
-
-
-def _tag(number: int, wire: int) -> bytes:
-    return _varint(number << 3 | wire)
-
-
-def _varint(value: int) -> bytes:
-    data = bytearray()
-    while value > 0x7F:
-        data.append(value & 0x7F | 0x80)
-        value >>= 7
-    data.append(value)
-    return bytes(data)
+        head += encoded(fields["device_time"], 0.0)
+    head += tag(fields["data"].number, BYTES) + varint(data.nbytes + len(padding))
+    return b"".join((head, data, padding))
 
 
 # ---------------------------------------------------------------------- schemas
@@ -240,53 +212,32 @@ def _varint(value: int) -> bytes:
 @cache
 def schema_data(name: str) -> bytes:
     """Return the schema of a message for MCAP: a FileDescriptorSet."""
-    package, _, short = name.partition(".")
-    stamp = _file(
-        "google/protobuf/timestamp.proto",
-        "google.protobuf",
-        "Timestamp",
-        [("seconds", 1, 3, ""), ("nanos", 2, 5, "")],
-    )
-    fields = [
-        (called, one.number, _TYPES[one.type], one.of) for called, one in SCHEMAS[name].items()
-    ]
-    path = f"{package}/{short}.proto"
-    main = _file(path, package, short, fields, "google/protobuf/timestamp.proto")
-    return _bytes(1, stamp) + _bytes(1, main)
-
-
-def _file(
-    path: str, package: str, name: str, fields: list[tuple[str, int, int, str]], needs: str = ""
-) -> bytes:
-    """Return a FileDescriptorProto with one message."""
-    message = _bytes(1, name.encode())
-    for called, number, kind, of in fields:
-        told = _bytes(1, called.encode()) + _tag(3, _VARINT) + _varint(number)
-        told += _tag(4, _VARINT) + _varint(1) + _tag(5, _VARINT) + _varint(kind)
-        message += _bytes(2, told + (_bytes(6, of.encode()) if of else b""))
-    needed = _bytes(3, needs.encode()) if needs else b""
-    head = _bytes(1, path.encode()) + _bytes(2, package.encode()) + needed
-    return head + _bytes(4, message) + _bytes(12, b"proto3")
-
-
-def _bytes(number: int, data: bytes) -> bytes:
-    return _tag(number, _BYTES) + _varint(len(data)) + data
+    return file_set(name, {name.partition(".")[2]: SCHEMAS[name]}, {})
 
 
 # ---------------------------------------------------------------------- reading
 
 
-def picture_of(schema: str, data: memoryview) -> RecordedPicture:
+def picture_of(
+    schema: str, data: memoryview, number: int = 0, drawings: tuple[Drawing, ...] = ()
+) -> RecordedPicture:
     """Return the picture of a message; its pixels are a view of ``data``.
+
+    Args:
+        schema: name of the message.
+        data: bytes of the message.
+        number: number of the last message of annotations; 0: there was none.
+        drawings: marks in that message, which the picture gets if it names it.
 
     Raises:
         ValueError: the message is not valid, or lacks a field of its format.
     """
-    values = _values(schema, data)
+    values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
     said = _Values(values)
     try:
         found = find_format(said.text("pixel_format", 100))
-        frame = _frame(said, found)
+        marks = drawings if number and said.whole("annotations_from") == number else ()
+        frame = _frame(said, found, marks)
         found.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
         received = said.result_received_at()
@@ -297,7 +248,7 @@ def picture_of(schema: str, data: memoryview) -> RecordedPicture:
     return RecordedPicture(camera, at, frame, said.whole("left_out"), *made)
 
 
-def _frame(said: _Values, found: PixelFormat) -> Frame:
+def _frame(said: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
     moment = said.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")
@@ -320,6 +271,7 @@ def _frame(said: _Values, found: PixelFormat) -> Frame:
         lost=said.whole("lost"),
         source=said.text("source", MAX_NAME_CHARACTERS),
         remark=said.text("remark", MAX_NAME_CHARACTERS),
+        drawings=drawings,
     )
 
 
@@ -364,66 +316,3 @@ class _Values:
     def result_received_at(self) -> datetime | None:
         seconds = self.real("result_received")
         return datetime.fromtimestamp(seconds, UTC) if seconds else None
-
-
-def _values(schema: str, data: memoryview) -> dict[str, Any]:
-    """Return the values of the known fields, with checked types; ignore others."""
-    known = {one.number: (name, one) for name, one in SCHEMAS[schema].items()}
-    found: dict[str, Any] = {}
-    for count, (number, wire, value) in enumerate(_pieces(data)):
-        if count >= MAX_FIELDS:
-            raise ValueError(f"a message of more than {MAX_FIELDS} fields")
-        name, field = known.get(number, ("", None))
-        if field is None:
-            continue
-        expected, read = _READERS[field.type]
-        if wire != expected:
-            raise ValueError(f"{name}: wire type {wire} came, expected {expected}")
-        found[name] = read(value)
-    return found
-
-
-_READERS: Final[dict[str, tuple[int, Callable[[Any], Any]]]] = {
-    "double": (_FIXED64, lambda value: struct.unpack("<d", value)[0]),
-    "fixed32": (_FIXED32, lambda value: struct.unpack("<I", value)[0]),
-    "uint64": (_VARINT, lambda value: value),
-    "string": (_BYTES, lambda value: value),
-    "bytes": (_BYTES, lambda value: value),
-    "message": (_BYTES, lambda value: value),
-}
-
-
-def _pieces(data: memoryview) -> Iterator[tuple[int, int, Any]]:
-    """Yield the number, wire type and value of each field."""
-    place = 0
-    while place < len(data):
-        tag, place = _read_varint(data, place)
-        wire = tag & 7
-        if wire == _VARINT:
-            value, place = _read_varint(data, place)
-            yield tag >> 3, wire, value
-            continue
-        if wire == _BYTES:
-            size, place = _read_varint(data, place)
-        elif wire in (_FIXED32, _FIXED64):
-            size = 4 if wire == _FIXED32 else 8
-        else:
-            raise ValueError(f"a field of wire type {wire}")
-        if size > len(data) - place:
-            raise ValueError(f"a field of {size} bytes in the last {len(data) - place}")
-        yield tag >> 3, wire, data[place : place + size]
-        place += size
-
-
-def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
-    """Return the number at a place, and the place after it."""
-    value = 0
-    for shift in range(0, 64, 7):
-        if place >= len(data):
-            raise ValueError("a number is cut off")
-        byte = data[place]
-        place += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value & 0xFFFF_FFFF_FFFF_FFFF, place
-    raise ValueError("a number of more than 64 bits")

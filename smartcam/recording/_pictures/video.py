@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.frames import Frame
-    from smartcam.recording._recorder import Given
 
 TICK_DURATION: Final = Fraction(1, 1000)
 """Step of a Matroska file's times as FFmpeg writes them, seconds."""
@@ -81,7 +80,7 @@ class VideoFile:
     def start(self) -> None:
         """Do nothing: the first picture decides the format."""
 
-    def add(self, item: Given, /) -> None:
+    def add(self, item: object, /) -> None:
         """Write a picture.
 
         Raises:

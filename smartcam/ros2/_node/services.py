@@ -321,9 +321,7 @@ class RosClient(RosEnd):
                 why = (
                     refused[0]
                     if refused
-                    else (
-                        "the call ended without a reply; whether it was carried out is unknown"
-                    )
+                    else ("the call ended without a reply; whether it was carried out is unknown")
                 )
                 reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.testing.proxy._log import Entry, LinkLog
+    from smartcam.testing.proxy._log import Entry
     from smartcam.testing.proxy._proxy import LinkProxy
     from smartcam.testing.proxy._rules import (
         CoalesceBytes,
@@ -41,7 +41,6 @@ __all__ = [
     "Flip",
     "InsertBytes",
     "Late",
-    "LinkLog",
     "LinkProxy",
     "Lose",
     "Pace",
@@ -58,7 +57,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_log": "Entry LinkLog",
+            "_log": "Entry",
             "_proxy": "LinkProxy",
             "_rules": "CoalesceBytes Cut DelayBytes Drip DropBytes DuplicateBytes Flip "
             "InsertBytes Late Lose Pace Rate Reorder Repeat ResetConnection Rule "

@@ -8,8 +8,7 @@ import pytest
 
 from smartcam.calibration import CircleGrid, Code, find_target, make_sheet
 from smartcam.calibration._detection.blobs import dark_pieces
-from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from tests.calibration.inside import apply_homography, fit_homography
+from tests.calibration.inside import alike_areas, apply_homography, fit_homography, lattices
 from tests.calibration.scenes import STRAIGHT, drawn, refused
 
 ROUND = CircleGrid(columns=7, rows=6, spacing=0.015, diameter=0.0075, origin_diameter=0.011)

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
-from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import grey_image, scaled
 from smartcam.calibration._detection.ordering import (
     Arrangement,
     arrangements,
@@ -24,6 +22,7 @@ from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._inside import Target
 from smartcam.exceptions import CalibrationError
 from tests import ROOT
+from tests.calibration.inside import alike_areas, grey_image, lattices, scaled
 from tests.calibration.scenes import STRAIGHT, check_pair, drawn, refused
 
 if TYPE_CHECKING:

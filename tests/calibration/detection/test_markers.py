@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Charuco, Code, TargetView, find_target
-from smartcam.calibration._detection.markers import Markers, agreeing
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import Markers, agreeing
 from tests.calibration.scenes import BENT, STRAIGHT, Drawn, drawn, refused
 
 NEW = Charuco(columns=9, rows=6, square=0.03, marker=0.02, dictionary="DICT_4X4_50")

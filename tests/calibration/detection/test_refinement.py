@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Checkerboard, CircleGrid, Code, find_target
-from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_corners
 from smartcam.calibration._detection.dots import UNREFINED_SIGMA_PX as UNREFINED_DOT
 from smartcam.calibration._detection.dots import GridMap, refine_dots
-from smartcam.calibration._detection.image import grey_image
-from tests.calibration.inside import apply_homography, fit_homography
+from tests.calibration.inside import (
+    UNREFINED_SIGMA_PX,
+    apply_homography,
+    fit_homography,
+    grey_image,
+    refine_corners,
+)
 from tests.calibration.scenes import BENT, STRAIGHT, drawn, facing, refused
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)

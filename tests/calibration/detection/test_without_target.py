@@ -10,21 +10,24 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
-from smartcam.calibration._detection import boards, charucos, circle_grids, corners
-from smartcam.calibration._detection.grid_growing import MAX_SEEDS_TRIED, _Grown
-from smartcam.calibration._detection.markers import (
-    MAX_OUTLINES,
-    MAX_OUTLINES_OF_ALL_WINDOWS,
-    WINDOWS_PX,
-    _outlines,
-    marker_finder,
-)
+from smartcam.calibration._detection import boards, circle_grids
 from smartcam.calibration._detection.saddles import (
     MAX_SADDLES_EXAMINED,
     MAX_SADDLES_KEPT,
     find_saddles,
 )
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import (
+    MAX_OUTLINES,
+    MAX_OUTLINES_OF_ALL_WINDOWS,
+    MAX_SEEDS_TRIED,
+    WINDOWS_PX,
+    _Grown,
+    _outlines,
+    charucos,
+    corners,
+    marker_finder,
+)
 from tests.calibration.scenes import STRAIGHT, drawn, refused
 
 if TYPE_CHECKING:

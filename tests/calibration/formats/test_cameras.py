@@ -13,14 +13,14 @@ from smartcam import CalibrationError
 from smartcam.calibration import CameraModel, Code, calibrate_intrinsics
 from smartcam.calibration._inside import parse_camera_info, rectify
 from smartcam.calibration.formats import CameraChain, read_cameras, write_camera_info, write_cameras
-from smartcam.calibration.formats._cameras import (
+from tests.calibration.inside import (
     FORMS,
+    CameraForm,
     compose_camchain,
     compose_camera_info,
     compose_opencv,
     parse_opencv,
 )
-from tests.calibration.inside import CameraForm
 from tests.calibration.lenskit import FISHEYE, LEFT, RIG, RIGHT, WIDE, poses, seen
 
 FOUR = dataclasses.replace(LEFT, distortion=np.array([-0.28, 0.07, 1e-3, -5e-4, 0.0]))

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from smartcam.calibration import Chain, PlaneCalibration, PlaneProjection, Transform, fit_plane
-from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration.formats import (
     SAMPLES,
     TRAJECTORIES,
@@ -38,10 +37,9 @@ from smartcam.calibration.formats import (
     write_transform,
 )
 from smartcam.calibration.formats._opencv import compose_matrix
-from smartcam.calibration.formats._plain import real
 from smartcam.calibration.wizards import CalibrationService
 from tests import ROOT
-from tests.calibration.inside import write
+from tests.calibration.inside import PlaneModel, real, write
 from tests.geometry.rigid import (
     FEW,
     NOON,

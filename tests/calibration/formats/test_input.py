@@ -24,9 +24,8 @@ from smartcam.calibration.formats import (
     read_transform,
     write_transform,
 )
-from smartcam.calibration.formats._file_format import MAX_TEXT_BYTES
-from smartcam.calibration.formats._plain import load_json, load_yaml
 from smartcam.exceptions import CalibrationError, MissingExtraError
+from tests.calibration.inside import MAX_TEXT_BYTES, load_json, load_yaml
 from tests.geometry.rigid import FEW, refused
 from tests.layout.bombs import laughs, merges
 

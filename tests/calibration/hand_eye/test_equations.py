@@ -13,8 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.calibration import CameraModel, RobotSigmas
-from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
-from smartcam.calibration._hand_eye.equations import (
+from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
+from smartcam.geometry._inside import Rigid, exp_rotation
+from tests.calibration.inside import (
+    LINEAR,
     Observations,
     PixelObservations,
     PoseObservations,
@@ -23,12 +25,11 @@ from smartcam.calibration._hand_eye.equations import (
     Solution,
     adjust,
     carried,
+    check_motion,
+    solve_linear,
     sums,
     without_each,
 )
-from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
-from smartcam.geometry._inside import Rigid, exp_rotation
-from tests.calibration.inside import LINEAR
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)

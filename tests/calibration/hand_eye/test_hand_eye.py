@@ -500,7 +500,7 @@ def test_hand_eye_with_a_wrong_lens_adjusts_it_and_says_so() -> None:
     found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=wrong)
     assert found.camera is not None
     assert found.camera.matrix[0, 0] == pytest.approx(1200, rel=0.005)
-    assert [one.code for one in found.warnings] == [Code.POOR_FIT]
+    assert [one.code for one in found.warnings] == [Code.WRONG_LENS]
     assert "px instead of 1150.0 px" in found.warnings[0].text
 
 

@@ -16,9 +16,8 @@ from smartcam.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration._hand_eye.closed_forms import second_turn, second_turns
-from smartcam.calibration._hand_eye.equations import RobotPoses
 from smartcam.geometry._inside import Rigid, exp_rotation
+from tests.calibration.inside import RobotPoses, second_turn, second_turns
 from tests.calibration.scenes import scene
 
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import (
+    Checkerboard,
     Code,
     HandEyeCalibration,
     RobotSigmas,
@@ -17,7 +18,6 @@ from smartcam.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration._hand_eye.equations import PoseObservations, RobotPoses
 from smartcam.calibration._hand_eye.model_selection import Problem
 from smartcam.calibration._hand_eye.validation import (
     agreement,
@@ -25,13 +25,16 @@ from smartcam.calibration._hand_eye.validation import (
     expected_error,
     most_error,
 )
+from smartcam.calibration.simulation import hand_eye_scene
 from smartcam.geometry._inside import Rigid
-from tests.calibration.inside import Setup
+from tests.calibration.inside import PoseObservations, RobotPoses, Setup
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
 ONE_LONG = [pytest.param("eye-in-hand", marks=pytest.mark.long), "eye-to-hand"]
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
+PUSHED = np.array([0.06, 0.03, 0.0])
+"""A fixture that was pushed, metres."""
 
 Pairs = tuple[list[Transform], "list[TargetView]"]
 
@@ -128,6 +131,53 @@ def test_hand_eye_told_to_keep_a_pose_of_another_view_says_how_poor_it_is() -> N
     texts = {one.code: one.text for one in found.warnings}
     assert texts[Code.POOR_FIT].startswith("expected a held-out error of ")
     assert texts[Code.BAD_VIEW].endswith("it is used all the same")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("moved", ["target", "camera"])
+def test_hand_eye_of_what_moved_before_the_last_views_is_not_good(setup: Setup, moved: str) -> None:
+    """The views that were left out agree with each other: they are how things stand now."""
+    poses, views = measured(setup, poses=13)
+    on_base = (moved == "target") == (setup == "eye-in-hand")
+    frame = "base" if on_base else "flange"
+    push = Transform(frame, frame, np.eye(3), PUSHED)
+    shifted = [push @ one if on_base else one @ push for one in poses[-3:]]
+    found = calibrated([*poses[:-3], *shifted], views, setup)
+    assert sum(found.used) == 10
+    assert found.verdict.level == "poor"
+    assert "moved or slipped" in found.verdict.text
+    assert any(f"the {moved} seems to have moved by 67" in one.text for one in found.warnings)
+
+
+@pytest.mark.long
+@pytest.mark.judged
+@pytest.mark.parametrize(("number", "level"), [(-1, "unknown"), (-2, "good")])
+def test_hand_eye_of_which_the_last_view_does_not_fit_is_not_good(number: int, level: str) -> None:
+    poses, views = measured("eye-in-hand", poses=9)
+    poses[number] = Transform("base", "base", np.eye(3), PUSHED) @ poses[number]
+    found = calibrated(poses, views)
+    assert not found.used[number]
+    assert found.verdict.level == level
+
+
+@pytest.mark.long
+def test_hand_eye_of_a_robot_that_stood_for_half_of_the_views_is_refused() -> None:
+    """The fits end where nothing is determined, with a target in the camera."""
+    truth = hand_eye_scene(
+        Checkerboard(columns=9, rows=6, square=0.025),
+        CAMERA,
+        setup="eye-in-hand",
+        poses=14,
+        tilt=math.radians(30),
+        distance=0.5,
+        random=np.random.default_rng(3),
+    )
+    poses, views = truth.measured(
+        pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(4)
+    )
+    with refused("POOR_FIT"):
+        calibrate_hand_eye([*poses[:7], *[poses[7]] * 7], views, setup="eye-in-hand", camera=CAMERA)
 
 
 @pytest.mark.long

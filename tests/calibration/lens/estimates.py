@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smartcam.calibration import CameraModel, IntrinsicCalibration, Transform
-from smartcam.calibration._lens.coverage import Coverage
-from smartcam.calibration._lens.intrinsics import ViewFit
-from smartcam.calibration._lens.projection import linearize, pose_changes
 from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration import lenskit
+from tests.calibration.inside import Coverage, ViewFit, linearize, pose_changes
 
 if TYPE_CHECKING:
     from smartcam.calibration import TargetView

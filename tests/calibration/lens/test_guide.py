@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Charuco, Code, NextView, Transform, suggest_views
+from smartcam.calibration import CameraModel, Charuco, Code, Transform, suggest_views
 from smartcam.calibration._inside import Target
-from smartcam.calibration._lens.guide import candidates
+from smartcam.calibration._lens.guide import NextView, candidates
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import exp_rotation
 from tests.calibration import lenskit

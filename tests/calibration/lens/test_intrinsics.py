@@ -19,19 +19,23 @@ from smartcam.calibration import (
     Transform,
     calibrate_intrinsics,
 )
-from smartcam.calibration._lens.bundle import (
-    Bundle,
-    Sight,
-    adjust,
-    adjust_weighted,
-    leave_out,
-    residuals,
-)
-from smartcam.calibration._lens.coverage import Coverage, coverage
-from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, choose_shape
 from smartcam.calibration._lens.start import fit_lens, lens_basis, parameter_names
 from smartcam.geometry._inside import Rigid
-from tests.calibration.inside import lens_values, with_lens
+from tests.calibration.inside import (
+    Bundle,
+    Coverage,
+    Sight,
+    adjust_shape,
+    adjust_weighted,
+    as_meant,
+    choose_shape,
+    coverage,
+    leave_out,
+    lens_values,
+    residuals,
+    with_lens,
+)
+from tests.calibration.inside import bundle_adjust as adjust
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, RIG, RIGHT, WIDE, pairs, poses, seen
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code, Transform, locate
-from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
 from smartcam.geometry._inside import exp_rotation
+from tests.calibration.inside import excess, linearize, pose_changes, whitening
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, TURNED, WIDE, poses, seen
 
 if TYPE_CHECKING:

@@ -7,17 +7,17 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration._homography import element_derivatives
-from smartcam.calibration._plane.fitting import (
+from smartcam.geometry._inside import Array
+from tests.calibration.inside import (
     MODELS,
     ModelName,
     Normalization,
     Pairs,
+    apply_homography,
+    element_derivatives,
     fit,
     held_out,
 )
-from smartcam.geometry._inside import Array
-from tests.calibration.inside import apply_homography
 from tests.calibration.plane.planekit import GRID, SPECIAL, Scene, grid
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))

@@ -159,3 +159,27 @@ def test_touches_in_millimetres_are_refused_with_the_question() -> None:
     touches[3] *= 1000
     with refused("UNIT_UNKNOWN", "are they millimetres?"):
         fit_plane(marks, touches, tool_z=DOWN)
+
+
+@pytest.mark.parametrize("off", [0.003, 0.02])
+@pytest.mark.parametrize("moved", [2, 4])
+def test_touches_before_and_after_a_move_are_not_called_good_by_a_robust_fit(
+    off: float, moved: int
+) -> None:
+    random = np.random.default_rng([9, moved])
+    marks = layout(9, random)
+    touches = SCENE.robot(marks) + SIGMA * random.normal(size=(9, 3))
+    touches[-moved:] += off * SCENE.turn[:, 0]
+    found = fit_plane(marks, touches, touch_sigma=SIGMA, tool_z=DOWN, robust=True)
+    assert found.outliers == tuple(range(9 - moved, 9))
+    assert found.verdict.level == "poor"
+    assert "moved between the touches" in found.warnings[0].text
+
+
+def test_robust_fit_of_a_touch_that_was_sent_four_times_is_refused() -> None:
+    random = np.random.default_rng([8, 7])
+    marks = layout(7, random)
+    touches = SCENE.robot(marks) + 2e-4 * random.normal(size=(7, 3))
+    touches[4:] = touches[3]
+    with refused("SHORT_LEVER"):
+        fit_plane(marks, touches, tool_z=DOWN, robust=True)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import Chain, MovingCamera, PoseHistory, Transform, chain_of, fit_plane
 from smartcam.calibration._plane.moving_camera import Moved
-from smartcam.calibration._solvers import Poses
-from tests.calibration.inside import RealWorldPosition
+from tests.calibration.inside import Poses, RealWorldPosition
 from tests.geometry.rigid import (
     NOON,
     after,

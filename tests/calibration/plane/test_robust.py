@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from smartcam import CalibrationError
 from smartcam.calibration import Code, PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
-from smartcam.calibration._plane.fitting import Fit, fit
 from smartcam.calibration._plane.robust import (
     MAX_FITTED_PROPOSALS,
     MAX_SUBSETS_TRIED,
@@ -22,6 +21,7 @@ from smartcam.calibration._plane.robust import (
     agreeing,
 )
 from smartcam.geometry._inside import Array
+from tests.calibration.inside import Fit, fit
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene, grid, scenes, spread
 from tests.geometry.rigid import FEW, refused
 

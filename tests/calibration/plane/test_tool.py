@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import ToolOffset, Transform, fit_tool_tip
 from smartcam.calibration._plane.tool import fit_rotation_centre
-from smartcam.calibration._solvers import Poses
+from tests.calibration.inside import Poses
 from tests.calibration.plane.planekit import part
 from tests.geometry.rigid import (
     angles,

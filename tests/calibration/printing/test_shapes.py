@@ -14,17 +14,9 @@ import pytest
 
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code
 from smartcam.calibration._inside import Target
-from smartcam.calibration._printing.page import (
-    Disc,
-    Label,
-    Polygon,
-    PrintedPage,
-    pdf,
-    rectangle,
-    svg,
-)
 from smartcam.calibration._printing.shapes import Box, ink, outlines, quartered
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import Disc, Label, Polygon, PrintedPage, pdf, rectangle, svg
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

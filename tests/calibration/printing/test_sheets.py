@@ -24,12 +24,9 @@ from smartcam.calibration import (
     target_from_data,
 )
 from smartcam.calibration._inside import Target, on_paper
-from smartcam.calibration._printing.page import Disc, Label, Polygon
-from smartcam.calibration._printing.page_layout import BORDER_MM
-from smartcam.calibration._printing.sheets import page_size
 from smartcam.exceptions import CalibrationError
 from tests import ROOT
-from tests.calibration.inside import Rays
+from tests.calibration.inside import BORDER_MM, Disc, Label, Polygon, Rays, page_size
 
 GOLDEN = ROOT / "docs" / "sheet.svg"
 

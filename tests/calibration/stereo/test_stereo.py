@@ -18,12 +18,9 @@ from smartcam.calibration import (
     Transform,
     calibrate_stereo,
 )
-from smartcam.calibration._lens.bundle import Sight
-from smartcam.calibration._lens.sheet_shape import as_meant
-from smartcam.calibration._stereo.checks import check_fit, remark_sides
 from smartcam.calibration._stereo.errors import spacing_errors
 from smartcam.calibration._stereo.start import Lenses, as_moments, start
-from tests.calibration.inside import half_turned
+from tests.calibration.inside import Sight, as_meant, check_fit, half_turned, remark_sides
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
 

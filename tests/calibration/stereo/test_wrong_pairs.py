@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Code, StereoCalibration, TargetView, Transform, calibrate_stereo
-from smartcam.calibration._stereo.checks import check_apart
+from tests.calibration.inside import check_apart
 from tests.calibration.lens.test_wrong_views import flipped, mirrored
 from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused

@@ -10,13 +10,11 @@ import pytest
 
 from smartcam.calibration import Folder, PlaneCalibration, fit_plane
 from smartcam.calibration._files.directory import MAX_NAME_LENGTH
-from smartcam.calibration._files.store import BACKUPS
 from smartcam.calibration._inside import listing
-from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration.wizards import CalibrationService
 from smartcam.calibration.wizards._services import MAX_EARLIER_JOURNALS
 from tests import ROOT
-from tests.calibration.inside import read_document, write
+from tests.calibration.inside import BACKUPS, RULER_MM, read_document, write
 
 if TYPE_CHECKING:
     from pathlib import Path

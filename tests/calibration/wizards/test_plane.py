@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -170,14 +171,16 @@ async def test_error_beyond_what_the_user_allows_is_not_good(tmp_path: Path) -> 
     assert "but 0.5 mm are allowed" in view["verdict"]["text"]
 
 
-async def touch_some_wrong(session: WizardSession, bench: Bench, wrong: set[int]) -> dict[str, Any]:
-    """Touch all nine marks, those of these numbers 5 mm off; return the review."""
+async def touch_some_wrong(
+    session: WizardSession, bench: Bench, wrong: Mapping[int, float]
+) -> dict[str, Any]:
+    """Touch all nine marks, some by number off by so many millimetres; return the review."""
     await say(session, {"touch_sigma": 0.2})
     await say(session)
     view = await say(session)
     for number, mark in enumerate(GRID, 1):
         answer = bench.touch_mm(*mark)
-        view = await say(session, {**answer, "x": answer["x"] + 5.0 * (number in wrong)})
+        view = await say(session, {**answer, "x": answer["x"] + wrong.get(number, 0.0)})
     assert view["step"] == "review"
     return view
 
@@ -185,7 +188,7 @@ async def touch_some_wrong(session: WizardSession, bench: Bench, wrong: set[int]
 async def test_one_wrong_touch_again_and_again_gets_another_advice(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
-    view = await touch_some_wrong(session, bench, {4})
+    view = await touch_some_wrong(session, bench, {4: 5.0})
     assert view["defaults"] == {"next": "redo", "point": 4}
     await say(session, {"next": "redo", "point": 4})
     answer = bench.touch_mm(*GRID[3])
@@ -203,7 +206,7 @@ def choices(view: dict[str, Any]) -> list[str]:
 async def test_wrong_touches_can_be_left_out_and_count_nowhere(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
-    view = await touch_some_wrong(session, bench, {3, 6})
+    view = await touch_some_wrong(session, bench, {3: 5.0, 6: -5.0})
     assert choices(view) == ["accept", "more", "redo", "remove", "robust"]
     view = await say(session, {"next": "robust"})
     assert view["notes"][0] == "model rigid from 7 of 9 points"
@@ -222,7 +225,7 @@ async def test_wrong_touches_can_be_left_out_and_count_nowhere(tmp_path: Path) -
 async def test_points_left_out_can_count_again_or_be_touched_again(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
-    plain = await touch_some_wrong(session, bench, {4})
+    plain = await touch_some_wrong(session, bench, {4: 5.0})
     await say(session, {"next": "robust"})
     view = await say(session, {"next": "all"})
     assert (view["notes"], choices(view)) == (plain["notes"], choices(plain))
@@ -237,14 +240,14 @@ async def test_points_left_out_can_count_again_or_be_touched_again(tmp_path: Pat
 async def test_points_that_agree_are_not_offered_to_be_left_out(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
-    assert "robust" not in choices(await touch_some_wrong(session, bench, set()))
+    assert "robust" not in choices(await touch_some_wrong(session, bench, {}))
     session.close()
 
 
 async def test_points_left_out_down_to_five_all_count(tmp_path: Path) -> None:
     bench = Bench(sigma=0.0002)
     session = begin(tmp_path, bench)
-    await touch_some_wrong(session, bench, {4})
+    await touch_some_wrong(session, bench, {4: 5.0})
     view = await say(session, {"next": "robust"})
     for _ in range(4):
         view = await say(session, {"next": "remove"})
@@ -255,7 +258,7 @@ async def test_points_left_out_down_to_five_all_count(tmp_path: Path) -> None:
 async def test_wizard_resumed_leaves_out_the_same_points(tmp_path: Path) -> None:
     bench, journal = Bench(sigma=0.0002), tmp_path / "table.journal"
     session = begin(tmp_path, bench, journal=journal)
-    await touch_some_wrong(session, bench, {3, 6})
+    await touch_some_wrong(session, bench, {3: 5.0, 6: -5.0})
     before = await say(session, {"next": "robust"})
     session.close()
     session = begin(tmp_path, bench, journal=journal)

@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 
 from smartcam.calibration.wizards import Step, Wizard, WizardSession, ask
-from smartcam.calibration.wizards import _journal as module
-from smartcam.calibration.wizards._journal import MAX_LINE_BYTES
 from smartcam.exceptions import CalibrationError, NotRunningError
-from tests.calibration.inside import Journal
+from tests.calibration.inside import MAX_LINE_BYTES, Journal
+from tests.calibration.inside import _journal as module
 from tests.calibration.wizards import wizards
 from tests.calibration.wizards.wizards import ANSWERS, Trigger, answer_all, survey
 

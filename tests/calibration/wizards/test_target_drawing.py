@@ -18,13 +18,11 @@ import pytest
 
 from smartcam.calibration import Checkerboard, Code, PlaneCalibration, TargetView, fit_plane
 from smartcam.calibration._inside import LOOKS
-from smartcam.calibration.wizards._marks import Mark
+from smartcam.calibration.wizards._marks import Mark, Touch
 from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw
 from smartcam.calibration.wizards._touch_previews import HEAT_MAP_CELLS, before, compared, plain
-from smartcam.calibration.wizards._touches import Touch
-from smartcam.calibration.wizards._view_suggestions import Look
 from smartcam.exceptions import CalibrationError
-from tests.calibration.inside import outline
+from tests.calibration.inside import Look, outline
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene
 
 if TYPE_CHECKING:

@@ -25,12 +25,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client._inside import CameraState, ClientCounters, Interpretation, Listeners
-from smartcam._client.connection import Connection
-from smartcam._client.dispatch import Dispatch
-from smartcam._client.doorbell import Doorbell
-from smartcam._client.requests import Requests
-from smartcam._client.triggering import FENCED_TRIGGER
-from smartcam._client.waits import StatusWaiter, Waits
 from smartcam.models import ApplicationChanged, Result, StatusChanged
 from smartcam.observers import Observers
 from smartcam.protocols import LinkFailed, Role, State, Transport
@@ -53,7 +47,20 @@ from tests.client.camera_by_hand import (
     WIRES,
     words,
 )
-from tests.client.inside import Chunk, Correlation, EvidenceByStatus, PendingTrigger, Results
+from tests.client.inside import (
+    FENCED_TRIGGER,
+    Chunk,
+    Connection,
+    Correlation,
+    Dispatch,
+    Doorbell,
+    EvidenceByStatus,
+    PendingTrigger,
+    Requests,
+    Results,
+    StatusWaiter,
+    Waits,
+)
 from tests.client.proofs.interleaved_client import LOOP, time_stands_still
 from tests.protocols.frame_times import JudgingMachine, ShortMachine
 

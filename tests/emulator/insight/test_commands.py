@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from smartcam.emulator import EmulatedInSight, InSightQuirks, Job, ManualClock
-from smartcam.emulator._insight.job import BUILTIN_JOBS
 from smartcam.protocols._inside import words
+from tests.emulator.inside import BUILTIN_JOBS
 from tests.emulator.insight import insight_wire as wire
 from tests.emulator.insight.insight_wire import TelnetClient
 

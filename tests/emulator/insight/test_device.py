@@ -11,13 +11,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Job
-from smartcam.emulator._insight.commands import InSightCommands
-from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._insight.image import bitmap, check_image, grey_pattern
-from smartcam.emulator._insight.job import Control, make_job, shown
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames._inside import read_bitmap
 from smartcam.protocols._inside import StatusCode, words
+from tests.emulator.inside import Control, InSightCommands, InSightDevice, make_job, shown
 
 SECOND = 1_000_000_000
 

@@ -28,10 +28,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from smartcam.exceptions import ReservationLostError
-from smartcam.fleet._agent.agent import CallNumbers
-from smartcam.fleet._agent.gate import InLine
-from smartcam.fleet._program.caller import Lease, Met
-from tests.fleet.inside import Caller, Gate
+from tests.fleet.inside import Caller, CallNumbers, Gate, InLine, Lease, Met
 
 Move = tuple[Any, ...]
 Wrong = Literal["between", "behind", "twice"]

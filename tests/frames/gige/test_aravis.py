@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 
 from tests.frames.gige.in_namespace import PROGRAM
+from tests.processes import network_namespace
 
 pytestmark = pytest.mark.long
 
@@ -21,17 +21,7 @@ FRAMES = 3000
 @pytest.fixture(scope="module")
 def namespace() -> list[str]:
     """Return the command that runs another one in a namespace of its own."""
-    for program, package in (
-        (PROGRAM, "aravis-tools"),
-        ("ip", "iproute2"),
-        ("unshare", "util-linux"),
-    ):
-        if shutil.which(program) is None:
-            pytest.skip(f"needs {program}: apt-get install {package}")
-    for command in (["unshare", "-n"], ["unshare", "-r", "-n"]):
-        if subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0:  # noqa: S603
-            return command
-    pytest.skip("needs network namespaces: unshare -n is not allowed here")
+    return network_namespace(PROGRAM, "aravis-tools")
 
 
 def read(namespace: list[str], frames: int, query: str, *arguments: str) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige import assembler as _assembler
-from smartcam.frames._gige.assembler import MAX_OPEN_BLOCKS, Assembler, Resend
 from smartcam.frames._gige.block import WholePicture
 from tests.frames.gige.packets import FULL, frame, header, leader, payload, trailer
+from tests.frames.inside import MAX_OPEN_BLOCKS, Assembler, Resend
+from tests.frames.inside import assembler as _assembler
 
 START = 100.0
 

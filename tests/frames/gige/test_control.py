@@ -15,11 +15,10 @@ from smartcam.frames._gige import driver
 from smartcam.frames._gige import force_address as force
 from smartcam.frames._gige import places as _places
 from smartcam.frames._gige.control import RequestRefusedError
-from smartcam.frames._gige.discovery import AnsweringCamera as Found
-from smartcam.frames._gige.discovery import Network, find, networks
-from smartcam.frames._gige.gvcp import DeviceInfo
 from smartcam.frames._inside import ControlChannel, GigEDriver, checked_mac, force_address
 from tests.frames.gige.camera import camera
+from tests.frames.inside import AnsweringCamera as Found
+from tests.frames.inside import DeviceInfo, Network, find, networks
 
 Answers = Callable[[int, bytes], list[bytes]]
 

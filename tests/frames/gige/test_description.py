@@ -11,14 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameSourceError, MessageError
-from smartcam.frames._gige import description as _description
-from smartcam.frames._gige.description import locate, unpack
-from smartcam.frames._gige.event_channel import decode_events
-from smartcam.frames._gige.expressions import evaluate
-from smartcam.frames._gige.messages import MAX_CHUNKS, MessageFeatures, cut_chunks
 from smartcam.frames._inside import GenicamFeatures
 from tests.frames.gige.camera import DESCRIPTION, HEAD
-from tests.frames.inside import parse
+from tests.frames.inside import (
+    MAX_CHUNKS,
+    MessageFeatures,
+    cut_chunks,
+    decode_events,
+    evaluate,
+    locate,
+    parse,
+    unpack,
+)
+from tests.frames.inside import description as _description
 
 
 def described(inside: str) -> str:

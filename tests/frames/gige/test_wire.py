@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige import gvcp, gvsp
+from smartcam.frames._gige import gvsp
 from tests.frames.gige.packets import header, leader, trailer
+from tests.frames.inside import gvcp
 
 
 @pytest.mark.parametrize(

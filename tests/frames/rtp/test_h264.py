@@ -13,11 +13,18 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Codecs
-from smartcam.frames._streaming.rtp.assembling import AccessUnit
-from smartcam.frames._streaming.rtp.depacketizer import MAX_PACKETS_AHEAD
-from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets, units
-from smartcam.frames._streaming.rtp.parameters import description, picture_size, size_in
-from tests.frames.inside import Depacketizer, RtpPacket
+from tests.frames.inside import (
+    MAX_PACKETS_AHEAD,
+    AccessUnit,
+    Depacketizer,
+    H264Packetizer,
+    RtpPacket,
+    parameter_sets,
+    picture_size,
+    units,
+)
+from tests.frames.inside import parameters_description as description
+from tests.frames.inside import parameters_size_in as size_in
 from tests.frames.pictures import frame_of
 
 SPS, PPS = b"\x67\x42\xc0\x1e\xa6", b"\x68\xce\x0f\xc8"

@@ -23,19 +23,20 @@ from smartcam.frames import Codecs, Moment, RtpSender
 from smartcam.frames._inside import entry_point, read_stamp
 from smartcam.frames._streaming.rtp import decoding as receiving
 from smartcam.frames._streaming.rtp import feedback
-from smartcam.frames._streaming.rtp.h264 import H264Packetizer
-from smartcam.frames._streaming.rtp.packets import (
+from smartcam.frames._streaming.rtp.sockets import host_and_port
+from tests.frames.drivers import GoneError, scripted
+from tests.frames.inside import (
     Goodbye,
+    H264Packetizer,
     PacketsMissing,
     PictureLost,
     ReceiverReport,
+    RtpDriver,
+    RtpPacket,
     SenderReport,
     compound,
     parse_rtcp,
 )
-from smartcam.frames._streaming.rtp.sockets import host_and_port
-from tests.frames.drivers import GoneError, scripted
-from tests.frames.inside import RtpDriver, RtpPacket
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped, stripes, write_stamp
 from tests.frames.rtp.ways import HOST, two_ports, way
 
@@ -43,7 +44,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from smartcam.frames import Frame, FrameReader, FrameSource, RtpStatistics
+    from smartcam.frames import Frame, FrameReader, FrameSource
+    from tests.frames.inside import RtpStatistics
 
 pytestmark = pytest.mark.real_time
 

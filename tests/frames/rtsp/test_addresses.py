@@ -9,13 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
-from smartcam.frames._streaming.rtsp.authentication import (
+from tests.frames.inside import (
     MAX_WRONG_ANSWERS,
     Authentication,
     PasswordGate,
+    RtspError,
+    RtspRequest,
+    RtspTarget,
+    TransportWish,
+    target_of,
+    wish_of,
 )
-from smartcam.frames._streaming.rtsp.messages import RtspError, RtspRequest
 from tests.frames.rtsp.client import Reply, digest
 
 URL = "rtsp://h:8554/left"

@@ -8,18 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.frames._streaming.rtsp.messages import (
-    MAX_BODY_BYTES,
-    MAX_HEADERS,
-    MAX_LINE_BYTES,
-    ROOM,
-    ChannelData,
-    RequestParser,
-    RtspError,
-    RtspRequest,
-    answer,
-    cseq_of,
-)
+from tests.frames.inside import messages
 
 REQUESTS = (
     b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n",
@@ -30,20 +19,22 @@ REQUESTS = (
     b"$\7\0\0",
 )
 MESSAGES = (
-    RtspRequest("OPTIONS", "*", {"cseq": "1"}),
-    RtspRequest(
+    messages.RtspRequest("OPTIONS", "*", {"cseq": "1"}),
+    messages.RtspRequest(
         "SET_PARAMETER", "rtsp://h/a", {"cseq": "2", "content-length": "6"}, b"$\0\r\n\r\n"
     ),
-    RtspRequest("PLAY", "rtsp://h/a", {"cseq": "3", "range": "npt=0-"}),
-    ChannelData(1, b"abc"),
-    RtspRequest("GET_PARAMETER", "rtsp://h/a", {"cseq": "4", "x": "a, b", "content-length": "0"}),
-    ChannelData(7, b""),
+    messages.RtspRequest("PLAY", "rtsp://h/a", {"cseq": "3", "range": "npt=0-"}),
+    messages.ChannelData(1, b"abc"),
+    messages.RtspRequest(
+        "GET_PARAMETER", "rtsp://h/a", {"cseq": "4", "x": "a, b", "content-length": "0"}
+    ),
+    messages.ChannelData(7, b""),
 )
 
 
-def read(*pieces: bytes) -> list[RtspRequest | ChannelData]:
+def read(*pieces: bytes) -> list[messages.RtspRequest | messages.ChannelData]:
     """Return what is cut from pieces, each of which is looked at when it comes."""
-    parser, found = RequestParser(), []
+    parser, found = messages.RequestParser(), []
     for piece in pieces:
         parser.feed(piece)
         while (message := parser.next()) is not None:
@@ -77,16 +68,16 @@ def test_byte_by_byte() -> None:
 def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
     parts: list[bytes], cuts: list[int]
 ) -> None:
-    def told(*pieces: bytes) -> tuple[list[RtspRequest | ChannelData], int]:
-        parser, found = RequestParser(), []
+    def told(*pieces: bytes) -> tuple[list[messages.RtspRequest | messages.ChannelData], int]:
+        parser, found = messages.RequestParser(), []
         for piece in pieces:
             parser.feed(piece)
             try:
                 while (message := parser.next()) is not None:
                     found.append(message)
-            except RtspError as error:
+            except messages.RtspError as error:
                 return found, error.status if error.fatal else -1
-        assert parser.waiting <= ROOM
+        assert parser.waiting <= messages.ROOM
         return found, 0
 
     data = b"".join(parts)
@@ -110,45 +101,46 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
         (b"OPTIONS * RTSP/1.0\r\nContent-Length: -1\r\n", 413, "Content-Length"),
         (b"OPTIONS * RTSP/1.0\r\nContent-Length: \xb2\r\n", 413, "Content-Length"),
         (
-            b"OPTIONS * RTSP/1.0\r\nContent-Length: %d\r\n" % (MAX_BODY_BYTES + 1),
+            b"OPTIONS * RTSP/1.0\r\nContent-Length: %d\r\n" % (messages.MAX_BODY_BYTES + 1),
             413,
             "Content-Length",
         ),
-        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * MAX_LINE_BYTES, 400, "headers"),
-        (b"A" * (MAX_LINE_BYTES + 1), 400, "a line"),
-        (b"A" * (MAX_LINE_BYTES + 1) + b"\n", 400, "a line"),
+        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * messages.MAX_LINE_BYTES, 400, "headers"),
+        (b"A" * (messages.MAX_LINE_BYTES + 1), 400, "a line"),
+        (b"A" * (messages.MAX_LINE_BYTES + 1) + b"\n", 400, "a line"),
         (
-            b"OPTIONS * RTSP/1.0\r\n" + b"".join(b"A%d: b\r\n" % n for n in range(MAX_HEADERS + 1)),
+            b"OPTIONS * RTSP/1.0\r\n"
+            + b"".join(b"A%d: b\r\n" % n for n in range(messages.MAX_HEADERS + 1)),
             400,
             "headers",
         ),
     ],
 )
 def test_what_cannot_be_a_request_is_refused(data: bytes, status: int, text: str) -> None:
-    with pytest.raises(RtspError, match=text) as caught:
+    with pytest.raises(messages.RtspError, match=text) as caught:
         read(data)
     assert (caught.value.status, caught.value.fatal) == (status, True)
 
 
 def test_a_half_message_is_known_as_one() -> None:
-    parser = RequestParser()
+    parser = messages.RequestParser()
     for data, midst in ((b"\r\n", False), (b"OPT", True), (b"IONS * RTSP/1.0\r\n", True)):
         parser.feed(data)
         assert parser.next() is None
         assert parser.in_midst == midst
     parser.feed(b"\r\n")
-    assert parser.next() == RtspRequest("OPTIONS", "*", {})
+    assert parser.next() == messages.RtspRequest("OPTIONS", "*", {})
     assert not parser.in_midst
 
 
 @pytest.mark.parametrize("cseq", [{}, {"cseq": ""}, {"cseq": "-1"}, {"cseq": "1" * 10}])
 def test_a_request_has_a_number(cseq: dict[str, str]) -> None:
-    with pytest.raises(RtspError, match="CSeq"):
-        cseq_of(RtspRequest("OPTIONS", "*", cseq))
+    with pytest.raises(messages.RtspError, match="CSeq"):
+        messages.cseq_of(messages.RtspRequest("OPTIONS", "*", cseq))
 
 
 def test_answers() -> None:
-    assert answer(461, "3", (("A", "b"),), b"c\n") == (
+    assert messages.answer(461, "3", (("A", "b"),), b"c\n") == (
         b"RTSP/1.0 461 Unsupported Transport\r\nCSeq: 3\r\nA: b\r\nContent-Length: 2\r\n\r\nc\n"
     )
-    assert answer(200, "") == b"RTSP/1.0 200 OK\r\n\r\n"
+    assert messages.answer(200, "") == b"RTSP/1.0 200 OK\r\n\r\n"

@@ -10,8 +10,8 @@ import pytest
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import Codecs
-from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
 from tests.frames.drivers import GoneError, scripted
+from tests.frames.inside import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
 from tests.frames.pictures import frame_of, stamped
 from tests.handmade import until
 

@@ -14,26 +14,28 @@ import numpy as np
 import pytest
 
 from smartcam.frames import Codecs, RtspServer
-from smartcam.frames._streaming.rtp.packets import (
-    Goodbye,
-    PictureLost,
-    ReceiverReport,
-    SenderReport,
-    SourceDescription,
-    compound,
-    parse_rtcp,
-)
-from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970
-from smartcam.frames._streaming.rtsp import delivery
-from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, port_pair
 from smartcam.frames._streaming.rtsp.session import (
     CLOCK,
     REPORT_INTERVAL,
     TIMEOUT,
 )
-from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER
 from tests.frames.drivers import GoneError, scripted
-from tests.frames.inside import RtpPacket
+from tests.frames.inside import (
+    KEY_PAUSE,
+    LINGER,
+    SECONDS_FROM_1900_TO_1970,
+    STALL_TIMEOUT,
+    Goodbye,
+    PictureLost,
+    ReceiverReport,
+    RtpPacket,
+    SenderReport,
+    SourceDescription,
+    compound,
+    delivery,
+    parse_rtcp,
+    port_pair,
+)
 from tests.frames.pictures import frame_of, stamped, write_stamp
 from tests.frames.rtsp.client import Client, Watcher
 from tests.handmade import until

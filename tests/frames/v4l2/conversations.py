@@ -15,9 +15,7 @@ import threading
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from smartcam.frames._v4l2 import abi
-from smartcam.frames._v4l2.abi import Ioctl
-from tests.frames.inside import system
+from tests.frames.inside import Ioctl, abi, system
 
 TABLE = Path(__file__).with_name("vivid.json")
 WRAPPED = ("open", "close", "ioctl", "pages", "nodes", "now")

@@ -7,10 +7,7 @@ from collections.abc import Awaitable, Callable
 import smartcam.frames
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FoundSource, Frame, FrameReader
-from smartcam.frames._v4l2 import abi
-from smartcam.frames._v4l2.controls import DeviceControl
-from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
-from smartcam.frames._v4l2.driver import V4L2Driver
+from tests.frames.inside import FORMATS, CaptureDevice, DeviceControl, V4L2Driver, abi
 
 __all__ = ["DeviceControl", "V4L2Driver", "abi"]
 

@@ -13,9 +13,8 @@ import pytest
 import smartcam.frames
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.frames import Moment
-from smartcam.frames._v4l2 import abi, stream
-from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
-from tests.frames.inside import discovery, system
+from smartcam.frames._v4l2 import stream
+from tests.frames.inside import FORMATS, CaptureDevice, abi, discovery, system
 from tests.frames.v4l2 import scenarios
 from tests.frames.v4l2.conversations import WRAPPED, Answer, Replay
 

@@ -23,18 +23,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from smartcam.inspection._measure.edges import EdgeSettings
-from smartcam.inspection._measure.features import (
+from tests.inspection.inside import (
+    PIXELS,
+    EdgeSettings,
+    NotMeasuredError,
+    Sectors,
+    Strips,
+    circle_of,
     find_circle,
     find_line,
     find_pair,
     find_point,
+    line_of,
     strip_between,
+    width,
 )
-from smartcam.inspection._measure.planes import PIXELS
-from smartcam.inspection._measure.strips import Sectors, Strips
-from smartcam.inspection._measure.troubles import NotMeasuredError
-from smartcam.inspection._measure.values import circle_of, line_of, width
 from tests.inspection.proofs import calipers_of_others as others
 from tests.inspection.rendering import Array, disc, half_plane, photographed, pixel_means
 

@@ -25,9 +25,8 @@ import cv2
 import numpy as np
 
 from smartcam.inspection import Picture, ToolSetup
-from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
-from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.drawn_codes import Look, draw_code
+from tests.inspection.inside import ReadCode, ReadSettings, ReadTool, formats_of, read_codes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

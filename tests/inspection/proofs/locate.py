@@ -3,7 +3,7 @@
 ``python -m tests.inspection.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER]
 [--others]``
 
-Draws parts at exact poses in scenes of 29 kinds, five pictures of each drawing, locates them by a
+Draws parts at exact poses in scenes of 31 kinds, five pictures of each drawing, locates them by a
 model that was taught from another picture, and compares. No estimate without a bias can be better
 than the Cramer-Rao bound, which is worked out here from the drawing alone: of the pixels beside the
 edges that were used, where both levels of each piece of an edge are unknown, and of a texture no
@@ -94,7 +94,8 @@ class Kind:
         part: name of the part.
         look: how the scene is photographed.
         taught: how the taught picture is photographed.
-        scales: from and to.
+        scales: from and to, as they are drawn.
+        one_size: whether the taught size is looked for, whatever is drawn.
         covered: part of the part that something covers.
         clutter: number of other parts around it.
         texture: levels of a texture behind it.
@@ -110,6 +111,7 @@ class Kind:
     look: Look = LOOK
     taught: Look = QUIET
     scales: tuple[float, float] = (1.0, 1.0)
+    one_size: bool = False
     covered: float = 0.0
     clutter: int = 0
     texture: float = 0.0
@@ -123,7 +125,10 @@ class Kind:
         """The search for the part."""
         least = 0.7 - self.covered
         return PartSearch(
-            scales=self.scales, least_score=least, any_polarity=self.any_polarity, seconds=30.0
+            scales=(1.0, 1.0) if self.one_size else self.scales,
+            least_score=least,
+            any_polarity=self.any_polarity,
+            seconds=30.0,
         )
 
 
@@ -149,7 +154,9 @@ KINDS = (
     Kind(name="texture", texture=15.0),
     Kind(name="straight", straight=True),
     Kind(name="scale 0.8 to 1.25", scales=(0.8, 1.25)),
+    Kind(name="scale 0.5 to 0.7", scales=(0.5, 0.7)),
     Kind(name="scale 1.3 to 1.6", scales=(1.3, 1.6)),
+    Kind(name="another size", scales=(0.98, 1.02), one_size=True),
     Kind(name="tee", part="tee"),
     Kind(name="bolt", part="bolt"),
     Kind(name="square", part="square"),
@@ -259,7 +266,9 @@ def _over_bound(kind: Kind, model: PartModel, scene: Scene, found: LocatedPart) 
     fitted = [True, True, model.symmetry.fold != 0, kind.scales[1] > kind.scales[0]]
     x, y, angle, scale = truth(model, scene.part).tolist()
     cos, sin = scale * math.cos(angle), scale * math.sin(angle)
-    pixels = pixels_in(model.bands, np.array([[cos, -sin, x], [sin, cos, y]]), scene.light)
+    pixels = pixels_in(
+        model.bands_at(scale), np.array([[cos, -sin, x], [sin, cos, y]]), scene.light
+    )
     columns, rows = pixels.points.astype(int).T
     gain = kind.look.contrast * (2**kind.look.bits - 1) / 255
     drawing = (SIDE, SIDE), scene.part, kind.look.blur, kind.samples

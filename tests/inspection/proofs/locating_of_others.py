@@ -1,9 +1,16 @@
-"""OpenCV's ways of finding a part, in the scenes of :mod:`tests.inspection.proofs.locate`."""
+"""Others' ways of finding a part, in the scenes of :mod:`tests.inspection.proofs.locate`.
+
+OpenCV's are always there. ``linemod`` (of ``opencv-contrib-python-headless``), ``geofit`` and
+``corrmatch`` are judged where they can be imported: install them into a folder by ``pip install
+--target FOLDER --no-deps``, and name that folder first in ``PYTHONPATH``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
+import importlib.util
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -37,6 +44,19 @@ class Pose(NamedTuple):
     x: float
     y: float
     degrees: float
+
+
+MIN_SIMILARITY = 70.0
+"""Per cent of the gradients from which on ``linemod`` counts as a find."""
+
+PART_LEVEL = 90
+"""Grey level above which a pixel of the taught picture is of the part."""
+
+LINEMOD_PX = 80
+"""Pixels that divide the sides of a picture for ``linemod``."""
+
+MIN_SHAPE_SCORE = 0.55
+"""Score from which on ``geofit`` counts as a find, as the score of `locate`."""
 
 
 Way = Callable[["NDArray[np.uint8]"], "Pose | None"]
@@ -82,7 +102,11 @@ def _turned(degrees: float) -> NDArray[np.uint8]:
 
 def ecc(picture: NDArray[np.uint8]) -> Pose | None:
     """Refine what ``matchTemplate`` finds by ``findTransformECC``."""
-    start = match_template(picture)
+    return _refined(match_template(picture), picture)
+
+
+def _refined(start: Pose | None, picture: NDArray[np.uint8]) -> Pose | None:
+    """Return a pose as ``findTransformECC`` refines it; itself where that does not converge."""
     if start is None:
         return None
     angle = math.radians(start.degrees)
@@ -133,6 +157,63 @@ def hough(picture: NDArray[np.uint8]) -> Pose | None:
     return Pose(x, y, degrees)
 
 
+@functools.cache
+def _linemod() -> tuple[Any, dict[int, tuple[float, float]]]:
+    """Return the detector with a template for every 3 degrees, and the part's place in each."""
+    detector = importlib.import_module("cv2").linemod.getDefaultLINE()
+    middles = {}
+    for number in range(120):
+        turned = _turned(3.0 * number)
+        # it takes gradients along the mask's border alone
+        mask = np.where(turned > PART_LEVEL, np.uint8(255), np.uint8(0))
+        found, box = detector.addTemplate([cv2.merge([turned] * 3)], "part", mask)
+        if found >= 0:
+            middles[found] = (MIDDLE - box[0], MIDDLE - box[1])
+    return detector, middles
+
+
+def linemod(picture: NDArray[np.uint8]) -> Pose | None:
+    """Find the part by LINE, whose places are those of pixels, then by ``findTransformECC``."""
+    detector, middles = _linemod()
+    below, right = (-one % LINEMOD_PX for one in picture.shape)
+    wider = cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    matches, _ = detector.match([cv2.merge([wider] * 3)], MIN_SIMILARITY)
+    if not matches:
+        return None
+    best = max(matches, key=lambda one: one.similarity)
+    x, y = middles[best.template_id]
+    return _refined(Pose(best.x + x, best.y + y, 3.0 * best.template_id), picture)
+
+
+@functools.cache
+def _geofit() -> Any:
+    return importlib.import_module("geofit").ShapeModel.create(taught_picture()[30:171, 30:171])
+
+
+def geofit(picture: NDArray[np.uint8]) -> Pose | None:
+    """Find the part by geofit, with one thread."""
+    found = _geofit().find(picture, min_score=MIN_SHAPE_SCORE, num_threads=1)
+    return Pose(found[0].x, found[0].y, -found[0].angle) if found else None
+
+
+@functools.cache
+def _corrmatch() -> Any:
+    package = importlib.import_module("corrmatch")
+    template = package.Template(np.ascontiguousarray(taught_picture()[30:171, 30:171]))
+    compiled = template.compile(package.CompileConfig(max_levels=3, min_step_deg=0.5))
+    settings = package.MatchConfig(rotation="enabled", min_score=MIN_CORRELATION)
+    return compiled.matcher(settings)
+
+
+def corrmatch(picture: NDArray[np.uint8]) -> Pose | None:
+    """Find the part by corrmatch's correlation over angles."""
+    try:
+        found = _corrmatch().match_image(picture)
+    except RuntimeError:  # it found none
+        return None
+    return Pose(found.x + 70, found.y + 70, found.angle_deg)
+
+
 def smartcam(model: PartModel, search: Any, picture: NDArray[np.uint8]) -> Pose | None:
     """Find the part by `locate`."""
     found = judge.locate(Picture(picture), [model], search).parts
@@ -172,6 +253,10 @@ def compare(count: int, seed: int) -> list[str]:
         "the same, then findTransformECC": ecc,
         "OpenCV GeneralizedHoughGuil": hough,
     }
+    if hasattr(cv2, "linemod"):
+        ways["OpenCV linemod, then findTransformECC"] = linemod
+    packages: dict[str, Way] = {"geofit": geofit, "corrmatch": corrmatch}
+    ways |= {name: way for name, way in packages.items() if importlib.util.find_spec(name)}
     drawn = list(scenes(count, seed))
     return [_row(name, way, drawn) for name, way in ways.items()]
 

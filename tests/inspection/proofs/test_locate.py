@@ -21,6 +21,7 @@ SHORT = (
     "covered 15 %",
     "clutter",
     "scale 0.8 to 1.25",
+    "another size",
     "square",
 )
 

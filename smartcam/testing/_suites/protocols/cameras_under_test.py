@@ -4,19 +4,13 @@ A :class:`CameraKind` is one kind of camera; a :class:`LiveCamera` is the camera
 Neither knows anything of the checks. What a camera can do in its dialect is asked of the client:
 ``camera.capabilities``.
 
-On each camera stand the same applications, by their ids:
-
-* ``COUNTER`` and ``OTHER`` wait for a trigger and send the number of the run, from 0, at once;
-* ``SLOW`` does so after ``SLOW_TIME``;
-* ``ECHO`` sends the number that it was given as input data, where the camera takes any;
-* ``FREE`` runs free, some 200 times per second, and sends the number of the run, where the camera
-  sends unasked.
+On each camera stand the same applications: :class:`LiveCamera` has their ids.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import pytest
 
@@ -37,7 +31,24 @@ class LiveCamera:
 
     A subclass has ``url`` and what else can be done with the camera. A check that needs what a
     subclass leaves out is skipped, and says so.
+
+    Attributes:
+        COUNTER: id of the application that answers each trigger with the number of the run, from 0.
+        OTHER: id of a second application that answers as ``COUNTER`` does.
+        SLOW: id of the application that answers so after ``SLOW_TIME``.
+        ECHO: id of the application that sends the number that came as input data, where the camera
+            takes any.
+        FREE: id of the application that runs free, some 200 times per second, and sends the number
+            of the run, where the camera sends unasked.
+        SLOW_TIME: seconds that an inspection of ``SLOW`` takes.
     """
+
+    COUNTER: Final = COUNTER
+    OTHER: Final = OTHER
+    SLOW: Final = SLOW
+    ECHO: Final = ECHO
+    FREE: Final = FREE
+    SLOW_TIME: Final = SLOW_TIME
 
     @property
     def url(self) -> str:

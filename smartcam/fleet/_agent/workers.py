@@ -1,0 +1,76 @@
+"""Tasks that carry out one trigger after another.
+
+A new task takes its first step in the next turn of the event loop. A worker that waits takes it at
+once, so that the camera is triggered in the turn in which the call came.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from smartcam._client._inside import make_doorbell
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+MAX_IDLE_WORKERS = 16
+"""Largest number of workers that are kept for further work; others end with their work."""
+
+
+class Worker:
+    """A task that does one piece of work after another.
+
+    Args:
+        workers: the workers that it belongs to.
+
+    Attributes:
+        task: the task. It may be cancelled at its work, which ends it.
+    """
+
+    def __init__(self, workers: Workers) -> None:
+        loop = asyncio.get_running_loop()
+        self._workers = workers
+        self._bell = make_doorbell(loop)
+        self._work: Callable[[], Awaitable[None]] | None = None
+        self.task: asyncio.Task[None] = loop.create_task(self._run(), name="smartcam.fleet.worker")
+
+    def do(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Do one piece of work; begin at once if the worker waits and no other task runs."""
+        self._work = work
+        self._bell.ring()
+
+    async def _run(self) -> None:
+        while True:
+            work, self._work = self._work, None
+            if work is None:
+                await self._bell
+                continue
+            await work()
+            if not self._workers.keep(self):
+                return
+
+
+class Workers:
+    """The workers of an agent."""
+
+    def __init__(self) -> None:
+        self._idle: list[Worker] | None = []  # None: closed
+
+    def take(self) -> Worker:
+        """Return a worker that has nothing to do; give it work before the next turn of the loop."""
+        return self._idle.pop() if self._idle else Worker(self)
+
+    def keep(self, worker: Worker) -> bool:
+        """Keep a worker for further work; return False if it is not needed."""
+        if self._idle is None or len(self._idle) >= MAX_IDLE_WORKERS:
+            return False
+        self._idle.append(worker)
+        return True
+
+    def close(self) -> list[asyncio.Task[None]]:
+        """Cancel the workers that wait, and keep none any more; return their tasks. Idempotent."""
+        idle, self._idle = self._idle or (), None
+        for worker in idle:
+            worker.task.cancel()
+        return [worker.task for worker in idle]

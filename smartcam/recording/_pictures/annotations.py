@@ -1,0 +1,192 @@
+"""The marks of a picture as Foxglove's message ``foxglove.ImageAnnotations``.
+
+A viewer draws it over the picture. Fields from 100 on are ours, and part of the schema in the file:
+so the marks that are read are the marks that were written. Foxglove counts pixels from the upper
+left corner of the upper left pixel, smartcam from its centre.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+from smartcam.frames._inside import COLOURS, Drawing, Kind, Role, stroke_width
+from smartcam.recording._pictures.protobuf import (
+    TIMESTAMP,
+    Fields,
+    WireField,
+    file_set,
+    message,
+    timestamp,
+    values_of,
+)
+
+if TYPE_CHECKING:
+    from smartcam.frames import Frame
+
+MAX_DRAWINGS: Final = 1000
+"""Largest number of marks of a picture that are written, or read."""
+
+MAX_POINTS: Final = 10_000
+"""Largest number of points of a mark that is written, or read."""
+
+MAX_TEXT_CHARACTERS: Final = 120
+"""Largest number of characters of a text that is written."""
+
+_STAMP: Final = WireField(1, "message", TIMESTAMP)
+_POINT, _COLOUR = ".foxglove.Point2", ".foxglove.Color"
+
+_MESSAGES: Final[dict[str, Fields]] = {
+    "Point2": {"x": WireField(1, "double"), "y": WireField(2, "double")},
+    "Color": {
+        name: WireField(number, "double") for number, name in enumerate(("r", "g", "b", "a"), 1)
+    },
+    "CircleAnnotation": {  # never written; viewers look for it
+        "timestamp": _STAMP,
+        "position": WireField(2, "message", _POINT),
+        "diameter": WireField(3, "double"),
+        "thickness": WireField(4, "double"),
+        "fill_color": WireField(5, "message", _COLOUR),
+        "outline_color": WireField(6, "message", _COLOUR),
+    },
+    "PointsAnnotation": {
+        "timestamp": _STAMP,
+        "type": WireField(2, "enum", ".foxglove.PointsAnnotation.Type"),
+        "points": WireField(3, "message", _POINT, repeated=True),
+        "outline_color": WireField(4, "message", _COLOUR),
+        "outline_colors": WireField(5, "message", _COLOUR, repeated=True),
+        "fill_color": WireField(6, "message", _COLOUR),
+        "thickness": WireField(7, "double"),
+        "place": WireField(101, "uint64"),
+        "role": WireField(102, "string"),
+        "word": WireField(103, "string"),
+    },
+    "TextAnnotation": {
+        "timestamp": _STAMP,
+        "position": WireField(2, "message", _POINT),
+        "text": WireField(3, "string"),
+        "font_size": WireField(4, "double"),
+        "text_color": WireField(5, "message", _COLOUR),
+        "background_color": WireField(6, "message", _COLOUR),
+        "place": WireField(101, "uint64"),
+        "role": WireField(102, "string"),
+    },
+    "ImageAnnotations": {
+        "circles": WireField(1, "message", ".foxglove.CircleAnnotation", repeated=True),
+        "points": WireField(2, "message", ".foxglove.PointsAnnotation", repeated=True),
+        "texts": WireField(3, "message", ".foxglove.TextAnnotation", repeated=True),
+    },
+}
+"""Foxglove's messages and their fields. ``place`` counts the marks of a picture from 1 on, ``word``
+is the text beside the first point, which is a text without a place, too."""
+
+_TYPES: Final = ("UNKNOWN", "POINTS", "LINE_LOOP", "LINE_STRIP", "LINE_LIST")
+_KINDS: Final[dict[int, Kind]] = {1: "points", 2: "polygon", 3: "line"}
+_TYPE_OF: Final = {kind: number for number, kind in _KINDS.items()}
+
+
+@cache
+def schema_data(name: str) -> bytes:
+    """Return the schema of the message as MCAP has it: a FileDescriptorSet."""
+    return file_set(name, _MESSAGES, {"PointsAnnotation": {"Type": _TYPES}})
+
+
+def annotations_message(frame: Frame) -> bytes:
+    """Return the message of a frame's marks.
+
+    Marks behind the first thousand are left out, and those with a place that is not finite.
+    """
+    thick = stroke_width(frame.width, frame.height)
+    stamp = timestamp(frame.utc)
+    parts: dict[str, list[bytes]] = {"points": [], "texts": []}
+    for place, one in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
+        points = one.points[:MAX_POINTS]
+        if not points or not all(math.isfinite(x) and math.isfinite(y) for x, y in points):
+            continue
+        marked = {"timestamp": stamp, "place": place, "role": one.role}
+        text = one.text[:MAX_TEXT_CHARACTERS]
+        if one.kind != "text":
+            values = {
+                **marked,
+                "type": _TYPE_OF[one.kind],
+                "points": [_point(*point) for point in points],
+                "outline_color": _colour(one.role),
+                "thickness": thick * (3.0 if one.kind == "points" else 1.0),
+                "word": text,
+            }
+            parts["points"].append(message(_MESSAGES["PointsAnnotation"], values))
+            marked = {"timestamp": stamp}
+        if text:
+            values = {
+                **marked,
+                "position": _point(*points[0]),
+                "text": text,
+                "font_size": 14.0 * thick,
+                "text_color": _colour(one.role),
+                "background_color": _colour(None),
+            }
+            parts["texts"].append(message(_MESSAGES["TextAnnotation"], values))
+    return message(_MESSAGES["ImageAnnotations"], parts)
+
+
+def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
+    """Return the marks of a message.
+
+    Raises:
+        ValueError: the message is not valid.
+    """
+    lists = values_of(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
+    found: dict[int, Drawing] = {}
+    for one in lists.get("points", ()):
+        values = values_of(_MESSAGES["PointsAnnotation"], one, MAX_POINTS + 100)
+        kind = _KINDS.get(values.get("type", 0))
+        if kind is None:
+            raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
+        points = tuple(map(_place, values.get("points", ())))
+        found[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+    for one in lists.get("texts", ()):
+        values = values_of(_MESSAGES["TextAnnotation"], one, 100)
+        if "place" in values:  # others are the words of points
+            point = _place(values.get("position", memoryview(b"")))
+            found[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
+    return tuple(one for _, one in sorted(found.items()))
+
+
+def _point(x: float, y: float) -> bytes:
+    return message(_MESSAGES["Point2"], {"x": x + 0.5, "y": y + 0.5})
+
+
+def _place(data: memoryview) -> tuple[float, float]:
+    values = values_of(_MESSAGES["Point2"], data, 10)
+    return values.get("x", 0.0) - 0.5, values.get("y", 0.0) - 0.5
+
+
+def _colour(role: Role | None) -> bytes:
+    """Return the colour of a role; of none a dark one that lets the picture through."""
+    red, green, blue = (0, 0, 0) if role is None else COLOURS[role]
+    opacity = 0.5 if role is None else 1.0
+    values = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": opacity}
+    return message(_MESSAGES["Color"], values)
+
+
+def _number(values: dict[str, Any]) -> int:
+    number: int = values.get("place", 0)
+    if not 1 <= number <= MAX_DRAWINGS:
+        raise ValueError(f"place: {number} came, expected 1 to {MAX_DRAWINGS}")
+    return number
+
+
+def _role(values: dict[str, Any]) -> Role:
+    came = _text(values, "role")
+    role: Role | None = next((one for one in get_args(Role) if one == came), None)
+    if role is None:
+        raise ValueError(f"role: {came!r:.60} came, expected {', '.join(get_args(Role))}")
+    return role
+
+
+def _text(values: dict[str, Any], name: str) -> str:
+    data = values.get(name, memoryview(b""))
+    if len(data) > 4 * MAX_TEXT_CHARACTERS:
+        raise ValueError(f"{name}: {len(data)} bytes, expected {4 * MAX_TEXT_CHARACTERS} at most")
+    return str(data, "utf-8")

@@ -1,0 +1,231 @@
+"""Write and read messages of Protocol Buffers, and describe them for the schema of an MCAP file."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+"""Wire types."""
+
+TYPES: Final = {
+    "double": 1,
+    "uint64": 4,
+    "fixed32": 7,
+    "string": 9,
+    "message": 11,
+    "bytes": 12,
+    "enum": 14,
+}
+"""Numbers of the types of fields."""
+
+TIMESTAMP: Final = ".google.protobuf.Timestamp"
+"""Name of the message of a time."""
+
+
+class WireField(NamedTuple):
+    """A field of a message.
+
+    Attributes:
+        number: number of the field.
+        type: type of the field, one of :data:`TYPES`.
+        of: full name of the type of a message or an enumeration, with a dot in front.
+        repeated: whether the message may have several of the field.
+    """
+
+    number: int
+    type: str
+    of: str = ""
+    repeated: bool = False
+
+
+Fields = dict[str, WireField]
+"""The fields of a message, by their names."""
+
+
+# ---------------------------------------------------------------------- writing
+
+
+def message(fields: Fields, values: Mapping[str, Any]) -> bytes:
+    """Return a message; values that are None, 0 or "" are left out, as Protocol Buffers do."""
+    return b"".join(
+        encoded(fields[name], value)
+        for name, value in values.items()
+        if value is not None and value not in (0, "")
+    )
+
+
+def encoded(field: WireField, value: Any) -> bytes:
+    """Return a field with its value; of a repeated field with each of the values in a list."""
+    if field.repeated and isinstance(value, list):
+        return b"".join(encoded(field, one) for one in value)
+    if field.type == "double":
+        return tag(field.number, FIXED64) + struct.pack("<d", value)
+    if field.type == "fixed32":
+        return tag(field.number, FIXED32) + struct.pack("<I", value)
+    if field.type in ("uint64", "enum"):
+        return tag(field.number, VARINT) + varint(value)
+    data: bytes = value.encode("utf-8", "replace") if field.type == "string" else value
+    return sized(field.number, data)
+
+
+def timestamp(utc: float) -> bytes:
+    """Return a time, seconds since 1970, as google.protobuf.Timestamp."""
+    seconds, nanoseconds = divmod(max(0, round(utc * 1e9)), 1_000_000_000)
+    return tag(1, VARINT) + varint(seconds) + tag(2, VARINT) + varint(nanoseconds)
+
+
+def sized(number: int, data: bytes) -> bytes:
+    """Return a field that begins with the number of its bytes."""
+    return tag(number, BYTES) + varint(len(data)) + data
+
+
+def tag(number: int, wire_type: int) -> bytes:
+    """Return the start of a field."""
+    return varint(number << 3 | wire_type)
+
+
+def varint(value: int) -> bytes:
+    """Return a whole number in groups of seven bits."""
+    data = bytearray()
+    while value > 0x7F:
+        data.append(value & 0x7F | 0x80)
+        value >>= 7
+    data.append(value)
+    return bytes(data)
+
+
+# ---------------------------------------------------------------------- reading
+
+
+def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
+    """Return the values of a message's known fields; a repeated field has a list of them.
+
+    Args:
+        fields: the known fields; others are passed over.
+        data: bytes of the message.
+        most: largest number of fields that the message may have.
+
+    Raises:
+        ValueError: the message is not valid, has too many fields, or a field of another type.
+    """
+    known = {one.number: (name, one) for name, one in fields.items()}
+    found: dict[str, Any] = {}
+    for count, (number, wire_type, value) in enumerate(_pieces(data)):
+        if count >= most:
+            raise ValueError(f"a message of more than {most} fields")
+        name, field = known.get(number, ("", None))
+        if field is None:
+            continue
+        expected, read = _READERS[field.type]
+        if wire_type != expected:
+            raise ValueError(f"{name}: wire type {wire_type} came, expected {expected}")
+        if field.repeated:
+            found.setdefault(name, []).append(read(value))
+        else:
+            found[name] = read(value)
+    return found
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+_READERS: Final[dict[str, tuple[int, Callable[[Any], Any]]]] = {
+    "double": (FIXED64, lambda value: struct.unpack("<d", value)[0]),
+    "fixed32": (FIXED32, lambda value: struct.unpack("<I", value)[0]),
+    "uint64": (VARINT, _same),
+    "enum": (VARINT, _same),
+    "string": (BYTES, _same),
+    "bytes": (BYTES, _same),
+    "message": (BYTES, _same),
+}
+
+
+def _pieces(data: memoryview) -> Iterator[tuple[int, int, Any]]:
+    """Yield the number, wire type and value of each field."""
+    place = 0
+    while place < len(data):
+        start, place = _read_varint(data, place)
+        wire_type = start & 7
+        if wire_type == VARINT:
+            value, place = _read_varint(data, place)
+            yield start >> 3, wire_type, value
+            continue
+        if wire_type == BYTES:
+            size, place = _read_varint(data, place)
+        elif wire_type in (FIXED32, FIXED64):
+            size = 4 if wire_type == FIXED32 else 8
+        else:
+            raise ValueError(f"a field of wire type {wire_type}")
+        if size > len(data) - place:
+            raise ValueError(f"a field of {size} bytes in the last {len(data) - place}")
+        yield start >> 3, wire_type, data[place : place + size]
+        place += size
+
+
+def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
+    """Return the number that begins at a place, and the place after it."""
+    value = 0
+    for shift in range(0, 64, 7):
+        if place >= len(data):
+            raise ValueError("a number is cut off")
+        byte = data[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value & 0xFFFF_FFFF_FFFF_FFFF, place
+    raise ValueError("a number of more than 64 bits")
+
+
+# ---------------------------------------------------------------------- schemas
+
+
+def file_set(
+    name: str, messages: dict[str, Fields], enums: dict[str, dict[str, tuple[str, ...]]]
+) -> bytes:
+    """Return the schema of a message as MCAP has it: a FileDescriptorSet.
+
+    Args:
+        name: full name of the message, without a dot in front.
+        messages: the message, and all that it needs of its package, by their short names.
+        enums: enumerations that a message has within itself, and their names from 0 on.
+    """
+    package, _, short = name.partition(".")
+    times = sized(2, _descriptor("seconds", 1, 3)) + sized(2, _descriptor("nanos", 2, 5))
+    stamp_path = "google/protobuf/timestamp.proto"
+    stamp = _file(stamp_path, "google.protobuf", [sized(1, b"Timestamp") + times])
+    bodies = []
+    for called, fields in messages.items():
+        body = sized(1, called.encode())
+        for field, one in fields.items():
+            told = _descriptor(field, one.number, TYPES[one.type], one.of, repeated=one.repeated)
+            body += sized(2, told)
+        for enum, names in enums.get(called, {}).items():
+            members = (
+                sized(2, sized(1, member.encode()) + tag(2, VARINT) + varint(number))
+                for number, member in enumerate(names)
+            )
+            body += sized(4, sized(1, enum.encode()) + b"".join(members))
+        bodies.append(body)
+    main = _file(f"{package}/{short}.proto", package, bodies, stamp_path)
+    return sized(1, stamp) + sized(1, main)
+
+
+def _descriptor(
+    name: str, number: int, kind: int, of: str = "", *, repeated: bool = False
+) -> bytes:
+    """Return a FieldDescriptorProto."""
+    told = sized(1, name.encode()) + tag(3, VARINT) + varint(number)
+    told += tag(4, VARINT) + varint(3 if repeated else 1) + tag(5, VARINT) + varint(kind)
+    return told + (sized(6, of.encode()) if of else b"")
+
+
+def _file(path: str, package: str, messages: list[bytes], needs: str = "") -> bytes:
+    """Return a FileDescriptorProto."""
+    head = sized(1, path.encode()) + sized(2, package.encode())
+    needed = sized(3, needs.encode()) if needs else b""
+    return head + needed + b"".join(sized(4, one) for one in messages) + sized(12, b"proto3")
