@@ -1,4 +1,4 @@
-"""The rooms weigh no more than the table in ``docs/architecture/rooms.md`` allows, nor the pages."""
+"""Rooms keep within their lines in ``docs/architecture/rooms.md``, and pages within their words."""
 
 from __future__ import annotations
 

@@ -83,9 +83,7 @@ class FrameCaller:
             size = int(said["width"]), int(said["height"])
             return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(
-                f"{self.name}: the agent's format of frames is not valid: {exc!r}"
-            ) from exc
+            raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
     async def one(
         self,
@@ -215,9 +213,7 @@ class FrameCaller:
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
-            raise RemoteProtocolError(
-                f"{self.name}: the agent's reply is not valid: {exc!r}"
-            ) from exc
+            raise RemoteProtocolError(f"{self.name}: invalid reply of the agent: {exc!r}") from exc
         finally:
             incoming.forget()
         return {**answer, "skipped": skipped}, frames
@@ -255,9 +251,7 @@ class FrameCaller:
             try:
                 found = None if said is None else CameraModel.from_data(said)
             except CalibrationError as exc:
-                raise RemoteProtocolError(
-                    f"{self.name}: the agent's lens is not valid: {exc}"
-                ) from exc
+                raise RemoteProtocolError(f"{self.name}: invalid lens of the agent: {exc}") from exc
             self._lenses[key] = found
             if len(self._lenses) > MAX_LENSES:
                 del self._lenses[next(iter(self._lenses))]
