@@ -98,5 +98,5 @@ class RosbridgePublisher:
 
     def advertisement(self) -> dict[str, Any]:
         """Return the operation that advertises the topic to a bridge."""
-        told = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
-        return {**told, "latch": self.lane.latched}
+        operation = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
+        return {**operation, "latch": self.lane.latched}

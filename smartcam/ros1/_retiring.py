@@ -50,7 +50,7 @@ async def retire(url: str, services: Sequence[str]) -> None:
             for share in shares:
                 group.create_task(_retire(url, share))
     except TimeoutError:
-        logger.warning("%s: does not say that it has withdrawn its services", url)
+        logger.warning("%s: did not confirm that it has withdrawn services", url)
 
 
 async def _retire(url: str, services: Sequence[str]) -> None:
@@ -78,4 +78,4 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
             continue
         if isinstance(operation, dict) and operation.get("id") == asked["id"]:
             return
-    raise ConnectionError("it closed the link")
+    raise ConnectionError("the bridge closed the link")

@@ -320,7 +320,7 @@ class RosbridgeNode(NamedNode):
         except ENDS_PROGRAM:
             raise
         except BaseException:
-            logger.exception("%s ! who was to be told of the bridge", self.full_name)
+            logger.exception("%s ! on_change failed", self.full_name)
 
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"

@@ -83,7 +83,7 @@ class RosbridgeService:
     def advertise(self) -> None:
         """Advertise the service, unless it is closed."""
         if self._node.has(self):
-            self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
+            self._send({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True
 
     def end_turn(self) -> None:
@@ -164,7 +164,7 @@ class RosbridgeService:
             self._responded = asyncio.get_running_loop().time()
             self._node.say(parts)
 
-    def _say(self, operation: dict[str, Any]) -> None:
+    def _send(self, operation: dict[str, Any]) -> None:
         self._node.say(encoded({**operation, "service": self.name}))
 
 

@@ -45,13 +45,13 @@ class RosbridgeSubscription(TopicReader[object]):
 
     def ask(self) -> None:
         """Subscribe at the bridge."""
-        told = {"op": "subscribe", "topic": self.name, "type": ros1_name(self.type.name)}
-        self._node.say(encoded({**told, "id": self._id, "queue_length": self._depth}))
+        operation = {"op": "subscribe", "topic": self.name, "type": ros1_name(self.type.name)}
+        self._node.say(encoded({**operation, "id": self._id, "queue_length": self._depth}))
 
     def leave(self) -> None:
         """Unsubscribe at the bridge."""
-        told = {"op": "unsubscribe", "topic": self.name, "id": self._id}
-        self._node.say(encoded(told))
+        operation = {"op": "unsubscribe", "topic": self.name, "id": self._id}
+        self._node.say(encoded(operation))
 
     def take(self, said: object) -> None:
         """Handle a message from the bridge."""

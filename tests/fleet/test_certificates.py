@@ -1,4 +1,4 @@
-"""Files that ``smartcam fleet certificates`` makes, and the users whom a fleet file lets in."""
+"""Files of ``smartcam fleet certificates``, and access from a fleet file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An agent that was stopped knows that what comes may have waited, and does nothing too late."""
+"""An agent that was stopped: messages that may have waited are not carried out too late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node behind a rosbridge: what it says, and what it does when the bridge does not."""
+"""Nodes through a rosbridge: their operations, and a bridge that fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node through rclpy: what it says and hears, its bounds, and what dies beside it."""
+"""Nodes through rclpy: messages, bounds, and failures of rclpy."""
 
 from __future__ import annotations
 

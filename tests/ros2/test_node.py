@@ -1,4 +1,4 @@
-"""A node with another over TCP: topics, services, the graph, and what must not hang or stay."""
+"""Two nodes over TCP: topics, services, the graph, and the end of everything."""
 
 from __future__ import annotations
 

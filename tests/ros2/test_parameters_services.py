@@ -1,4 +1,4 @@
-"""Parameters of a node, as other nodes see them over TCP."""
+"""Parameters of a node, used by other nodes over TCP."""
 
 from __future__ import annotations
 

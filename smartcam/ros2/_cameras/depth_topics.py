@@ -20,7 +20,7 @@ from smartcam.ros2._cameras.cloud_messages import (
 )
 from smartcam.ros2._cameras.image_messages import array_fields, header_fields
 from smartcam.ros2._cameras.lens_messages import lens_fields
-from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
 from smartcam.ros2._cameras.transforms import StaticTransforms
 from smartcam.ros2._node.qos import DRIVER
 
@@ -154,7 +154,7 @@ class DepthTopics:
         loop = asyncio.get_running_loop()
         for name, publisher in heard.items():
             fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
-            await say_newest(publisher, fields)
+            await publish_newest(publisher, fields)
 
     def _fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
         header = header_fields(frame.utc, self.frame_id)

@@ -88,13 +88,13 @@ class CameraLifecycle(Lifecycle):
         event = self._node.publisher("~/transition_event", "lifecycle_msgs/msg/TransitionEvent")
         self._ends.append(event)
         self._event = event
-        self.listen(self._say)
+        self.listen(self._publish_transition)
         for name, (kind, handler) in self._services().items():
             self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
             await asyncio.sleep(0)  # a declaration takes the engine a while
 
     def _services(self) -> dict[str, tuple[str, Callable[[Any], Awaitable[Any]]]]:
-        def told(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
+        def answering(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
             async def answer(_request: object) -> dict[str, Any]:
                 return fields()
 
@@ -104,10 +104,10 @@ class CameraLifecycle(Lifecycle):
         ways = "GetAvailableTransitions"
         return {
             "change_state": ("ChangeState", self._on_change_state),
-            "get_state": ("GetState", told(lambda: {"current_state": self.state._asdict()})),
-            "get_available_states": ("GetAvailableStates", told(lambda: states)),
-            "get_available_transitions": (ways, told(lambda: _described(self.available))),
-            "get_transition_graph": (ways, told(lambda: _described(TRANSITIONS))),
+            "get_state": ("GetState", answering(lambda: {"current_state": self.state._asdict()})),
+            "get_available_states": ("GetAvailableStates", answering(lambda: states)),
+            "get_available_transitions": (ways, answering(lambda: _described(self.available))),
+            "get_transition_graph": (ways, answering(lambda: _described(TRANSITIONS))),
         }
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
@@ -119,7 +119,7 @@ class CameraLifecycle(Lifecycle):
             return {"success": False}
         return {"success": True}
 
-    def _say(self, transition: LifecycleTransition) -> None:
+    def _publish_transition(self, transition: LifecycleTransition) -> None:
         self._event.publish({"timestamp": time.time_ns(), **transition.fields})
 
     def _begins(self) -> None:
@@ -141,7 +141,7 @@ class CameraLifecycle(Lifecycle):
 
     async def _start_up(self) -> None:
         """Go to Active as soon as the camera is connected, without a time limit."""
-        told, delays = "", RETRY.delays()
+        logged, delays = "", RETRY.delays()
         while True:
             try:
                 await self._camera.wait_connected(PATIENCE_TIMEOUT)
@@ -156,9 +156,9 @@ class CameraLifecycle(Lifecycle):
                 return
             else:
                 return
-            level = logging.DEBUG if why == told else logging.WARNING
+            level = logging.DEBUG if why == logged else logging.WARNING
             logger.log(level, "%s ! it is not active yet: %s", self.name, why)
-            told = why
+            logged = why
             await asyncio.sleep(next(delays))
 
     async def close(self) -> None:

@@ -152,7 +152,7 @@ class HeardPictures(Generic[Item]):
             logger.warning("%s ! %s", self._name, text)
 
 
-async def say_newest(publisher: Any, fields: dict[str, Any]) -> None:
+async def publish_newest(publisher: Any, fields: dict[str, Any]) -> None:
     """Publish the newest message; a node of ROS 1 has its own queue for that."""
     newest = getattr(publisher, "publish_newest", None)
     if newest is None:

@@ -19,7 +19,7 @@ from smartcam.ros2._cameras.image_messages import (
 )
 from smartcam.ros2._cameras.lens import CameraLens
 from smartcam.ros2._cameras.picture_requests import PictureRequests, one_frame
-from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
 from smartcam.ros2._node.qos import DRIVER
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ class CameraPictures:
             ready = frame
             if frame.format.name not in ENCODINGS:
                 ready = await self._in_thread(lambda: prepared(frame))
-            await say_newest(self._image, image_fields(ready, self.frame_id))
+            await publish_newest(self._image, image_fields(ready, self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_small(self, frame: Frame) -> None:
@@ -195,7 +195,7 @@ class CameraPictures:
             small = await self._codecs.png(small)
         elif way.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        await say_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
+        await publish_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:

@@ -209,9 +209,11 @@ class CameraResults:
         self.taken += 1
         parts, make = localizations_in_metres(self._camera, result), self._messages
         if parts is not None:
-            self._say("localizations", lambda: make.poses(result, parts))
-            self._say("detections", lambda: make.detections(result, parts))
-        self._say_result(_Made(result.number, lambda: make.result(result, parts), len(result.raw)))
+            self._publish_to("localizations", lambda: make.poses(result, parts))
+            self._publish_to("detections", lambda: make.detections(result, parts))
+        self._publish_result(
+            _Made(result.number, lambda: make.result(result, parts), len(result.raw))
+        )
 
     def _take_failed(self, error: InterpretationError) -> None:
         if not self.active:
@@ -221,14 +223,14 @@ class CameraResults:
         level = logging.DEBUG if self.failed > 1 else logging.WARNING
         logger.log(level, "%s ! a result has no poses: %s", self._camera.name, error)
         message = self._messages.failed(error, datetime.now(UTC))
-        self._say_result(_Made(0, lambda: message, 0))
+        self._publish_result(_Made(0, lambda: message, 0))
 
-    def _say_result(self, made: _Made) -> None:
-        self._say("results", made.make)
+    def _publish_result(self, made: _Made) -> None:
+        self._publish_to("results", made.make)
         if self._outlet is not None:
             self._outlet.offer(made, self._put)
 
-    def _say(self, name: str, make: Any) -> None:
+    def _publish_to(self, name: str, make: Any) -> None:
         publisher = self._publishers.get(name)
         if publisher is not None:
             self._put(publisher, make)

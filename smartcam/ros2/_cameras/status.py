@@ -93,7 +93,7 @@ class CameraStatus:
         self._events = self._camera.events(max_queue=MAX_WAITING_EVENTS)
         if self._camera.connected:
             self._since = datetime.now(UTC)
-        self._guarded(self._say_if_new)
+        self._guarded(self._publish_if_new)
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(self._follow()), loop.create_task(self._repeat())]
 
@@ -143,9 +143,9 @@ class CameraStatus:
             async for event in self._events:
                 self._note(event)
                 await asyncio.sleep(self._due - loop.time())
-                self._guarded(self._say_if_new)
+                self._guarded(self._publish_if_new)
         await asyncio.sleep(self._due - loop.time())
-        self._guarded(self._say_if_new)
+        self._guarded(self._publish_if_new)
 
     def _note(self, event: object) -> None:
         if isinstance(event, (Connected, Reconnected)):
@@ -153,7 +153,7 @@ class CameraStatus:
         elif isinstance(event, Disconnected):
             self._since = None
 
-    def _say_if_new(self) -> None:
+    def _publish_if_new(self) -> None:
         fields = status_fields(KnownState.of(self._camera))
         if fields == self._said:
             return
@@ -173,7 +173,7 @@ class CameraStatus:
             if getattr(self._diagnostics, "heard", True):
                 self._guarded(self._diagnose)
             if loop.time() >= self._due:
-                self._guarded(self._say_if_new)  # the reason of a loss changes without an event
+                self._guarded(self._publish_if_new)  # the reason of a loss changes without an event
             missed = max(0.0, loop.time() - due)
             due += self.period * (1 + missed // self.period)
             with contextlib.suppress(TimeoutError):
@@ -204,8 +204,8 @@ class CameraStatus:
 
     def _hardware_id(self) -> str:
         options = self._options
-        told = options.settings.address if options.settings is not None else None
-        return options.hardware_id or hardware_id(told or place_of(self._camera))
+        address = options.settings.address if options.settings is not None else None
+        return options.hardware_id or hardware_id(address or place_of(self._camera))
 
     def _is_heard(self, counted: Statistics) -> bool:
         """Return True if the program that has the session is alive, or was."""

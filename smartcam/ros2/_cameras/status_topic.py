@@ -92,16 +92,16 @@ class CameraStatusTopic:
                 fields = status_fields(KnownState.of(self._camera))
                 if fields != said:
                     said = fields
-                    self._say(publisher, fields)
+                    self._publish(publisher, fields)
                     await asyncio.sleep(MIN_INTERVAL)
                 try:
                     await anext(events)
                 except (SmartCamError, StopAsyncIteration):
                     break  # nothing more will come, and the status says why
         if status_fields(KnownState.of(self._camera)) != said:
-            self._say(publisher, status_fields(KnownState.of(self._camera)))
+            self._publish(publisher, status_fields(KnownState.of(self._camera)))
 
-    def _say(self, publisher: Any, fields: dict[str, Any]) -> None:
+    def _publish(self, publisher: Any, fields: dict[str, Any]) -> None:
         header = self._messages.header(datetime.now(UTC), self._messages.frame_id)
         try:
             publisher.publish(publisher.type.new(header=header, **fields))

@@ -146,7 +146,7 @@ class StaticTransforms:
         """Publish the transforms, if there are any."""
         if self._publisher is None and self._transforms:
             self._publisher = self._node.publisher(TOPIC, TYPE, qos=LATCHED)
-            self._say()
+            self._publish()
 
     async def close(self) -> None:
         """Stop publishing. Idempotent."""
@@ -166,11 +166,11 @@ class StaticTransforms:
         """
         self._transforms = _checked(transforms)
         if self._publisher is not None:
-            self._say()
+            self._publish()
         else:
             self.start()
 
-    def _say(self) -> None:
+    def _publish(self) -> None:
         now = time.time()
         self._publisher.publish(transforms=[transform_fields(one, now) for one in self._transforms])
 

@@ -88,12 +88,12 @@ class NativeParameters(RosParameters):
     def _declare_in_ros(self, name: str) -> None:
         description = self.describe(name)
         kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
-        told = to_ros(kind, description.encode(), class_of(kind.name))
+        descriptor = to_ros(kind, description.encode(), class_of(kind.name))
         given = self._parameter(name)
         self._own.now = True
         try:
             made = self._ros.declare_parameter(
-                name, given.value, told, ignore_override=description.read_only
+                name, given.value, descriptor, ignore_override=description.read_only
             )
         except Exception as exc:
             del self._declared[name]

@@ -126,8 +126,8 @@ class ServiceCalls:
     def _refused(self, why: str) -> bytes | None:
         self.failed += 1
         answer = refusal(self._kind, f"{self._name}: {why}", self._node.types)
-        told = "was refused" if answer is not None else "had no reply"
-        logger.warning("%s ! a call %s: %s", self._name, told, why)
+        outcome = "was refused" if answer is not None else "had no reply"
+        logger.warning("%s ! a call %s: %s", self._name, outcome, why)
         return None if answer is None else self._kind.response.encode(answer)
 
     def close(self) -> None:

@@ -92,7 +92,7 @@ class NativePublisher:
         """
         self._check_open()
         if self._raw is not None:
-            self._node.outbox.put(lambda: self._say(data), len(data), self._drop)
+            self._node.outbox.put(lambda: self._pass_on(data), len(data), self._drop)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message, and return once the middleware has it; a thread encodes it.
@@ -112,7 +112,7 @@ class NativePublisher:
 
         def say() -> None:
             try:
-                self._say(self.type.encode(what))
+                self._pass_on(self.type.encode(what))
             except Exception as exc:  # noqa: BLE001 - passed to the waiting task
                 failed.append(exc)
             self._node.in_loop(done.set)
@@ -122,7 +122,7 @@ class NativePublisher:
         if failed:
             raise failed[0]
 
-    def _say(self, data: bytes) -> None:
+    def _pass_on(self, data: bytes) -> None:
         """Pass a message to rclpy, in the node's thread."""
         if self._node.has_sim_time:
             data = self._node.stamps.moved(self.type, data)

@@ -236,7 +236,7 @@ class RosContext:
         self._said_directly += 1
         return self._said_directly <= MAX_DIRECT
 
-    def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+    def send_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
         """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:

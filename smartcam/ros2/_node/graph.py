@@ -112,7 +112,7 @@ class RosGraph:
             except ENDS_PROGRAM:
                 raise
             except BaseException:
-                logger.exception("the graph: who heard of %s", entity.token)
+                logger.exception("the graph: a listener failed at %s", entity.token)
 
     # ------------------------------------------------------------------ questions
 

@@ -277,4 +277,6 @@ class Lifecycle:
             except ENDS_PROGRAM:
                 raise
             except BaseException:
-                logger.exception("%s ! who was told that it is %s", self.name, self.state.label)
+                logger.exception(
+                    "%s ! a listener failed at the state %s", self.name, self.state.label
+                )

@@ -214,7 +214,7 @@ class RosPublisher(RosEnd):
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
-        self._context.say_later(self, self._say_next, self._lane)
+        self._context.send_later(self, self._send_next, self._lane)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message, a long one except on links where another is being sent.
@@ -239,16 +239,16 @@ class RosPublisher(RosEnd):
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._say_newest(self.type.encode(what))
+                self._send_newest(self.type.encode(what))
             except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
                 done.set_exception(exc)
             else:
                 done.set_result(None)
 
-        self._context.say_later(self, say, self._lane)
+        self._context.send_later(self, say, self._lane)
         await asyncio.wrap_future(done)
 
-    def _say_newest(self, data: bytes) -> None:
+    def _send_newest(self, data: bytes) -> None:
         """Send a message; called in the thread for it.
 
         Long messages have their own publisher. The engine skips its message on each link that is
@@ -279,7 +279,7 @@ class RosPublisher(RosEnd):
         self._number += 1
         return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
-    def _say_next(self) -> None:
+    def _send_next(self) -> None:
         """Send the oldest waiting message; called in the thread for it."""
         with self._lock:
             if not self._waiting or self._closed:
@@ -312,7 +312,7 @@ class RosPublisher(RosEnd):
             self._waiting.clear()
             self._bytes = 0
         if self._context.waits(self):  # the thread undeclares it after a running send
-            self._context.say_later(self, self._take_back, self._lane)
+            self._context.send_later(self, self._take_back, self._lane)
         else:
             self._take_back()
 
