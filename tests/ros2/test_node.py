@@ -248,7 +248,7 @@ async def test_calls_beyond_the_bound_are_refused() -> None:
             for _ in range(MAX_CONCURRENT_CALLS + 5)
         ]
         done, _ = await asyncio.wait(tasks, return_when="FIRST_COMPLETED", timeout=PATIENCE)
-        assert "under way" in done.pop().result().message
+        assert "are running" in done.pop().result().message
         await until(lambda: served.calls == len(tasks))
         release.set()
         replies = await soon(asyncio.gather(*tasks))
