@@ -319,7 +319,7 @@ def test_promises_name_tests_that_are_there() -> None:
 
 def test_promises_have_every_wait_with_its_default() -> None:
     page = (DOCS / "promises.md").read_text(encoding="utf-8")
-    table = page.partition("\n(waits)=\n")[2].partition("\nWaiting for another task")[0]
+    table = page.partition("\n(waits)=\n")[2].partition("\nThe `timeout` includes")[0]
     waits = [row for row in rows(table[table.index("\n|") + 1 :]) if len(row) == 3]
     named: set[str] = set()
     calls = [(call, *row) for calls, *row in waits for call in re.findall(r"\w+\([\w=]*\)", calls)]

@@ -1,4 +1,4 @@
-"""The rooms weigh no more than the table in ``docs/architecture/rooms.md`` allows."""
+"""Rooms keep within their lines in ``docs/architecture/rooms.md``, and pages within their words."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 PAGE = ROOT / "docs" / "architecture" / "rooms.md"
+MAX_WORDS = 100_000
+"""Largest number of words of all pages together."""
 BESIDE = "beside the rooms"
 """The table's name for the modules directly in smartcam."""
 
@@ -46,3 +48,8 @@ def test_each_room_is_in_the_table_once() -> None:
     named = [name for rooms in budgets() for name in rooms.split(", ")]
     there = {one.name for one in (ROOT / "smartcam").iterdir() if any(one.glob("*.py"))}
     assert sorted(named) == sorted([*there, BESIDE, "tests"])
+
+
+def test_pages_keep_within_their_words() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= MAX_WORDS

@@ -1,4 +1,4 @@
-"""Names that other packages of smartcam import from this one; users do not need them."""
+"""Names for other packages of smartcam; users do not need them."""
 
 from __future__ import annotations
 

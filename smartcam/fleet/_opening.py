@@ -1,4 +1,4 @@
-"""Make a fleet, an agent or a camera from a fleet's address or file."""
+"""Create a fleet, an agent or a camera from a fleet's address or file."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def serve(file: str | Path | FleetFile) -> FleetServer:
         file: path of a fleet file, or its contents.
 
     Raises:
-        ConfigurationError: the file is wrong; the text says where.
+        ConfigurationError: the file is wrong; the text names the place.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
     return FleetServer(file)
@@ -74,7 +74,7 @@ def open(
             ``request_timeout``, ``reconnect``, as for :func:`smartcam.connect`.
 
     Raises:
-        ConfigurationError: the URL, the file or an option cannot work.
+        ConfigurationError: the URL, the file or an option is wrong.
         MissingExtraError: a URL was given, and the extra ``fleet`` is not installed.
     """
     for name in options:
@@ -102,7 +102,7 @@ def open(
 SESSIONS_OWN = frozenset(
     {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
 )
-"""Options of the session with the camera, which belong into the agent's file."""
+"""Options of the session with the camera, which are set in the agent's file."""
 
 
 def fleet_camera(
@@ -111,7 +111,7 @@ def fleet_camera(
     """Return a camera by its fleet URL.
 
     Raises:
-        ConfigurationError: the URL or an option cannot work.
+        ConfigurationError: the URL or an option is wrong.
         UnsupportedError: an option concerns the session, which belongs to the agent.
         MissingExtraError: the extra ``fleet`` is not installed.
     """

@@ -1,4 +1,4 @@
-"""Run an agent's outlets, which deliver its sessions' results as the fleet file says."""
+"""Run an agent's outlets, which deliver its sessions' results."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ if TYPE_CHECKING:
     from smartcam.outlets import Outlets
 
 COMMAND_CONNECT_TIMEOUT = 5.0
-"""Seconds until a camera is reached for an outlet's command."""
+"""Seconds of the timeout for connecting to a camera for an outlet's command."""
 
 
 class FleetOutlets(Server):
-    """The outlets of an agent, as ``outlets:`` in a fleet file says.
+    """The outlets of an agent, from ``outlets:`` in a fleet file.
 
-    It is started before the server, and stopped after it. A slow receiver never holds up the agent.
+    Start it before the server, and stop it after the server. A slow receiver never delays the
+    agent.
 
     Args:
         server: server of the cameras; not started yet.
-        tell: function that is called with an outlet's name and its trouble, and with "" once that
-            is over.
+        tell: function that is called with an outlet's name and its trouble, and with "" at the end
+            of the trouble.
 
     Attributes:
         outlets: the outlets.
@@ -78,7 +79,7 @@ class FleetOutlets(Server):
         Raises:
             ConfigurationError: a spool cannot be opened, or the server was started.
 
-        Cancellation: leaves it stopped.
+        Cancellation: the outlets are stopped.
         """
         if self._server.hosts:
             raise ConfigurationError("outlets: start them before the server")
@@ -124,7 +125,7 @@ class FleetOutlets(Server):
             spec: Any = "raw" if entry.interpret_as is None else entry.interpret_as
             if host is not None:
                 spec = host.settings.interpret_as
-            elif seeing:  # what waits from before may be asked for first
+            elif seeing:  # waiting entries of an earlier run may be requested first
                 made = software_camera(camera, entry.software or {}, self._server.folder)
                 spec = {number: one.interpret_as for number, one in made.programs.items()}
             read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
@@ -152,7 +153,7 @@ class FleetOutlets(Server):
         return self._columns_of(None if read is None else read.interpreter(application))
 
     async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a command as any program of the fleet does it."""
+        """Carry out a command like any program of the fleet."""
         if name not in self._server.hosts:
             raise ConfigurationError(f"there is no camera {name!r:.120} here")
         async with self._opening:
@@ -173,7 +174,7 @@ class _OutletObserver(Observer):
         self._states: dict[str, dict[str, Any]] = {}
 
     def on_state(self, event: CameraEvent) -> None:
-        """Pass on that a camera connects or is lost, and its application."""
+        """Pass on connections, losses and applications of a camera."""
         name = event.camera
         state = self._states.setdefault(
             name, {"connected": False, "application": None, "reason": None}
@@ -191,7 +192,7 @@ class _OutletObserver(Observer):
         self._owner.outlets.state_changed(name, {**state, "at": event.at})
 
     def on_results(self, results: Sequence[Result]) -> None:
-        """Hand on results that came together."""
+        """Pass on results that came together."""
         camera = results[0].camera
         read, endian = self._owner.reading(camera), self._owner.endian(camera)
         for result in results:

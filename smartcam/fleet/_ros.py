@@ -70,21 +70,21 @@ class _Cameras(Fleet):
 
 
 class RosFleet(Server):
-    """A node for each camera of a fleet, as they come and go.
+    """Nodes for the cameras of a fleet, while these are shared.
 
     Args:
         bus: open end of the fleet's bus; its session carries ROS, too.
-        fleet: the fleet's name; None for the only one that is there.
+        fleet: the fleet's name; None for the only one on the bus.
         address: address of the fleet.
         section: settings of all cameras' nodes.
         cameras: settings of single cameras' nodes, by name.
-        settings: settings that the agent gives the cameras' sessions, by name, where known.
+        settings: the agent's settings of the cameras' sessions, by name, if known.
         frames: sources of the cameras' frames, by name, as parameters of v4l2_camera.
-        calibrations: calibrations of cameras whose results are turned into the robot's frame, by
+        calibrations: calibrations that convert results of cameras to the robot's frame, by
             name.
         controls: functions that return the open source of a camera's frames, whose device has
             controls, by name.
-        places: hand-eye calibrations, which say where cameras are, by name.
+        places: hand-eye calibrations, the cameras' places, by name.
         wanted: function that returns whether a camera of an agent gets a node.
         desks: calibrations that are also on the agent's bus; None if there is no folder for them.
 
@@ -136,7 +136,7 @@ class RosFleet(Server):
         self._task = asyncio.get_running_loop().create_task(self._follow(events))
 
     async def _follow(self, events: Any) -> None:
-        """Create a node for each new camera; that of a lost camera stays, and reports this."""
+        """Create a node for each new camera; the node of a lost camera stays, and reports that."""
         async for event in events:
             if isinstance(event, CameraJoined) and self._wanted(event.agent, event.camera):
                 await self._show(event.camera)
@@ -167,7 +167,7 @@ class RosFleet(Server):
         """Wait briefly for the agent's answer, which says whether the camera has frames."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(MEET_TIMEOUT):
-                while not camera.met:  # noqa: ASYNC110 - nothing tells of it
+                while not camera.met:  # noqa: ASYNC110 - there is no event for it
                     await asyncio.sleep(0.01)
 
     def _node(self, name: str) -> Node | NativeNode:

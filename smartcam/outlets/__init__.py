@@ -1,8 +1,8 @@
-"""Ways of results out of a cell: brokers, databases, PLCs; nothing is lost while they are away.
+"""Delivery of results to brokers, databases and PLCs, without loss while these cannot be reached.
 
-:class:`Outlets` runs what a section ``outlets:`` says. Each one has a spool on the disk, and an
-account that balances. :class:`Outlet` is the base of a new kind: a class in the entry-point group
-``smartcam.outlets``. The commands are ``smartcam serve``, ``smartcam outlet`` and
+:class:`Outlets` runs the outlets of a section ``outlets:``. Each one has a spool on the disk, and
+an account that balances. :class:`Outlet` is the base of a new kind: a class in the entry-point
+group ``smartcam.outlets``. The commands are ``smartcam serve``, ``smartcam outlet`` and
 ``smartcam results``.
 """
 

@@ -1,4 +1,4 @@
-"""Commands that come through outlets, done by a camera."""
+"""Commands to a camera that come through outlets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
 
 MAX_TIMEOUT = 300.0
-"""Seconds that a command may be given."""
+"""Seconds of the longest timeout of a command."""
 
 _FIELDS = {
     "trigger": ("timeout",),
@@ -26,12 +26,12 @@ _TIMEOUTS = {"trigger": 5.0, "switch": 10.0, "start": 10.0, "stop": 10.0}
 
 
 async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Do a command and return what is answered.
+    """Carry out a command and return the fields of the answer.
 
     Args:
         camera: camera that is open.
         verb: ``trigger``, ``switch``, ``start`` or ``stop``.
-        given: ``timeout`` in seconds; for a switch ``application``.
+        given: fields of the command: ``timeout`` in seconds; for a switch ``application``.
 
     Raises:
         ConfigurationError: a field is wrong or unknown.

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 class _Database(sqlite3.Connection):
-    """A connection all of whose errors are of SQLite's kind.
+    """A connection whose errors are all of the class ``sqlite3.Error``.
 
-    SQLite names the table that is damaged. Python's module decodes the name, and raises
-    UnicodeDecodeError where the name itself is damaged.
+    SQLite's errors name the damaged table. Python's module decodes the name, and raises
+    UnicodeDecodeError if the name itself is damaged.
     """
 
     def execute(self, sql: str, parameters: Any = (), /) -> sqlite3.Cursor:
@@ -46,7 +46,7 @@ def open_database(path: Path, *, timeout: float) -> sqlite3.Connection:
     Each statement outside of a transaction takes effect at once.
 
     Args:
-        path: file of the database; it is made if it does not exist.
+        path: file of the database; created if it does not exist.
         timeout: seconds that a statement waits for another process.
 
     Raises:
@@ -61,7 +61,7 @@ def open_for_reading(path: Path, *, timeout: float) -> sqlite3.Connection:
     """Return a connection for reading a database that another process may be writing.
 
     Args:
-        path: file of the database, which has to be there.
+        path: file of the database, which has to exist.
         timeout: seconds that a statement waits for another process.
 
     Raises:

@@ -1,4 +1,4 @@
-"""One thing that an outlet delivers: a result, an error, or a gap."""
+"""Entries that an outlet delivers: results, errors and gaps; and their account."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ Kind: TypeAlias = Literal["result", "error", "gap"]
 
 
 class OutletEntry(NamedTuple):
-    """One thing that an outlet delivers, as it stands in the spool.
+    """A result, an error or a gap, as it is stored in the spool.
 
     Attributes:
         camera: name of the camera.
-        epoch: number of the start of whoever numbers; grows with each start, also where the clock
-            was set back.
-        number: number of the entry within its epoch and camera, from 1, results and errors alike.
-            A gap has the number of the last entry that it stands for.
+        epoch: number of the outlet's start; grows with each start, also if the clock was set back.
+        number: number of the entry within its epoch and camera, from 1, for results and errors
+            together. A gap has the number of the last entry that it replaces.
         kind: ``result``, ``error``, or ``gap`` for entries that are lost.
         application: application of a result; None for errors and gaps.
         at: time of arrival, seconds since 1970, UTC.
@@ -40,16 +39,16 @@ class OutletEntry(NamedTuple):
 class OutletAccount(NamedTuple):
     """The account of an outlet: ``results == delivered + spooled + dropped``, always.
 
-    Errors count as results do; gaps do not.
+    Errors count as results; gaps do not count.
 
     Attributes:
         results: results and errors that came.
-        delivered: results and errors that the far end took.
-        spooled: results and errors that wait, on the disk or for it.
-        dropped: results and errors that were given up, by the reason: ``full`` for the policy of a
-            full spool,
-            ``memory`` where the disk was away or too slow, ``refused`` where the far end never
-            takes it, ``damaged`` where a spool could not be read any more.
+        delivered: results and errors that the far end accepted.
+        spooled: results and errors that wait, on the disk or for the disk.
+        dropped: results and errors that were dropped, by reason: ``full`` by the policy of a full
+            spool,
+            ``memory`` while the disk was unavailable or too slow, ``refused`` by the far end,
+            ``damaged`` in a damaged spool.
     """
 
     results: int = 0

@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_HEADER_BYTES = 12
-"""Bytes of a packet beside topic and text: its kind, three lengths, number and properties."""
+"""Bytes of a packet besides topic and text: its kind, three lengths, number and properties."""
 
 MAX_COMMANDS = 1_000
 """Largest number of commands under way at a time, such as a trigger of each camera; more are
-answered with an error. As many wait before it is known that they are too many."""
+answered with an error. The same number may wait before they are counted."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of the messages that wait so; what comes beyond is not answered."""
+"""Largest number of bytes of the commands that wait; further ones are not answered."""
 
 MAX_COMMAND_BYTES = 1 << 16
 """Largest number of bytes of a command's message."""
@@ -84,27 +84,27 @@ class MqttSettings(OutletSettings):
     )
     user: str | None = Field(None, description="name to log in with")
     password: Secret | None = Field(
-        None, description="where the password is: {file: PATH} or {variable: NAME}"
+        None, description="source of the password: {file: PATH} or {variable: NAME}"
     )
     ca: str | None = Field(
-        None, min_length=1, description="file of the authority that signs brokers, beside this file"
+        None, min_length=1, description="file of the broker's authority, relative to this file"
     )
     topic: Annotated[str, AfterValidator(_prefix)] = Field(
-        "smartcam", min_length=1, max_length=200, description="what every topic begins with"
+        "smartcam", min_length=1, max_length=200, description="first part of every topic"
     )
     client_id: str | None = Field(
-        None, min_length=1, max_length=100, description="default: smartcam-NAME, of the outlet"
+        None, min_length=1, max_length=100, description="client id; default: smartcam-NAME"
     )
     commands: bool = Field(
         False,
-        description="whoever may publish to TOPIC/command/# may trigger cameras and switch "
-        "applications; see to it that the broker says who that is",
+        description="whether clients that may publish to TOPIC/command/# may trigger cameras and "
+        "switch applications; limit these clients in the broker",
     )
     largest: int = Field(
         10_000_000,
         ge=1000,
         le=268_000_000,
-        description="bytes of a message with its topic; larger are refused",
+        description="largest number of bytes of a message with its topic",
     )
 
 
@@ -128,7 +128,7 @@ class _CommandQueue(asyncio.Queue[Any]):
 
 
 class _ShakenSocket(ssl.SSLSocket):
-    """A socket that is closed where its handshake fails; paho leaves it open."""
+    """A socket that closes itself if its handshake fails; paho would leave it open."""
 
     def do_handshake(self, block: bool = False) -> None:
         """Do the handshake."""
@@ -140,7 +140,7 @@ class _ShakenSocket(ssl.SSLSocket):
 
 
 class MqttOutlet(Outlet[MqttSettings]):
-    """Publishes entries with QoS 1, states retained, and does commands."""
+    """Publishes entries with QoS 1 and retained states, and carries out commands."""
 
     settings_class = MqttSettings
     max_batch: ClassVar[int] = 100
@@ -158,12 +158,12 @@ class MqttOutlet(Outlet[MqttSettings]):
         self._commands: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
-        """Come to the broker.
+        """Connect to the broker.
 
         Raises:
             ConfigurationError: a secret or the authority's file does not exist.
             MissingExtraError: aiomqtt is not installed.
-            Exception: the broker is away, or refuses.
+            Exception: the broker cannot be reached, or refuses.
         """
         aiomqtt = load("aiomqtt")
         settings, online = self.settings, f"{self.settings.topic}/outlet/{self.name}"
@@ -179,7 +179,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             will=aiomqtt.Will(online, '{"online":false}', qos=1, retain=True),
             timeout=settings.timeout,
             keepalive=10,
-            clean_start=True,  # a command from before would be done too late
+            clean_start=True,  # a command from before the session would be carried out too late
             queue_type=_CommandQueue,
             max_queued_incoming_messages=MAX_COMMANDS,
             tls_context=self._tls() if parts.scheme == "mqtts" else None,
@@ -208,10 +208,10 @@ class MqttOutlet(Outlet[MqttSettings]):
         return made
 
     def _watch_refusals(self, client: Any) -> None:
-        """Learn which messages the broker does not take: aiomqtt does not tell."""
+        """Note which messages the broker refuses, which aiomqtt does not report."""
         inner = client._client  # noqa: SLF001
         send, told, came = inner.publish, inner.on_publish, inner.on_connect
-        topics: dict[int, str] = {}  # of messages that are not acknowledged yet
+        topics: dict[int, str] = {}  # topics of messages that are not acknowledged yet
 
         def publish(topic: str, *given: Any, **named: Any) -> Any:
             sent = send(topic, *given, **named)
@@ -223,7 +223,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             if reason is not None and reason.is_failure:
                 if topic.removeprefix(f"{self.settings.topic}/").startswith(_ENTRIES):
                     self._refusal = str(reason)
-                else:  # a state, or an answer to who has asked for it there
+                else:  # a state, or an answer to a command
                     logger.warning(
                         "outlet %s: the broker refused a message to %.120s: %s",
                         *(self.name, topic, reason),
@@ -239,11 +239,11 @@ class MqttOutlet(Outlet[MqttSettings]):
         inner.publish, inner.on_publish, inner.on_connect = publish, on_publish, on_connect
 
     def _topic(self, kind: str, camera: str) -> str:
-        """Return the topic of a camera; what no topic may have in its name is _ there."""
+        """Return the topic of a camera, with _ for characters that topics may not have."""
         return f"{self.settings.topic}/{kind}/{camera.translate(_NO_TOPIC)}"
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Publish entries to TOPIC/KIND/CAMERA; the broker has acknowledged each one then."""
+        """Publish entries to TOPIC/KIND/CAMERA; return when the broker has acknowledged all."""
         messages = [_message(entry) for entry in entries]
         topics = [self._topic(one.kind, one.camera or "all") for one in entries]
         sizes = [
@@ -265,7 +265,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             raise EntryRefusedError(text, place=bad)
 
     async def _while_here(self, calls: list[Any]) -> None:
-        """Have messages published side by side, in order, as long as the broker is there."""
+        """Publish messages concurrently, in order, while the broker is connected."""
         hearing = self._hearing
         if hearing is None:
             for call in calls:
@@ -286,19 +286,19 @@ class MqttOutlet(Outlet[MqttSettings]):
             raise OutletError(f"the broker refused a message: {self._refusal}")
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Have the camera's state published, retained, soon."""
+        """Schedule the camera's state to be published, retained."""
         if camera in self._states or len(self._states) < MAX_STATES:
             self._states[camera] = state
             self._fresh.add(camera)
             self._changed.set()
 
     async def watch(self) -> None:
-        """Wait until the broker is gone."""
+        """Wait until the connection to the broker is lost."""
         if self._hearing is not None:
             await asyncio.shield(self._hearing)
 
     async def close(self) -> None:
-        """Leave the broker."""
+        """Disconnect from the broker."""
         tasks = [*self._commands, *([self._hearing] if self._hearing is not None else [])]
         self._hearing = None
         for task in tasks:
@@ -316,7 +316,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     # ------------------------------------------------------------------ states and commands
 
     async def _hear(self, client: Any) -> None:
-        """Publish states and take commands until the broker is gone."""
+        """Publish states and receive commands until the broker's connection is lost."""
         loop = asyncio.get_running_loop()
         telling = loop.create_task(self._tell_states(client))
         hearing = loop.create_task(self._take_commands(client))
@@ -348,7 +348,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def _take_commands(self, client: Any) -> None:
         async for message in client.messages:
             if message.retain:
-                continue  # it would be done again with each session
+                continue  # a retained command would be carried out again in each session
             task = asyncio.get_running_loop().create_task(self._command(client, message))
             self._commands.add(task)
             task.add_done_callback(self._commands.discard)
@@ -369,7 +369,7 @@ class MqttOutlet(Outlet[MqttSettings]):
                 load("paho.mqtt.packettypes").PacketTypes.PUBLISH
             )
             properties.CorrelationData = correlation
-        with contextlib.suppress(load("aiomqtt").MqttError):  # who asked sees that none came
+        with contextlib.suppress(load("aiomqtt").MqttError):  # the client gets no answer then
             await client.publish(topic, object_text(reply), qos=1, properties=properties)
 
     async def _do(self, verb: str, camera: str, payload: object) -> dict[str, Any]:
@@ -389,7 +389,7 @@ class MqttOutlet(Outlet[MqttSettings]):
 
 
 def _message(entry: OutletEntry) -> bytes:
-    """Return an entry's JSON with its id in front."""
+    """Return an entry's JSON, with its id as the first field."""
     head = (
         {"id": entry.id, "camera": entry.camera}
         if '"camera":' not in entry.body

@@ -18,16 +18,16 @@ SettingsT = TypeVar("SettingsT", bound="OutletSettings")
 
 
 class OutletDesk:
-    """The things that an outlet may ask of the process that has the cameras.
+    """Functions of the process that has the cameras, which an outlet may call.
 
     Args:
         columns: function that returns names, types and units of the values of a camera's
             application, by its layout; empty if they are not known.
-        command: does a command and returns what is answered; None if commands are not allowed.
+        command: function that carries out a command and returns the answer; None if commands are
+            not allowed.
         cameras: function that returns the names of the cameras, and whether each is emulated; None
             if that is not known.
-        names: function that returns the names that a camera's applications have, with their
-            numbers.
+        names: function that returns the names of a camera's applications, with their numbers.
     """
 
     def __init__(
@@ -48,22 +48,22 @@ Column = tuple[str, str, str]
 
 
 class Outlet(ABC, Generic[SettingsT]):
-    """A way of results out of a cell; derive from it, and name the class in an entry point.
+    """The base class of outlets; derive from it, and name the class in an entry point.
 
-    An outlet only delivers. What waits, what is counted and what is tried again is the work of the
-    code that calls it: :meth:`open` first, then :meth:`deliver` for one batch after the other, in
-    order. An exception of any of them means that the far end is away: :meth:`close` follows, and
-    after a delay :meth:`open` again, with the same batch.
+    An outlet only delivers. Its caller queues, counts and repeats: it calls :meth:`open` first,
+    then :meth:`deliver` for one batch after the other, in order. If one of them raises an
+    exception, the far end cannot be reached: the caller calls :meth:`close`, and after a delay
+    :meth:`open` again, then :meth:`deliver` with the same batch.
 
     Args:
         name: name of the outlet.
         settings: settings of the outlet.
         folder: folder of relative paths.
-        desk: what it may ask of the process that has the cameras.
+        desk: functions of the process that has the cameras.
 
     Attributes:
         settings_class: model of the settings, a class of ``OutletSettings``.
-        max_batch: entries of one batch at most.
+        max_batch: largest number of entries of one batch.
     """
 
     settings_class: ClassVar[type[Any]]
@@ -76,29 +76,29 @@ class Outlet(ABC, Generic[SettingsT]):
         self.desk = desk
 
     async def open(self) -> None:
-        """Come to the far end."""
+        """Connect to the far end."""
 
     @abstractmethod
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Return when the far end has all of these entries for good.
+        """Deliver entries, and return when the far end has stored all of them.
 
-        A batch may come again, where nobody knows whether it arrived: hand on each entry's ``id``.
+        If it is unknown whether a batch arrived, it comes again: send each entry's ``id``.
 
         Raises:
-            EntryRefusedError: the far end will never take one of them.
-            Exception: the far end is away; the batch comes again.
+            EntryRefusedError: the far end will never accept one of them.
+            Exception: the far end cannot be reached; the batch comes again.
         """
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
+        """Handle a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
-        """Return the results at the far end; None if it cannot be asked. In a thread."""
+        """Return the results at the far end; None if it has no query. Called in a thread."""
         return None
 
     async def watch(self) -> None:
-        """Wait while nothing is to be delivered; raise when the far end is gone."""
+        """Wait while there is nothing to deliver; raise when the far end is lost."""
         await asyncio.Event().wait()
 
     async def close(self) -> None:
-        """Leave the far end; called after each :meth:`open`, also after one that failed."""
+        """Disconnect from the far end; called after each :meth:`open`, also after a failed one."""

@@ -1,4 +1,4 @@
-"""All outlets of a process: they are offered what cameras bring."""
+"""All outlets of a process, which get the results, errors and states of cameras."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from smartcam.outlets._stored import StoredResults
 
 MAX_TURN_SECONDS = 0.0005
-"""Seconds for which a thread of Python may keep another one waiting while outlets run. Usually it
-is 5 ms, and a trigger would wait so long where its result comes while a spool is written."""
+"""Seconds of the interpreter's switch interval while outlets run. With the usual 5 ms a trigger
+would wait that long if its result comes while a spool is written."""
 
 RESULT_BYTES = 600
-"""Bytes that a result keeps in memory beside its container, about."""
+"""Bytes that a result takes in memory besides its container, about."""
 
 
 class OutletState(NamedTuple):
     """The state of one outlet.
 
     Attributes:
-        account: account of all that came.
-        trouble: reason for which nothing is delivered, or spooled, at the time; "" for none.
+        account: account of the outlet.
+        trouble: reason why entries are not delivered, or not spooled, now; "" without one.
     """
 
     account: OutletAccount
@@ -58,13 +58,12 @@ class Outlets(Server):
         folder: folder of relative paths: of spools, secrets, stores.
         columns: function that returns names, types and units of an application's values, by its
             layout.
-        command: does a command for an outlet that takes them.
+        command: function that carries out a command from an outlet.
         tell: function that is called with an outlet's name and its trouble, and with "" when that
             is over.
-        cameras: function that returns the cameras' names, and whether each is emulated; None: not
-            known.
-        names: function that returns the names that a camera's applications have, with their
-            numbers.
+        cameras: function that returns the cameras' names, and whether each is emulated; None if
+            that is not known.
+        names: function that returns the names of a camera's applications, with their numbers.
 
     Raises:
         ConfigurationError: the section is wrong.
@@ -109,7 +108,7 @@ class Outlets(Server):
         self._started: list[Pump] = []
 
     async def start(self) -> None:
-        """Open the spools, and begin to deliver; a far end that is away is no error.
+        """Open the spools, and begin to deliver; a far end that cannot be reached is no error.
 
         Raises:
             ConfigurationError: a spool cannot be opened, or another process has it.
@@ -133,7 +132,7 @@ class Outlets(Server):
             raise
 
     async def stop(self) -> None:
-        """End; what is not delivered stays in the spools. Harmless when called twice."""
+        """Stop; undelivered entries stay in the spools. A second call does nothing."""
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
@@ -148,7 +147,7 @@ class Outlets(Server):
         }
 
     def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
-        """Return the results at far ends that can be asked, by the outlet's name; blocks.
+        """Return the results at far ends with a query, by the outlet's name; blocks.
 
         Raises:
             ConfigurationError: one of the stores cannot be read now.
@@ -162,17 +161,17 @@ class Outlets(Server):
     def offer_result(
         self, result: Result[Any], read: Callable[[], tuple[Any, int | None]] | None = None
     ) -> None:
-        """Hand a result to the outlets; returns at once.
+        """Pass a result to the outlets; return at once.
 
         Args:
             result: the result.
-            read: function that returns value and sequence number; called in a thread. None: as they
-                are.
+            read: function that returns value and sequence number; called in a thread. None: those
+                of the result.
         """
         made: list[tuple[Any, int | None, str]] = []
 
         def make() -> tuple[Any, int | None, str]:
-            if not made:  # one outlet makes it for all
+            if not made:  # the first outlet makes the body for all
                 made.append(_result(result, read))
             return made[0]
 
@@ -183,14 +182,14 @@ class Outlets(Server):
     def offer_error(
         self, camera: str, at: datetime, error: str, kind: str, triggered_at: datetime | None = None
     ) -> None:
-        """Hand an error to the outlets; returns at once."""
+        """Pass an error to the outlets; return at once."""
         fields = {"camera": camera, "error": error, "kind": kind, "triggered_at": triggered_at}
         text = object_text(fields)
         for pump in self._of(camera):
             pump.offer(camera, at.timestamp(), len(text), lambda: ("error", None, text))
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Tell the outlets of a camera's state; returns at once."""
+        """Pass a camera's state to the outlets; return at once."""
         for pump in self._of(camera):
             pump.outlet.state_changed(camera, state)
 
@@ -228,7 +227,7 @@ def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
 
 
 def stored_accounts(section: Section, folder: Path) -> dict[str, OutletAccount | None]:
-    """Return the accounts in the spools of a section, by the outlet's name; None: no spool yet."""
+    """Return the accounts of a section's spools, by the outlet's name; None without a spool."""
     found: dict[str, OutletAccount | None] = {}
     for name, given in section.items():
         settings = outlet_class(name, given).settings_class.model_validate(given)

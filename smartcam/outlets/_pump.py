@@ -1,4 +1,4 @@
-"""Bring what comes into a spool, and from the spool to the far end."""
+"""Write entries to a spool, and deliver them from the spool to the far end."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ MAX_WAITING = 20_000
 """Largest number of entries that wait in memory for the spool's disk."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes that these entries keep."""
+"""Largest number of bytes of the entries that wait in memory."""
 
 MAX_WRITTEN_TOGETHER = 500
 """Largest number of entries of one write to the spool."""
 
 GATHER_SECONDS = 0.002
-"""Seconds in which entries gather in memory before they are written together: a write is out of the
-way of the trigger whose result it has, and many results cost one write."""
+"""Seconds in which entries gather in memory before they are written together: so a write does not
+delay the trigger of its result, and many results need one write."""
 
 DISK_RETRY_SECONDS = 1.0
-"""Seconds until a disk that was full or away is tried again."""
+"""Seconds until a disk that was full or unavailable is tried again."""
 
 STOP_TIMEOUT = 10.0
-"""Seconds for writing what waits in memory when it ends."""
+"""Seconds for writing the waiting entries at the end."""
 
 LINGER = 1.0
-"""Seconds for delivering what is spooled when it ends, where the far end takes it."""
+"""Seconds for delivering spooled entries at the end, if the far end accepts them."""
 
 CLOSE_TIMEOUT = 5.0
-"""Seconds that an outlet has for leaving its far end."""
+"""Seconds for an outlet's ``close``."""
 
 
 class Arrival(NamedTuple):
-    """Something that came, not made into an entry yet.
+    """A result or an error that is not yet made into an entry.
 
     Attributes:
         camera: name of the camera.
         number: number of the entry.
         at: time of arrival, seconds since 1970, UTC.
-        size: bytes that it keeps.
+        size: bytes that it takes in memory.
         make: function that returns kind, application and body of the entry; called in the spool's
             thread.
     """
@@ -77,12 +77,12 @@ class Pump:
     Args:
         outlet: the outlet.
         spool: spool of the outlet.
-        tell: function that is called with why the far end or the disk does not take anything, and
-            with "" when they do again.
+        tell: function that is called with the reason why the far end or the disk fails, and with
+            "" when it works again.
 
     Attributes:
-        trouble: reason for which nothing is delivered at the time; "" if all is well.
-        disk_trouble: reason for which nothing is spooled at the time; "" if all is well.
+        trouble: reason why entries are not delivered now; "" without one.
+        disk_trouble: reason why entries are not spooled now; "" without one.
     """
 
     def __init__(
@@ -95,25 +95,25 @@ class Pump:
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
-        self._lost: dict[str, tuple[Arrival, int]] = {}  # found no room, and are not told yet
+        self._lost: dict[str, tuple[Arrival, int]] = {}  # dropped entries without a gap yet
         self._numbers: dict[str, int] = {}
         self._came, self._spooled = asyncio.Event(), asyncio.Event()
         self._account = OutletAccount()
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
-        self._together = outlet.max_batch  # entries of the next batch at most
-        self._gathering: asyncio.TimerHandle | None = None  # until what came is written
+        self._together = outlet.max_batch  # largest number of entries of the next batch
+        self._gathering: asyncio.TimerHandle | None = None  # timer of the next write
 
     async def start(self) -> None:
-        """Open the spool, and begin.
+        """Open the spool, and start writing and delivering.
 
         Raises:
             ConfigurationError: another process has the spool.
             sqlite3.Error: its file cannot be created.
         """
         try:
-            await self._run(lambda: None)  # which opens it
+            await self._run(lambda: None)  # opens the spool
         except BaseException:
             await self._end_thread()
             raise
@@ -124,9 +124,9 @@ class Pump:
             self._tasks.append(loop.create_task(work, name=f"smartcam.outlets.{self.outlet.name}"))
 
     async def stop(self) -> None:
-        """End: what waits in memory goes to the spool, and what is there stays for the next start.
+        """Stop, after writing the waiting entries to the spool, where they stay for the next start.
 
-        Cancellation: the spool's thread goes on to the end of what it does.
+        Cancellation: the spool's thread still finishes its work.
         """
         if self._gathering is not None:
             self._gathering.cancel()
@@ -134,7 +134,7 @@ class Pump:
         try:
             await self._end(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(Exception):  # what stays is told by the next start
+                with contextlib.suppress(Exception):  # the next start adds a gap for the rest
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._lost:
                             await self._keep_some()
@@ -169,13 +169,13 @@ class Pump:
     def offer(
         self, camera: str, at: float, size: int, make: Callable[[], tuple[Any, int | None, str]]
     ) -> None:
-        """Take a result or an error; never waits."""
+        """Accept a result or an error; never wait."""
         number = self._numbers[camera] = self._numbers.get(camera, 0) + 1
         came = Arrival(camera, number, at, size, make)
         if (
             len(self._waiting) >= MAX_WAITING
             or self._waiting_bytes + size > MAX_WAITING_BYTES
-            or self._lost  # what comes behind a gap stays behind it
+            or self._lost  # entries after a gap stay after it
         ):
             self._lost[camera] = came, self._lost.get(camera, (came, 0))[1] + 1
         else:
@@ -191,7 +191,7 @@ class Pump:
 
     @property
     def account(self) -> OutletAccount:
-        """The account of all that came, with what waits in memory."""
+        """The account of all entries, with those that wait in memory."""
         kept, waiting = self._account, len(self._waiting)
         lost = sum(count for _, count in self._lost.values())
         dropped = dict(kept.dropped)
@@ -210,7 +210,7 @@ class Pump:
             while self._waiting or self._lost:
                 try:
                     await self._keep_some()
-                except Exception as exc:  # noqa: BLE001 - whatever it is, what waits is kept
+                except Exception as exc:  # noqa: BLE001 - after any error entries are kept
                     self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                     self._account = self.spool.account
                     await asyncio.sleep(DISK_RETRY_SECONDS)
@@ -218,7 +218,7 @@ class Pump:
                     self._say_disk("")
 
     async def _keep_some(self) -> None:
-        """Write the first entries of those that wait, or the gap behind all of them."""
+        """Write the first waiting entries, or the gap after all of them."""
         batch = [one for one, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)]
         lost = {} if batch else dict(self._lost)
         await self._kept(batch, lost)
@@ -259,7 +259,7 @@ class Pump:
         self._account = account
 
     async def _run(self, work: Callable[[], T], then: Callable[[T], None] = lambda _: None) -> T:
-        """Have work done in the spool's thread, and what follows, also for a cancelled caller."""
+        """Run work in the spool's thread, then ``then``, also if the caller is cancelled."""
 
         def guarded() -> T:
             if self.spool.closed:
@@ -325,10 +325,10 @@ class Pump:
             logger.debug("outlet %s: closing: %s", self.outlet.name, text_of(exc))
 
     async def _deliver_some(self) -> bool:
-        """Deliver a batch, or wait for one; return True if one was taken.
+        """Deliver a batch, or wait for one; return True if one was delivered.
 
-        After one that failed, entries come one by one at first: if the far end fails at one of
-        them, those before it are not delivered again and again.
+        After a failed batch, entries are delivered one by one at first: if the far end fails at one
+        of them, earlier ones are not delivered again and again.
         """
         self._spooled.clear()
         together, self._together = self._together, 1
@@ -358,7 +358,7 @@ class Pump:
         return True
 
     async def _forget(self, waiting: SpoolHead, count: int | None, refused: str) -> None:
-        """Forget what was delivered; a disk that is full is awaited, nothing is delivered twice."""
+        """Remove delivered entries; wait while the disk is full, so that none is sent twice."""
 
         def work() -> OutletAccount:
             self.spool.done(waiting, count, refused)
@@ -380,7 +380,7 @@ class Pump:
         """Wait until something is spooled.
 
         Raises:
-            Exception: the far end is gone.
+            Exception: the far end is lost.
         """
         loop = asyncio.get_running_loop()
         came = loop.create_task(self._spooled.wait())
@@ -406,6 +406,6 @@ _MEMORY = "the spool's disk was full, away or too slow"
 
 
 def _cancelled() -> bool:
-    """Return True if this task is to end."""
+    """Return True if this task has been cancelled."""
     task = asyncio.current_task()
     return task is None or task.cancelling() > 0

@@ -13,9 +13,9 @@ def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | No
     """Return the file of a result's picture; None if there is none below the folder.
 
     Args:
-        pattern: place of the file, with ``{camera}``, ``{application}``, ``{number}`` and
+        pattern: path of the file, with ``{camera}``, ``{application}``, ``{number}`` and
             ``{sequence}``.
-        folder: folder of relative places.
+        folder: folder of relative paths.
         said: fields of the result.
     """
     for name in ("camera", "application", "number", "sequence"):

@@ -1,4 +1,4 @@
-"""Settings of outlets, as a section of a fleet file or a file of their own has them."""
+"""Settings of outlets, from a section of a fleet file or a file of their own."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class _OutletFields(BaseModel):
 
 
 class Secret(_OutletFields):
-    """A secret, which never stands in a settings file itself: where it is instead."""
+    """The source of a secret, which is never in a settings file itself."""
 
-    file: str | None = Field(None, min_length=1, description="path of a file that holds it alone")
+    file: str | None = Field(None, min_length=1, description="path of a file with only the secret")
     variable: str | None = Field(
-        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable that holds it"
+        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable with it"
     )
 
     @model_validator(mode="before")
@@ -56,7 +56,7 @@ class Secret(_OutletFields):
             folder: folder of a relative path.
 
         Raises:
-            ConfigurationError: the secret is not there; says where it was looked for.
+            ConfigurationError: the secret does not exist; the text names its place.
         """
         if self.variable is not None:
             found = os.environ.get(self.variable)
@@ -78,39 +78,41 @@ class OutletSettings(_OutletFields):
 
     kind: str | None = Field(None, description="the kind of outlet; default: its name")
     cameras: Patterns = Field(
-        ("**",), description="which cameras: names, * for one part of them, ** for any number"
+        ("**",), description="cameras: names, * for one part of a name, ** for any number"
     )
     spool: str = Field(
-        "outlets", min_length=1, description="folder of the spool, beside this file; made if new"
+        "outlets",
+        min_length=1,
+        description="folder of the spool, beside this file; made if missing",
     )
-    size: Size = Field(1e9, description="of the entries that wait at most: 1 GB")
+    size: Size = Field(1e9, description="largest size of the waiting entries, such as 1 GB")
     full: Policy = Field(
         "drop_oldest",
-        description="beyond it, drop_oldest: the oldest make room; drop_newest: the newest are "
-        "refused. Both are counted, and the far end is told of the gap",
+        description="beyond the size, drop_oldest: drop the oldest; drop_newest: refuse the "
+        "newest. Both are counted, and the gap is delivered",
     )
     durable: bool = Field(
         False,
-        description="each write reaches the disk before it counts, so that a loss of power takes "
-        "nothing either; slower",
+        description="whether each write waits for the disk, so that a power failure loses "
+        "nothing; slower",
     )
     timeout: float = Field(
-        30.0, gt=0, le=3600, description="seconds within which the far end takes a batch"
+        30.0, gt=0, le=3600, description="seconds of the timeout for delivering a batch"
     )
 
     def chooses(self, camera: str) -> bool:
-        """Return True if a camera of this name is of this outlet."""
+        """Return True if this outlet is for a camera of this name."""
         return chosen(self.cameras, camera)
 
 
 Section = dict[str, dict[str, Any]]
-"""The section ``outlets:`` as it stands in a file: settings by the outlet's name."""
+"""The section ``outlets:`` of a file: settings by the outlet's name."""
 
 
 class OutletsFile(_OutletFields):
     """Outlets of one camera in a file of their own."""
 
-    outlets: Section = Field(description="by name; the name says the kind where kind: does not")
+    outlets: Section = Field(description="by name; without kind: the name is the kind")
 
     @classmethod
     def load(cls, path: str | Path) -> OutletsFile:

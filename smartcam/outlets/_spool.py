@@ -1,4 +1,4 @@
-"""A spool: what waits for a far end, in a file that survives a crash of its process."""
+"""A spool: entries that wait for a far end, in a file that survives a crash of its process."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 Policy: TypeAlias = Literal["drop_oldest", "drop_newest"]
 
 ROW_BYTES = 200
-"""Bytes that an entry takes in the file beside its text, about."""
+"""Bytes that an entry takes in the file besides its text, about."""
 
 MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
 MAX_PLACES_AT_ONCE = 1 << 32
-"""Places that are free behind the last one, or the note of it is damaged."""
+"""Places that must be free after the last one; otherwise the record of it is damaged."""
 
 MAX_REASON_CHARACTERS = 500
 """Largest number of characters of the reasons of a gap, which may be several gaps in one."""
 
 MAX_DAMAGED_FILES = 3
-"""Damaged spools that are kept beside the new one."""
+"""Largest number of damaged spools that are kept beside the new one."""
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS entries(
@@ -62,7 +62,7 @@ _DISK_CODES = frozenset(
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if an error tells that the file is damaged, not that its disk is full or away."""
+    """Return True if an error means a damaged file, not a full or unavailable disk."""
     code = getattr(error, "sqlite_errorcode", None)
     if code is None:
         return not isinstance(error, sqlite3.OperationalError)
@@ -70,7 +70,7 @@ def is_damage(error: sqlite3.Error) -> bool:
 
 
 class SpoolHead(NamedTuple):
-    """Entries at the head of the spool, their places, and the epoch in which they are there."""
+    """Entries at the head of the spool, their places, and the spool's epoch."""
 
     places: list[int]
     entries: list[OutletEntry]
@@ -81,20 +81,20 @@ class Spool:
     """A spool in one file; every method blocks, and belongs to one thread at a time.
 
     Args:
-        path: the file; made if it does not exist. A damaged one is put aside, what can be read of
-            it is kept, and a gap tells of the rest.
-        max_bytes: bytes of entries that wait at most.
-        policy: what happens beyond: the oldest entries make room, or the newest are refused; both
-            are counted, and a gap stands where they were.
-        durable: whether each write reaches the disk before it counts, so that a loss of power
-            takes nothing; otherwise only a crash of the process takes nothing.
+        path: the file; created if it does not exist. A damaged one is put aside, its readable
+            entries are kept, and a gap replaces the others.
+        max_bytes: largest number of bytes of the waiting entries.
+        policy: entries to drop beyond ``max_bytes``: the oldest or the newest; both are counted,
+            and a gap replaces them.
+        durable: whether each write is synced, so that entries survive a power failure; otherwise
+            they survive only a crash of the process.
 
     Raises:
         ConfigurationError: another process has the spool.
         sqlite3.Error: the file cannot be created or written.
 
     Attributes:
-        epoch: number of this start, larger than all before, whatever the clock says.
+        epoch: number of this start, larger than all earlier ones, also if the clock was set back.
     """
 
     def __init__(
@@ -106,11 +106,11 @@ class Spool:
         self.epoch: int = 0
         self._counts: dict[str, int] = {}
         self._bytes = self._spooled = 0
-        self._in_flight = 0  # the last place that is being delivered: it is not dropped
+        self._in_flight = 0  # the last place that is being delivered, and so not dropped
         self._lock: int | None = None
 
     def open(self) -> None:
-        """Open the file, also again after an error."""
+        """Open the file, also after an error."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
             self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
@@ -127,7 +127,7 @@ class Spool:
         self._keep_epoch(self.epoch)
 
     def renew(self, why: str) -> None:
-        """Put the file aside, which turned out to be damaged, and go on with what can be read."""
+        """Put the damaged file aside, and go on with its readable entries."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
@@ -135,7 +135,7 @@ class Spool:
 
     @property
     def closed(self) -> bool:
-        """True where the file is not open, also after an error of :meth:`renew`."""
+        """True if the file is not open, also after an error of :meth:`renew`."""
         return self._database is None
 
     def _connect(self) -> None:
@@ -180,7 +180,7 @@ class Spool:
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
     def _last_epoch(self) -> int:
-        """Return the epoch that the lock's file remembers, whatever became of the spool."""
+        """Return the epoch in the lock file, which remains if the spool is deleted."""
         if self._lock is None:
             return 0
         os.lseek(self._lock, 0, os.SEEK_SET)
@@ -193,14 +193,14 @@ class Spool:
             os.write(self._lock, b"%20d" % epoch)
 
     def _tell_all(self, database: sqlite3.Connection, lost: int, why: str) -> None:
-        """Tell a gap of all cameras."""
+        """Add a gap of all cameras."""
         ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
         gap = _gap("", epoch, number + 1)
         _add_gap(database, gap, lost, why, self._in_flight, unknown=True)
         database.execute("UPDATE cameras SET number = number + 1 WHERE camera = ''")
 
     def _start_anew(self, why: str) -> None:
-        """Put a damaged file aside, and keep what can be read of it."""
+        """Put a damaged file aside, and keep its readable entries."""
         saved, counts = _salvaged(self.path)
         stamp = time.time_ns()
         for suffix in ("", "-wal", "-shm"):
@@ -244,14 +244,14 @@ class Spool:
     def add(
         self, entries: Sequence[OutletEntry], lost: Sequence[tuple[OutletEntry, int, str]] = ()
     ) -> None:
-        """Keep entries that came, all or none, and tell gaps before them.
+        """Write entries, all or none, and gaps before them.
 
         Args:
-            entries: results and errors, and gaps that a source tells.
-            lost: entries that found no room in memory: the last one, their number, the reason.
+            entries: results and errors, and gaps from a source.
+            lost: entries that were dropped from memory: the last one, their number, the reason.
 
         Raises:
-            sqlite3.Error: the disk is full or away; nothing was kept and nothing counted.
+            sqlite3.Error: the disk is full or unavailable; no entry was written or counted.
         """
         database = self._there
         new = dict(self._counts)
@@ -282,7 +282,7 @@ class Spool:
         return sum(row[-2] for row in rows)
 
     def _room_for(self, entries: Sequence[OutletEntry]) -> int:
-        """Return the number of entries that there is room for."""
+        """Return the number of entries for which there is room."""
         room = self._max_bytes - self._bytes
         for taken, entry in enumerate(entries):
             room -= len(entry.body) + ROW_BYTES
@@ -293,7 +293,7 @@ class Spool:
     def _make_room(
         self, database: sqlite3.Connection, size: int, counts: dict[str, int]
     ) -> tuple[int, int]:
-        """Drop the oldest entries beyond the bound; return how many, and their bytes."""
+        """Drop the oldest entries beyond the bound; return their number and their bytes."""
         if size <= self._max_bytes or self._policy != "drop_oldest":
             return 0, 0
         freed, places, dropped = 0, list[int](), list[OutletEntry]()
@@ -318,7 +318,7 @@ class Spool:
     # ------------------------------------------------------------------ delivering
 
     def head(self, most: int) -> SpoolHead:
-        """Return the oldest entries, ``most`` at most; they stay, and are in flight until told."""
+        """Return the oldest entries, ``most`` at most, which stay in flight until :meth:`done`."""
         while True:
             places, entries, bad = list[int](), list[OutletEntry](), list[int]()
             for place, checksum, *fields in self._there.execute(
@@ -337,7 +337,7 @@ class Spool:
             self._discard(bad)
 
     def _discard(self, places: Sequence[int]) -> None:
-        """Drop entries that are not what was written, and tell of them."""
+        """Drop damaged entries, and add a gap for them."""
         database, counts = self._there, dict(self._counts)
         with _transaction(database):
             database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
@@ -348,16 +348,16 @@ class Spool:
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
 
     def done(self, waiting: SpoolHead, count: int | None = None, refused: str = "") -> None:
-        """Forget the first ``count`` entries, which the far end took; None: all.
+        """Remove the first ``count`` entries, which the far end accepted; None: all.
 
         Args:
             waiting: entries of :meth:`head`.
-            count: number of those that were taken.
-            refused: why the far end never takes the next one; "" if none was refused.
+            count: number of accepted entries.
+            refused: reason why the far end refused the next one; "" if it did not.
         """
         database = self._there
         if waiting.epoch != self.epoch:
-            return  # the spool was begun anew meanwhile: they come again, with the same ids
+            return  # the spool was renewed meanwhile: they come again, with the same ids
         taken = len(waiting.places) if count is None else count
         places, entries = waiting.places[:taken], waiting.entries[:taken]
         delivered = sum(entry.kind != "gap" for entry in entries)
@@ -382,7 +382,7 @@ class Spool:
 
     @property
     def account(self) -> OutletAccount:
-        """The account of what is in the file."""
+        """The account of the entries in the file."""
         return _account(self._counts, self._spooled)
 
     @property
@@ -394,8 +394,7 @@ class Spool:
         """Close the file.
 
         Args:
-            ended: whether nothing was lost that waited for the spool; else the next start tells of
-                a gap.
+            ended: whether all waiting entries were written; if not, the next start adds a gap.
         """
         database, self._database = self._database, None
         if database is not None:
@@ -409,10 +408,10 @@ class Spool:
 
 
 def read_account(path: Path) -> OutletAccount | None:
-    """Return the account in a spool's file, which a process may have; None if there is none.
+    """Return the account in a spool's file, which a process may be using; None without a file.
 
     Raises:
-        sqlite3.Error: it cannot be read now.
+        sqlite3.Error: the file cannot be read now.
     """
     if not path.exists():
         return None
@@ -425,12 +424,12 @@ def read_account(path: Path) -> OutletAccount | None:
 
 def _connected(path: Path) -> sqlite3.Connection:
     database = open_database(path, timeout=0.5)
-    database.text_factory = _text  # a damaged text is found by its checksum
+    database.text_factory = _text  # checksums detect damaged texts
     return database
 
 
 def _check_versions(path: Path) -> None:
-    """Check the versions in the file's header: SQLite takes a damaged one for a file to read only.
+    """Check the versions in the file's header: SQLite opens a file with a damaged one read-only.
 
     Raises:
         sqlite3.DatabaseError: they are damaged.
@@ -467,11 +466,11 @@ def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
 
 
 def _settle(database: sqlite3.Connection, counts: dict[str, int]) -> int:
-    """Have counts balance with the entries that are there; return how many are lost."""
+    """Make counts balance with the entries in the file; return the number of lost entries."""
     spooled, _ = database.execute(_TOTALS).fetchone()
     account = _account(counts, int(spooled))
     known = account.delivered + account.spooled + sum(account.dropped.values())
-    lost = max(0, account.results - known)  # the counts may be of an older page than the entries
+    lost = max(0, account.results - known)  # the counts may be from an older page than the entries
     counts["results"] = max(account.results, known)
     counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost
     return lost
@@ -494,7 +493,7 @@ def _set(database: sqlite3.Connection, new: Mapping[str, int]) -> None:
 
 
 def _remember(database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
-    """Remember the last number of each camera, behind which a gap stands after a crash."""
+    """Write the last number of each camera, after which a crash's gap is added."""
     last = {entry.camera: (entry.camera, entry.epoch, entry.number) for entry in entries}
     database.executemany("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", last.values())
 
@@ -504,15 +503,15 @@ def _last_numbers(database: sqlite3.Connection, which: str = "") -> list[tuple[s
 
 
 def _checksum(entry: OutletEntry, place: int) -> int:
-    """Return the checksum of an entry and of its place, without which it would come out of turn."""
+    """Return the checksum of an entry and of its place, which has to be right for the order."""
     return zlib.crc32(repr((place, *entry)).encode(errors="backslashreplace"))
 
 
 def _next_place(database: sqlite3.Connection) -> int:
-    """Return the place behind all that entries ever had.
+    """Return the place after all earlier entries' places.
 
     Raises:
-        sqlite3.DatabaseError: the file's note of it is damaged.
+        sqlite3.DatabaseError: the file's record of the last place is damaged.
     """
     found = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
     last = 0 if found is None else found[0]
@@ -533,7 +532,7 @@ def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
 
 
 def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
-    """Return the last entry of each camera, and how many the camera had."""
+    """Return the last entry of each camera, and the number of the camera's entries."""
     found: dict[str, tuple[OutletEntry, int]] = {}
     for entry in entries:
         found[entry.camera] = entry, found.get(entry.camera, (entry, 0))[1] + 1
@@ -550,16 +549,16 @@ def _add_gap(
     *,
     unknown: bool = False,
 ) -> None:
-    """Tell a gap, at a place that is free, or at the end; gaps that follow each other are one.
+    """Add a gap, at a free place or at the end; consecutive gaps become one.
 
     Args:
         database: the spool.
-        last: the last entry that the gap stands for.
-        count: number of entries; 0 where nobody knows.
+        last: the last entry that the gap replaces.
+        count: number of entries; 0 if it is unknown.
         why: reason.
-        in_flight: place up to which entries are being delivered, and stay as they are.
+        in_flight: place up to which entries are being delivered, and must not change.
         place: place of the gap; None: the end.
-        unknown: whether more may be missing than the count tells.
+        unknown: whether more may be missing than the count.
     """
     unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
     for there, checksum, *fields in database.execute(
@@ -584,7 +583,7 @@ def _add_gap(
 
 
 def _salvaged(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
-    """Return the entries and the counts that can be read of a damaged file."""
+    """Return the readable entries and counts of a damaged file."""
     entries, counts = dict[int, OutletEntry](), dict[str, int]()
     with contextlib.suppress(sqlite3.Error), contextlib.closing(_connected(path)) as database:
         with contextlib.suppress(sqlite3.Error):

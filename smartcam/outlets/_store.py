@@ -1,4 +1,4 @@
-"""A store of results: a table for each application in a file of SQLite, which any program reads."""
+"""A store of results: an SQLite file with a table for each application."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
-"""Largest number of columns of an application's table; what has more stays in ``results.value``
-alone."""
+"""Largest number of columns of an application's table; further values are only in
+``results.value``."""
 
 MAX_COLUMN_CHARACTERS = 100
 
 EXPIRE_SECONDS = 60.0
-"""Seconds between two looks for results that are too old, or too many."""
+"""Seconds between two searches for results to delete."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS results(
@@ -68,7 +68,7 @@ _OWN = frozenset({"id", "record", "rowid"})
 class StoreSettings(OutletSettings):
     """The settings of a store of results."""
 
-    file: str = Field(min_length=1, description="the file, beside this one; made if new")
+    file: str = Field(min_length=1, description="the file, beside this one; made if missing")
     keep: Age | None = Field(None, description="age beyond which results are deleted: 90 d")
     keep_size: Size | None = Field(
         None, description="size of the file beyond which the oldest are deleted: 10 GB"
@@ -76,13 +76,13 @@ class StoreSettings(OutletSettings):
     pictures: str | None = Field(
         None,
         min_length=1,
-        description="place of a result's picture, beside the file, with {camera}, {application}, "
-        "{number} and {sequence} in it; it is referred to where it is there",
+        description="path of a result's picture, beside the file, with {camera}, {application}, "
+        "{number} and {sequence} in it; the row has it if the picture exists",
     )
 
 
 class ResultStore(Outlet[StoreSettings]):
-    """Writes results, errors and gaps to a file of SQLite; what came before is not written twice.
+    """Writes results, errors and gaps to an SQLite file; a repeated one is not written twice.
 
     The table ``results`` has a row for everything, ``app_7`` a row for each record of the results
     of application 7, ``fields`` the types and units of its columns.
@@ -94,22 +94,22 @@ class ResultStore(Outlet[StoreSettings]):
         super().__init__(name, settings, folder, desk)
         self.path = folder / settings.file
         self._file: _StoreFile | None = None
-        self._closing: Future[None] | None = None  # of the file before
+        self._closing: Future[None] | None = None  # closing of the earlier file
 
     async def open(self) -> None:
-        """Open the file, and bring its tables to this version, as soon as it is closed.
+        """Wait until the earlier file is closed, then open it, and migrate its tables.
 
         Raises:
-            ConfigurationError: a newer version of smartcam made it.
-            sqlite3.Error: it cannot be opened.
+            ConfigurationError: a newer version of smartcam made the file.
+            sqlite3.Error: the file cannot be opened.
         """
-        if self._closing is not None:  # a disk may still hold it
+        if self._closing is not None:  # a slow disk may still be closing it
             await asyncio.wait({asyncio.wrap_future(self._closing)})
         self._file = _StoreFile(self.name, self.path, self.settings, self.desk)
         await _done(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, all or none; those before one that no table can have are written."""
+        """Write entries, all or none; before an unfit entry, write those that precede it."""
         file = self._file
         if file is None:
             raise sqlite3.OperationalError("the store is closed")
@@ -132,33 +132,33 @@ class ResultStore(Outlet[StoreSettings]):
 
 
 async def _done(running: Future[None]) -> None:
-    """Wait for work of a thread, which goes on to its end also for a cancelled caller."""
+    """Wait for work of a thread, which is finished also if the caller is cancelled."""
     await asyncio.shield(asyncio.wrap_future(running))
 
 
 class _StoreFile:
-    """The file while it is open once: a connection, and a thread that alone uses it.
+    """An open file: a connection, and the only thread that uses it.
 
-    A disk may hold the thread for longer than the outlet waits. The store is opened again when the
-    thread has closed this connection: it is nobody else's.
+    A disk may block the thread for longer than the outlet waits. The store is opened again only
+    when the thread has closed this connection.
 
     Args:
         name: name of the outlet.
         path: path of the file.
         settings: settings of the store.
-        desk: what it may ask of the process that has the cameras.
+        desk: functions of the process that has the cameras.
     """
 
     def __init__(self, name: str, path: Path, settings: StoreSettings, desk: OutletDesk) -> None:
         self.path, self.settings, self.desk = path, settings, desk
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{name}.store")
         self._database: sqlite3.Connection | None = None
-        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
+        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns of one batch
         self._expired = 0.0
         self._identity: object = None  # of the file that is open
 
     def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
-        """Have work done in the thread; ``last``: the thread ends with it."""
+        """Run work in the thread; with ``last`` the thread ends afterwards."""
         running = self._thread.submit(work)
         if last:
             self._thread.shutdown(wait=False)
@@ -211,7 +211,7 @@ class _StoreFile:
             database.close()
 
     def write(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, and delete those that are too old, or too many."""
+        """Write entries, and delete old ones beyond the bounds."""
         database = self._database
         if database is None:
             raise sqlite3.OperationalError("the store is closed")
@@ -228,7 +228,7 @@ class _StoreFile:
         """Write entries in one transaction.
 
         Raises:
-            EntryRefusedError: no table can have one of them; none is written.
+            EntryRefusedError: an entry fits no table; none is written.
             OutletError: the file was moved or deleted meanwhile, with these entries.
         """
         self._columns.clear()  # a layout may have changed, and a transaction been undone
@@ -287,8 +287,8 @@ class _StoreFile:
     ) -> dict[str, str]:
         """Return an application's columns by the values' names; make new ones.
 
-        A value that the layout has no more keeps its column. One whose type or unit has changed
-        gets a new column, and so has one of a camera with another layout.
+        Columns stay if the layout no longer has their value. A value whose type or unit has changed
+        gets a new column, and so does one of a camera with another layout.
         """
         known = self._columns.get((camera, application))
         if known is None:
@@ -345,7 +345,7 @@ class _StoreFile:
         return None if found is None else str(found.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:
-        """Delete what is too old, or too much; a part at a time."""
+        """Delete results beyond the bounds of age and size, a part at a time."""
         if self.settings.keep is not None:
             limit = _time(time.time() - self.settings.keep)
             while self._delete(database, "WHERE at < ?", (limit,)):
@@ -369,11 +369,11 @@ class _StoreFile:
 
 
 _UNFIT = (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, sqlite3.DataError)
-"""Errors of an entry's own, which come again however often it is written."""
+"""Errors that an entry causes each time it is written."""
 
 
 def _readable(value: Any) -> Any:
-    """Return a value of JSON whose texts all have a form in UTF-8, with ? for what has none."""
+    """Return a JSON value whose texts can be encoded as UTF-8, with ? for other characters."""
     if isinstance(value, str):
         return value if value.isascii() else value.encode(errors="replace").decode()
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Answer what a shift asks of a store of results: what failed, and what is missing."""
+"""Queries to a store of results: failures of a shift, and missing results."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 READ_TIMEOUT = 20.0
-"""Seconds within which a store answers."""
+"""Seconds of the timeout of a query."""
 
 STEPS_BETWEEN_LOOKS = 10_000
-"""Steps of SQLite's machine between two looks at the time."""
+"""Steps of SQLite's machine between two checks of the time."""
 
 COLUMNS = (
     *("id", "camera", "kind", "at", "application", "sequence", "latency"),
@@ -33,10 +33,10 @@ class StoreQuestion(NamedTuple):
     """A question to a store of results.
 
     Attributes:
-        since: time from which on; None for all that is there.
+        since: earliest time; None for all rows.
         failed: whether only errors, gaps and results that did not pass are shown.
         camera: name or pattern of the cameras; ``**`` for all.
-        most: rows that are shown at most, the newest of all.
+        most: largest number of rows, the newest of all.
     """
 
     since: datetime | None = None
@@ -49,14 +49,14 @@ class StoredResults(NamedTuple):
     """The answer of a store of results.
 
     Attributes:
-        rows: rows that were asked for, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
+        rows: rows, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
             ``application``, ``sequence``, ``latency``, ``error``, ``lost``, ``at_least``,
             ``value``, ``picture``.
         total: results, errors and gaps of the time and the cameras, shown or not.
         failed: number of them that are errors, gaps, or did not pass.
         errors: number of errors.
         gaps: number of gaps.
-        lost: results that the gaps tell of.
+        lost: number of results that the gaps replace.
         at_least: whether more may be lost than the gaps count.
     """
 
@@ -103,7 +103,7 @@ def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResult
         which.append("at >= ?")
         values.append(question.since.astimezone(UTC).isoformat(timespec="microseconds"))
     if question.camera != "**":
-        which.append("chosen(camera)")  # a gap of all cameras is of each one
+        which.append("chosen(camera)")  # a gap of all cameras belongs to each one
     of = " AND ".join(which)
     shown = f"{of} AND {bad}" if question.failed else of
     columns = ", ".join(COLUMNS)

@@ -1,4 +1,4 @@
-"""Record what a camera says, play it back as an emulated camera, show it to Wireshark.
+"""Record a camera's messages, replay them as an emulated camera, convert them for Wireshark.
 
 ::
 
@@ -8,7 +8,7 @@
     async with replay(load_recording("run.mcap")) as emulator:
         emulator.url
 
-The container is MCAP, which Foxglove and others open. It needs the extra ``record``.
+The file format is MCAP, which Foxglove and other programs open. It needs the extra ``record``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Open a file that one recorder writes."""
+"""Open a file for a single recorder."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
-    """Open a file for one recorder; what was in it is gone when it is ours, not before.
+    """Open a file for a single recorder; truncate it only after it is locked.
 
     Raises:
-        ConfigurationError: another recorder writes it.
-        FileExistsError: the file is there already.
+        ConfigurationError: another recorder writes the file.
+        FileExistsError: the file exists already.
         OSError: the file cannot be created.
     """
     stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115

@@ -1,6 +1,6 @@
-"""A folder of recordings that follow each other: names, whose they are, how much there is.
+"""A folder of consecutive recordings: names, cameras and sizes of its files.
 
-A file's name is its camera's, with ``.`` for ``/``, and when the first in it came, UTC:
+A file's name has its camera's, with ``.`` for ``/``, and the time of its first record, UTC:
 ``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name a camera's files are in order.
 """
 
@@ -31,10 +31,10 @@ _AT = "%Y%m%dT%H%M%S.%f"
 
 _HEAD = MAGIC + b"\x01"
 _PROFILE_AT = len(_HEAD) + 8
-"""Place in the file, in bytes, of the length of the header's profile, behind the record's own."""
+"""Offset in the file, in bytes, of the length of the header's profile."""
 
 LOCK = ".smartcam.lock"
-"""The file that is locked where a folder cannot be: on Windows."""
+"""The file that is locked if a folder cannot be locked, as on Windows."""
 
 
 class FileName(NamedTuple):
@@ -42,7 +42,7 @@ class FileName(NamedTuple):
 
     Attributes:
         camera: name of the camera.
-        at: time of the first record, UTC, in whole milliseconds; later where the clock went back.
+        at: time of the first record, UTC, in whole milliseconds; later if the clock was set back.
     """
 
     camera: str
@@ -50,7 +50,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return the parts of a name; None if no recorder gives such a name."""
+        """Return the parts of a name; None if it is not a recorder's."""
         found = _NAME.fullmatch(name)
         if found is None:
             return None
@@ -70,7 +70,7 @@ class KnownFile:
     """A file of the folder; the oldest is the least.
 
     Attributes:
-        at: time at which the file was begun.
+        at: time of the file's beginning.
         name: name of the file.
         size: size of the file, bytes.
     """
@@ -81,7 +81,7 @@ class KnownFile:
 
 
 def is_ours(path: Path) -> bool:
-    """Return True if a file begins as smartcam's recordings do; an empty file does not."""
+    """Return True if a file begins like a recording of smartcam; False for an empty file."""
     try:
         with path.open("rb") as stream:
             head = stream.read(_PROFILE_AT + 4 + len(PROFILE))
@@ -96,7 +96,7 @@ def is_ours(path: Path) -> bool:
 
 
 def files_of(folder: Path) -> Iterator[tuple[FileName, os.DirEntry[str]]]:
-    """Give the files with a recorder's names, in no order; what they hold is not looked at.
+    """Yield the files with a recorder's names, in no order, without reading them.
 
     Raises:
         OSError: the folder cannot be read.
@@ -109,30 +109,30 @@ def files_of(folder: Path) -> Iterator[tuple[FileName, os.DirEntry[str]]]:
 
 
 class RecordingFolder:
-    """A folder that one recorder writes in; not safe for threads.
+    """A folder in which one recorder writes; not thread-safe.
 
     Args:
         path: the folder.
 
     Attributes:
         path: path that was given.
-        files: the recorder's files in it by name, as far as is known.
+        files: the known files of the recorder, by name.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files: dict[str, KnownFile] = {}
-        # whether each file that was examined is one of this recorder
+        # whether each examined file belongs to this recorder
         self._ours: dict[str, bool] = {}
         self._lock: int | None = None
-        self._made = False  # whether the folder existed once: it is not created again
+        self._made = False  # whether the folder existed earlier: it is not created again
         self._last: dict[str, datetime] = {}  # time at which the last file of each camera was begun
 
     def enter(self) -> None:
-        """Make the folder where it never was, lock it and look what is in it.
+        """Create the folder if it never existed, lock it and list its files.
 
-        A folder that was there and is gone is not made again: it may have been a mount, and what
-        stands in its place may be small.
+        A folder that existed and is missing is not created again: it may have been a mount, and the
+        disk at its place may be small.
 
         Raises:
             ConfigurationError: another recorder writes in it.
@@ -153,13 +153,13 @@ class RecordingFolder:
         self.look()
 
     def leave(self) -> None:
-        """Let another one have it. Idempotent."""
+        """Unlock the folder. Idempotent."""
         lock, self._lock = self._lock, None
         if lock is not None:
             os.close(lock)
 
     def look(self) -> None:
-        """Look what is there now.
+        """List the files again.
 
         Raises:
             OSError: the folder cannot be read.
@@ -180,11 +180,11 @@ class RecordingFolder:
         self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
 
     def next_path(self, camera: str, at: datetime) -> Path:
-        """Return the path of a camera's next file, which sorts behind all earlier ones.
+        """Return the path of a camera's next file, which sorts after all earlier ones.
 
         Args:
             camera: name of the camera.
-            at: time at which the first record of the file came.
+            at: time of the first record of the file.
         """
         whole = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
         last = self._last.get(camera)
@@ -212,7 +212,7 @@ class RecordingFolder:
         return sum(one.size for one in self.files.values())
 
     def delete(self, name: str) -> None:
-        """Delete a file of the recorder's; one that is not its own any more is left.
+        """Delete a file of the recorder; keep one that another program has replaced.
 
         Raises:
             OSError: the file cannot be deleted.

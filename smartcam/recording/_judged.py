@@ -1,4 +1,4 @@
-"""Find the picture that a result was made of."""
+"""Find the picture of each result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.form import Item
 
 MAX_PICTURES: Final = 256
-"""Largest number of pictures of a camera that are kept to be found."""
+"""Largest number of pictures of a camera that are kept for its results."""
 
 MAX_PICTURE_BYTES: Final = 1 << 28
 """Largest number of bytes that the kept pictures of a camera may have together; the last one is
@@ -31,10 +31,10 @@ class JudgedResult(NamedTuple):
 
     Attributes:
         result: result of the camera.
-        picture: picture that the result was made of; None if there is none.
-        told: True if the recorder was told that the two belong together, as after
-            ``read_image()``; False where the picture was found by the times. Without a trigger
-            of this client the times say nothing: the picture is None.
+        picture: picture of the result; None if it is unknown.
+        told: True if the picture was recorded for this result, as after ``read_image()``; False
+            if it was found by its time. Without a trigger of this client it cannot be found by
+            time: the picture is None.
     """
 
     result: Result[Any]
@@ -60,11 +60,11 @@ def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
 
 
 class PictureMatcher:
-    """Pictures and results of one camera, of which results with their pictures come.
+    """Matches pictures and results of one camera.
 
     Args:
-        max_bytes: bytes of the pictures that are kept to be found; the last one is kept in any
-            case.
+        max_bytes: largest number of bytes of the pictures that are kept for results; the last one
+            is kept in any case.
 
     Attributes:
         results: results whose picture is not known yet.
@@ -75,7 +75,7 @@ class PictureMatcher:
         self._max_bytes = max_bytes
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
-        self._dropped = -math.inf  # start of the exposure of the last picture not kept any more
+        self._dropped = -math.inf  # start of the exposure of the last picture no longer kept
         self._latest = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
@@ -92,7 +92,7 @@ class PictureMatcher:
             too_many = False
 
     def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
-        """Yield the results whose picture is known, or comes no more."""
+        """Yield the results whose picture is known, or cannot come any more."""
         while self.results:
             result = self.results[0]
             found = self._told(result)
@@ -104,7 +104,7 @@ class PictureMatcher:
             yield JudgedResult(result, picture, told)
 
     def settled_by_time(self) -> Iterator[JudgedResult]:
-        """Yield the results as soon as the times say their picture, where nobody tells it."""
+        """Yield the results as soon as their picture is found by its time."""
         while self.results:
             result = self.results[0]
             picture = self._by_time(result)
@@ -115,7 +115,7 @@ class PictureMatcher:
             yield JudgedResult(result, picture, False)
 
     def _is_late(self, result: Result[Any]) -> bool:
-        """Return True if a result waits no longer for a picture."""
+        """Return True if a result should not wait for a picture any more."""
         return self._latest > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
 
     def _told(self, result: Result[Any]) -> RecordedPicture | None:
@@ -126,7 +126,7 @@ class PictureMatcher:
         )
 
     def _by_time(self, result: Result[Any]) -> Frame | None:
-        if result.triggered_at is None:  # how long the camera's tools took is not known
+        if result.triggered_at is None:  # the duration of the inspection is unknown
             return None
         triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
         if self._dropped >= triggered:
@@ -134,7 +134,7 @@ class PictureMatcher:
         for one in self._pictures:
             began = one.frame.utc - one.frame.duration
             if one.result_number is None and triggered <= began <= one.frame.utc <= came:
-                missing = one.left_out or one.frame.lost  # the picture may be one of these
+                missing = one.left_out or one.frame.lost  # a missing picture may be the result's
                 return None if missing else one.frame
         return None
 

@@ -1,4 +1,4 @@
-"""Packets as bytes: Ethernet, IP, TCP and UDP, and the file that holds them.
+"""Packets as bytes: Ethernet, IP, TCP and UDP, and their pcap file.
 
 Sources: the format of pcap is libpcap's (draft-ietf-opsawg-pcap), IPv4 RFC 791, IPv6 RFC 8200, TCP
 RFC 9293, its window scale RFC 7323, UDP RFC 768.
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 MAX_PACKET_BYTES: Final = 1 << 18
-"""Snapshot length that the file's header tells: Wireshark's own default."""
+"""Snapshot length in the file's header: Wireshark's own default."""
 
 WINDOW_SCALE: Final = 7
-"""Makes of the largest window that fits into a header one of 8 MB, more than the largest frame."""
+"""Shift that makes the largest window of a header 8 MB, more than the largest frame."""
 
 FIN, SYN, RST, PUSH, ACK = 0x01, 0x02, 0x04, 0x08, 0x10
 """Flags of a TCP segment."""
@@ -52,7 +52,7 @@ def file_header() -> bytes:
 
 
 def file_record(time: int, packet: bytes) -> bytes:
-    """Return a packet as a pcap file has it; ``time`` in nanoseconds since 1970, cut to micro."""
+    """Return a packet's record; ``time`` in nanoseconds since 1970, cut to microseconds."""
     seconds, rest = divmod(time, 10**9)
     return _RECORD.pack(seconds, rest // 1000, len(packet), len(packet)) + packet
 
@@ -67,8 +67,8 @@ def tcp_packet(
         receiver: the end whose sequence number is acknowledged.
         flags: flags of the segment; a segment with SYN has options.
         number: number of the IP packet, in IPv4.
-        data: the segment's.
-        mss: the maximum segment size that its options tell.
+        data: data of the segment.
+        mss: the maximum segment size in its options.
     """
     # maximum segment size; no operation; window scale
     options = struct.pack(">BBHBBBB", 2, 4, mss, 1, 3, 3, WINDOW_SCALE) if flags & SYN else b""
@@ -86,7 +86,7 @@ def udp_packet(sender: Side, receiver: Side, number: int, data: bytes) -> bytes:
     header = sender.port, receiver.port, _UDP_HEADER.size + len(data)
     plain = _UDP_HEADER.pack(*header, 0) + data
     total = _checksum(_pseudo_header(sender, receiver, _UDP, len(plain)) + plain)
-    body = _UDP_HEADER.pack(*header, total or 0xFFFF) + data  # 0 would mean that there is none
+    body = _UDP_HEADER.pack(*header, total or 0xFFFF) + data  # 0 would mean no checksum
     return _ethernet(sender, receiver, _UDP, number, body)
 
 
@@ -110,7 +110,7 @@ def _pseudo_header(sender: Side, receiver: Side, protocol: int, size: int) -> by
 
 
 def _checksum(data: bytes) -> int:
-    """Return the Internet's checksum (RFC 1071) of bytes, whose own field is 0."""
+    """Return the Internet checksum (RFC 1071) of bytes whose checksum field is 0."""
     # The sum of all words is the number that they make, modulo 2^16 - 1.
     total = int.from_bytes(data + bytes(len(data) % 2), "big") % 0xFFFF
     if total == 0 and any(data):

@@ -1,9 +1,9 @@
-"""A recording as packets, for Wireshark and its kin.
+"""Convert a recording to packets, for Wireshark and similar programs.
 
-A recording holds frames and no packets, so these are made: Ethernet, IP, and TCP with handshake,
+A recording has frames and no packets, so packets are made: Ethernet, IP, and TCP with handshake,
 segments, acknowledgements and an end, or UDP with one datagram a frame. Times and payload are the
-recorded ones. What was not recorded is made up: the client's address and port, the division into
-segments, and how a link that was lost came to its end.
+recorded ones. Facts that were not recorded are invented: the client's address and port, the
+division into segments, and the end of a lost link.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ if TYPE_CHECKING:
     from smartcam.recording._reader import RecordedCamera, Recording
 
 MSS = {4: 1460, 6: 1440}
-"""Bytes of a TCP segment, by the version of IP: what fits into an Ethernet frame."""
+"""Bytes of a TCP segment that fit into an Ethernet frame, by the version of IP."""
 
 FIRST_PORT, PORTS = 49_152, 16_384
-"""The ports that a system gives to clients (RFC 6335); each link takes the next."""
+"""The ephemeral ports of clients (RFC 6335); each link uses the next one."""
 
 MAX_DATAGRAM_BYTES = 65_507
 """Largest number of bytes of a UDP datagram over IPv4."""
 
 MAX_TIME_NS = (1 << 32) * 10**9
-"""Nanoseconds since 1970 that a packet's time stays below: pcap counts seconds in 32 bits."""
+"""Upper bound of a packet's time, nanoseconds since 1970: pcap counts seconds in 32 bits."""
 
 _ADDRESSES = {4: ("192.0.2.1", "192.0.2.2"), 6: ("2001:db8::1", "2001:db8::2")}
-"""Addresses for documents (RFC 5737, RFC 3849): the client's, and that of a camera with a name."""
+"""Documentation addresses (RFC 5737, RFC 3849): of the client, and of a camera with a host name."""
 
 _CLIENT_MAC, _CAMERA_MAC = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")
 
@@ -73,19 +73,19 @@ def write_pcap(
 
     Args:
         recording: recording to read.
-        path: the file; the usual ending is ``.pcap``.
+        path: the file; the usual suffix is ``.pcap``.
         camera: name of the camera whose frames to write; default all cameras.
-        overwrite: take the place of a file that is there.
+        overwrite: replace an existing file.
 
     Returns:
-        How many packets were written.
+        Number of packets.
 
     Raises:
-        ConfigurationError: there is no such camera, or the file is there already or cannot be
+        ConfigurationError: there is no such camera, or the file exists already or cannot be
             created.
-        UnsupportedError: a camera is a fleet's, whose frames are its agent's.
-        RecordingError: the file cannot be written to its end: the disk is full, or a frame fits
-            into no packet.
+        UnsupportedError: a camera is a fleet's, whose frames only its agent has.
+        RecordingError: the file cannot be written to its end: the disk is full, or a frame does
+            not fit into a packet.
     """
     check_recording(recording, "pcap")
     path = check_path(path, "path", "pcap")
@@ -132,7 +132,7 @@ def _packets(recording: Recording, camera: str | None) -> Iterator[_Packet]:
 
 
 class _Capture:
-    """Everything that one camera's links carry; ``index`` is the camera's in the recording."""
+    """The packets of one camera's links; ``index`` is the camera's index in the recording."""
 
     def __init__(self, camera: RecordedCamera, index: int) -> None:
         host, port, self._tcp = _where(camera)
@@ -149,7 +149,7 @@ class _Capture:
         self._now = 0
 
     def packets(self, item: Item) -> Iterator[_Packet]:
-        """Yield the packets that an item makes."""
+        """Yield the packets of an item."""
         if isinstance(item, Disconnected):
             self._now = max(self._now, nanoseconds(item.at))
             yield from self._held()
@@ -182,7 +182,7 @@ class _Capture:
     def _say(self, entry: TraceEntry) -> Iterator[_Packet]:
         data = bytes.fromhex(entry.hex)
         if not data:
-            return  # a password, which is not recorded
+            return  # passwords are not recorded
         self._now = max(self._now, nanoseconds(entry.at), _HANDSHAKE)
         if not self._open:
             self._open = True
@@ -255,7 +255,7 @@ class _Capture:
 
 
 def _where(camera: RecordedCamera) -> tuple[str, int, bool]:
-    """Return a camera's host and port, and whether it was spoken to over TCP."""
+    """Return a camera's host and port, and whether the transport was TCP."""
     if not camera.url:
         bvs: Any = PROTOCOLS.load("bvs")
         return "", bvs.default_port, True
@@ -265,7 +265,7 @@ def _where(camera: RecordedCamera) -> tuple[str, int, bool]:
 
 
 def _address(host: str, index: int) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    """Return a camera's address; one for documents where only its name is known."""
+    """Return a camera's address; a documentation address if only its host name is known."""
     try:
         return ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

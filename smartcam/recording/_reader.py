@@ -1,4 +1,4 @@
-"""Reading a recording, whole or cut off."""
+"""Read a recording, whole or cut off."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Least number of values in the messages of a file that every file may have: ten seconds of
+"""Number of values that the messages of every file may have: ten seconds of
 work."""
 
 VALUES_PER_BYTE = 100
-"""Values for each byte of a larger file. Real recordings have less than one, since each message
-takes 16 bytes of index; tables that are nearly all zeros have ten."""
+"""Number of values for each byte that a larger file may have. Real recordings have less than one,
+since each message takes 16 bytes of index; tables of mostly zeros have ten."""
 
 MIN_POINT_BYTES = 2
 """Least number of bytes that a point of a mark has."""
@@ -73,16 +73,16 @@ T = TypeVar("T")
 
 
 class RecordedCamera(NamedTuple):
-    """A recording's facts about a camera.
+    """The recorded facts about a camera.
 
     Attributes:
         name: name of the camera.
         url: address of the camera, without a password; "" if there was never a session.
         protocol: name of the protocol; "" if there was never a session.
-        dialect: name of the dialect; None if none is known.
+        dialect: name of the dialect; None if it is not known.
         quirks: deviations from the dialect.
-        interpret_as: interpreter of the results, as text; None if the recorder was not told.
-        facts: everything that was told, by name.
+        interpret_as: interpreter of the results, as text; None if it was not recorded.
+        facts: all recorded facts, by name.
     """
 
     name: str
@@ -108,11 +108,11 @@ class Recording:
         counts: numbers of items of each kind.
         began: time of the first item, UTC; None if there is none.
         ended: time of the last item, UTC.
-        remark: "" for a whole file; otherwise where it stops being readable, and why. Of a folder
-            what is to say of its files, one a line.
-        files: the file itself; of a folder its files, camera by camera, each camera's in order.
-        since: items before it are left out, UTC; None if none are.
-        until: items behind it are left out, UTC; None if none are.
+        remark: "" for a whole file; otherwise the place after which it cannot be read, and the
+            reason. For a folder the remarks on its files, one a line.
+        files: the file itself; for a folder its files, camera by camera, each camera's in order.
+        since: time before which items are left out, UTC; None without one.
+        until: time after which items are left out, UTC; None without one.
     """
 
     path: Path
@@ -128,16 +128,16 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """From the first to the last item."""
+        """Seconds from the first to the last item."""
         if self.began is None or self.ended is None:
             return 0.0
         return (self.ended - self.began).total_seconds()
 
     def camera(self, name: str | None = None) -> RecordedCamera:
-        """Return the camera of that name; without a name the only one there is.
+        """Return the camera with a name; without a name the only one.
 
         Raises:
-            ConfigurationError: there is no camera of that name, or there are several; names them.
+            ConfigurationError: there is no such camera, or there are several; the text names them.
         """
         if name is not None:
             name = check_text(name, "camera", f"recording {self.path}")
@@ -156,7 +156,7 @@ class Recording:
         return self.cameras[next(iter(self.cameras)) if name is None else name]
 
     def items(self, camera: str | None = None) -> Iterator[Item]:
-        """Yield everything, of all cameras or of one."""
+        """Yield all items, of all cameras or of one."""
         for found in self.all_items(camera):
             if not isinstance(found, RecordedState) and (
                 self.since is None or _when(found) >= self.since
@@ -164,9 +164,9 @@ class Recording:
                 yield found
 
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
-        """Yield the items for a replay, those before ``since`` and the states of cameras included.
+        """Yield the items for a replay, with those before ``since`` and the states of cameras.
 
-        Where the rest of a file could not be read, an unknown state of the camera follows.
+        If the rest of a file cannot be read, an unknown state of the camera follows.
         """
         if camera is not None:
             camera = check_text(camera, "camera", f"recording {self.path}")
@@ -199,7 +199,7 @@ class Recording:
         return self._of_type(TraceEntry, camera)
 
     def results(self, camera: str | None = None) -> Iterator[Result]:
-        """Yield the results; ``value`` is as JSON has it: dicts, lists, texts and numbers."""
+        """Yield the results; ``value`` consists of JSON values: dicts, lists, texts and numbers."""
         return self._of_type(Result, camera)
 
     def events(self, camera: str | None = None) -> Iterator[CameraEvent]:
@@ -211,18 +211,18 @@ class Recording:
         return self._of_type(RecordedError, camera)
 
     def pictures(self, camera: str | None = None) -> Iterator[Frame]:
-        """Yield the pictures as their source gave them: with its times, numbers and losses.
+        """Yield the pictures with the times, numbers and losses of their source.
 
-        ``lost`` also counts those that the recorder had to leave out before the picture.
+        ``lost`` also counts pictures that the recorder left out before the picture.
         """
         return (frame_of(item) for item in self._of_type(RecordedPicture, camera))
 
     def judged(self, camera: str | None = None) -> Iterator[JudgedResult]:
-        """Yield each result with the picture that it was made of, as far as the recording tells.
+        """Yield each result with its picture, if the picture is known.
 
-        The recorder was told which one that is, or it is found by the times: the first picture of
-        the camera that was surely exposed after the trigger, and before the result came. A
-        result that its client did not trigger has one only if the recorder was told.
+        The picture was recorded for its result, or is found by its time: the first picture of the
+        camera that was certainly exposed after the trigger, and before the result came. A result
+        without a trigger of its client has a picture only if it was recorded for it.
         """
         return judged(self.items(camera))
 
@@ -231,33 +231,33 @@ class Recording:
 
 
 def frame_of(picture: RecordedPicture) -> Frame:
-    """Return the frame of a picture, which also counts as lost what was left out before it."""
+    """Return the frame of a picture, whose ``lost`` includes pictures that were left out."""
     frame = picture.frame
     return replace(frame, lost=frame.lost + picture.left_out) if picture.left_out else frame
 
 
 def check_recording(value: Recording, who: str) -> Recording:
-    """Return a recording; anything else is a ConfigurationError."""
+    """Return a recording; raise ConfigurationError for another type."""
     return check_kind(value, Recording, "recording", "what load_recording() returns", who)
 
 
 def load_recording(
     path: str | Path, *, since: datetime | None = None, until: datetime | None = None
 ) -> Recording:
-    """Look through a recording; what can be read of a file that was cut off, is.
+    """Scan a recording; read a file that was cut off as far as possible.
 
     Args:
-        path: the file; or the folder of a :class:`~smartcam.recording.FleetRecorder`, whose files
-            that cannot be read are in ``remark``.
-        since: leave out what is before; with a time zone.
-        until: leave out what is behind; with a time zone.
+        path: the file; or the folder of a :class:`~smartcam.recording.FleetRecorder`, whose
+            unreadable files are listed in ``remark``.
+        since: time before which items are left out; with a time zone.
+        until: time after which items are left out; with a time zone.
 
     Raises:
-        ConfigurationError: the file cannot be read, is no MCAP, or is another program's; nothing
-            of a folder can be read; a time has no time zone.
-        RecordingError: the recording goes beyond a bound that no recording comes near, or the disk
+        ConfigurationError: the file cannot be read, is no MCAP, or is another program's; no file of
+            a folder can be read; a time has no time zone.
+        RecordingError: the recording exceeds a bound that real recordings do not reach, or the disk
             fails.
-        MissingExtraError: what inflates its chunks is not installed.
+        MissingExtraError: the library that inflates its chunks is not installed.
     """
     path = check_path(path, "path", "recording")
     since = check_instant(since, "since", f"recording {path}")
@@ -280,15 +280,15 @@ def load_recording(
 
 
 def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
-    """Yield each item of a file or of a folder that can be read, without a look through it before.
+    """Yield each readable item of a file or of a folder, without scanning it before.
 
     Args:
         path: the file or folder.
-        note: function that is called with what cannot be read, and why.
+        note: function that is called with a text about each unreadable part.
 
     Raises:
         ConfigurationError: a file cannot be read, or is no recording of smartcam.
-        RecordingError: the recording goes beyond a bound, or the disk fails.
+        RecordingError: the recording exceeds a bound, or the disk fails.
     """
     for file in _files_in(path, None, None) if path.is_dir() else [path]:
         scan = _Scan(file)
@@ -298,7 +298,7 @@ def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
 
 
 def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> list[Path]:
-    """Return the files of a folder that may have something of a time, camera by camera."""
+    """Return the files of a folder that may have items of a time, camera by camera."""
     try:
         named = sorted((name, entry.path) for name, entry in files_of(folder))
     except OSError as exc:
@@ -322,7 +322,7 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
 
 @dataclass(slots=True)
 class _FolderLook:
-    """The findings while files are looked through."""
+    """The findings of a scan of files."""
 
     path: Path
     since: datetime | None
@@ -336,11 +336,11 @@ class _FolderLook:
     remarks: list[str] = field(default_factory=list[str])
 
     def take(self, scan: _Scan) -> None:
-        """Look through a file; raises as :meth:`_Scan.items`."""
+        """Scan a file; raises as :meth:`_Scan.items`."""
         try:
             for item in scan.items():
                 self._take_item(item)
-                del item  # the next one may be large, too
+                del item  # free it, since the next one may be large, too
         finally:
             for name, facts in scan.camera_facts.items():
                 self.facts[name] = {**self.facts.get(name, {}), **facts}
@@ -365,7 +365,7 @@ class _FolderLook:
         self.ended = at if self.ended is None else max(self.ended, at)
 
     def recording(self, files: tuple[Path, ...]) -> Recording:
-        """Return the recording, with everything that was found in its files."""
+        """Return the recording, with the findings in its files."""
         return Recording(
             path=self.path,
             version=self.version,
@@ -443,11 +443,11 @@ class _Scan:
     def items(self, *, states: Literal[True]) -> Iterator[Item | RecordedState]: ...
 
     def items(self, *, states: bool = False) -> Iterator[Item | RecordedState]:
-        """Yield everything that can be read; with ``states`` also what a camera was.
+        """Yield every readable item; with ``states`` also the states of cameras.
 
         Raises:
             ConfigurationError: the file is no recording of smartcam.
-            RecordingError: the file goes beyond a bound, or the disk fails.
+            RecordingError: the file exceeds a bound, or the disk fails.
         """
         try:
             stream = self.path.open("rb")
@@ -481,7 +481,7 @@ class _Scan:
                 elif item is not None:
                     count += 1
                     yield item
-                    item = None  # the next one may be large, too
+                    item = None  # free it, since the next one may be large, too
             self._check_ours(schemas)
 
     def _take(
@@ -539,7 +539,7 @@ class _Scan:
         return messages.picture_of(schema, data, *marks)
 
     def _find_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
-        """Put a result's bytes where they belong, if they stand in its frame."""
+        """Add a result's bytes, if they are in its frame."""
         raw_from = optional(fields, "raw_from", int)
         if raw_from is None:
             return

@@ -1,9 +1,9 @@
-"""Writing a recording: an observer that hands on, and a thread that writes.
+"""Write a recording: an observer that collects items, and a thread that writes them.
 
-The hooks put what they are called with into a list and return. A thread takes the list twice a
-second, writes it as one chunk of the file and has the system put that on the disk, so a crash, even
-of the machine, loses about half a second. Nothing is left out: where the disk is full, or too slow
-for what comes, the recording ends with an error, and never has a gap.
+The hooks put their arguments into a list and return. A thread takes the list twice a second, writes
+it as one chunk of the file and syncs that to the disk, so a crash, even of the machine, loses about
+half a second. No item is left out: if the disk is full or too slow, the recording ends with an
+error, and never has a gap.
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.form import Item
 
 INTERVAL = 0.5
-"""Seconds that anything waits for its chunk: a crash loses at most a second, writing included. The
-index of the chunks is kept in memory until the end: about 25 MB for a day without a pause."""
+"""Seconds between two chunks: a crash loses at most a second, writing included. The index of the
+chunks is kept in memory until the end: about 25 MB for a day without a pause."""
 
 CHUNK = 1 << 20
-"""Bytes that wait before a chunk is written sooner; also the largest chunk."""
+"""Number of waiting bytes at which a chunk is written sooner; also the largest chunk."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes that wait for the disk before the recording gives up: a minute of a fast
 camera."""
 
 MAX_WAITING_PICTURE_BYTES = 1 << 26
-"""Largest number of bytes of pictures that wait for the disk before further ones are left out; one
-may wait however large it is."""
+"""Largest number of bytes of pictures that wait for the disk before further ones are left out; a
+single picture may be larger."""
 
 VIDEO_SUFFIX = ".mkv"
 """Suffix of a file that becomes a video."""
@@ -83,11 +83,11 @@ CLOSE_TIMEOUT = 30.0
 """Seconds that :meth:`Recorder.close` waits for the disk."""
 
 ITEM_OVERHEAD_BYTES = 512
-"""Bytes that an item counts beside its data."""
+"""Bytes for which an item counts besides its data."""
 
 
 class Counts(NamedTuple):
-    """The counts of what was recorded so far, written or waiting.
+    """The counts of recorded items so far, written or waiting.
 
     Attributes:
         frames: frames and bytes that make no frame.
@@ -113,7 +113,7 @@ class Description(NamedTuple):
 
 
 Given: TypeAlias = "Item | RawFrame | Description"
-"""Things that the thread writes."""
+"""Objects that the thread writes."""
 
 
 class _Written(Protocol):
@@ -131,7 +131,7 @@ class _Written(Protocol):
 
 
 class Recorder(Observer):
-    """Writes everything that clients see to an MCAP file.
+    """Writes all frames, results, events and errors of clients to an MCAP file.
 
     ::
 
@@ -140,19 +140,19 @@ class Recorder(Observer):
                 ...
 
     One recorder may serve several cameras, of several event loops: topics have the camera's name.
-    Before it is opened and after it is closed it takes nothing. A result's value is turned to JSON
-    a moment later in the recorder's thread: do not change it in place.
+    Before it is opened and after it is closed it ignores all calls. A result's value is converted
+    to JSON a moment later in the recorder's thread: do not change it in place.
 
     A file that ends in ``.mkv`` becomes a video of one camera's pictures, without loss: JPEGs as
-    they came, pixels packed by FFV1. The times are those of the captures, in whole milliseconds,
-    from the first picture on, whose time is the file's ``creation_time``. When size or format
-    change, a further file begins: ``run-2.mkv``. Results and events are not in it.
+    they came, pixels compressed by FFV1. The times are those of the captures, in whole
+    milliseconds, from the first picture on, whose time is the file's ``creation_time``. If size or
+    format changes, a further file begins: ``run-2.mkv``. A video has no results and events.
 
     Args:
-        path: the file; the usual ending is ``.mcap``.
-        overwrite: take the place of a file that is there.
-        pictures: keep the pictures that results were made of, where a camera has them, as software
-            cameras do.
+        path: the file; the usual suffix is ``.mcap``.
+        overwrite: replace an existing file.
+        pictures: write the pictures of results, if the camera has them, as software cameras
+            do.
 
     Attributes:
         path: path that was given.
@@ -164,9 +164,9 @@ class Recorder(Observer):
         self._overwrite = check_flag(overwrite, "overwrite", "recording")
         self._more = threading.Condition()
         self._items: list[Given] = []
-        self._waiting = 0  # bytes in it, without pictures
-        self._waiting_pictures = 0  # bytes of pictures in it
-        self._left_out: dict[str, int] = {}  # pictures since the last one, by camera
+        self._waiting = 0  # waiting bytes, without pictures
+        self._waiting_pictures = 0  # waiting bytes of pictures
+        self._left_out: dict[str, int] = {}  # pictures left out since the last one, by camera
         self._counts = dict.fromkeys(Counts._fields, 0)
         self._taking = False
         self._closing = False
@@ -178,11 +178,11 @@ class Recorder(Observer):
     # ------------------------------------------------------------------ life
 
     def open(self) -> Self:
-        """Make the file and start the thread that writes it.
+        """Create the file and start the thread that writes it.
 
         Raises:
-            ConfigurationError: the file is there already, another recorder writes it, or it cannot
-                be created.
+            ConfigurationError: the file exists already, another recorder writes it, or it cannot be
+                created.
             MissingExtraError: the mcap library is not installed.
         """
         if self._thread is not None:
@@ -196,7 +196,7 @@ class Recorder(Observer):
         return self
 
     def _make_file(self) -> _Written:
-        """Make the file; raises as :meth:`open`."""
+        """Create the file; raises as :meth:`open`."""
         if self.path.suffix.lower() == VIDEO_SUFFIX:
             with from_part("frames", "videos need"):
                 from smartcam.recording._pictures.video import VideoFile
@@ -207,7 +207,7 @@ class Recorder(Observer):
         return RecordingFile(self._open_stream(), compress, self.path)
 
     def _open_stream(self) -> IO[bytes]:
-        """Make the empty file; raises as :meth:`open`."""
+        """Create the empty file; raises as :meth:`open`."""
         try:
             return opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
@@ -222,13 +222,13 @@ class Recorder(Observer):
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
 
     def close(self) -> None:
-        """Write what waits and end the file; idempotent.
+        """Write waiting items and end the file; idempotent.
 
-        It waits for the disk, usually some milliseconds, 30 s at most: call it in a thread where an
-        event loop has other things to do.
+        This waits for the disk, usually some milliseconds, 30 s at most: if an event loop must not
+        wait, call it in a thread.
 
         Raises:
-            RecordingError: the recording has failed, before or now.
+            RecordingError: the recording has failed, earlier or now.
         """
         with self._more:
             self._taking, self._closing = False, True
@@ -249,7 +249,7 @@ class Recorder(Observer):
         if exc is None:
             self.close()
             return
-        with contextlib.suppress(RecordingError):  # the first error is the one that is told
+        with contextlib.suppress(RecordingError):  # the first error is raised
             self.close()
 
     def forked(self) -> None:
@@ -262,7 +262,7 @@ class Recorder(Observer):
 
     @property
     def counts(self) -> Counts:
-        """Counts of what was recorded so far."""
+        """Counts of recorded items so far."""
         return Counts(**self._counts)
 
     @property
@@ -271,16 +271,16 @@ class Recorder(Observer):
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:
-        """Wait until the recording fails and return why; without a bound, it is its life.
+        """Wait until the recording fails, without a bound, and return the error.
 
         Cancellation: safe.
         """
         return await asyncio.shield(asyncio.wrap_future(self._failure))
 
     def describe(self, camera: str, **facts: object) -> None:
-        """Keep facts about a camera in the file, such as ``interpret_as``; None is left out.
+        """Write facts about a camera to the file, such as ``interpret_as``; None is left out.
 
-        Its address and dialect are kept by themselves, with every session.
+        The address and the dialect are written by themselves, with every session.
         """
         texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
         self._put(Description({"camera": camera, **texts}), 0)
@@ -308,7 +308,7 @@ class Recorder(Observer):
         self._put_all(results, 4 * sum([len(one.raw) for one in results]), "results")
 
     def on_picture(self, result: Result, frame: Frame) -> None:
-        """Keep the picture that a result was made of, unless ``pictures`` says otherwise."""
+        """Keep the picture of a result, unless ``pictures`` is False."""
         if self._pictures:
             self.add_picture(frame, camera=result.camera, result=result)
 
@@ -325,25 +325,25 @@ class Recorder(Observer):
     def add_picture(
         self, frame: Frame, *, camera: str = "", result: Result[Any] | None = None
     ) -> bool:
-        """Keep a picture, beside what else is recorded of its camera; it never waits.
+        """Add a picture to its camera's recording; never wait.
 
-        Where more than 64 MiB of pictures wait for the disk, the picture is left out and counted:
-        the next one that is kept says how many were. Results are never left out for pictures.
+        If more than 64 MiB of pictures wait for the disk, the picture is left out; the next one has
+        the number of those that were. Results are never left out for pictures.
 
         Args:
             frame: picture of a source of frames; its bytes are kept until they are written.
             camera: name of the camera in the file; default the frame's source.
-            result: result that was made of the picture.
+            result: result of the picture.
 
         Returns:
-            True if the picture is kept.
+            True if the picture was added.
 
         Raises:
-            ConfigurationError: an argument is of another kind; or it becomes a video, and the
-                picture is another camera's.
-            FrameFormatError: the file becomes a video, which cannot hold the picture without loss;
-                or nobody could read the picture again, such as one of more than 1,048,576 pixels
-                along a side. The recording goes on without it.
+            ConfigurationError: an argument has a wrong type; or the file is a video of another
+                camera.
+            FrameFormatError: the file is a video, which cannot hold the picture without loss; or
+                the picture could not be read again, such as one of more than 1,048,576 pixels along
+                a side. The recording goes on without it.
             MissingExtraError: the distribution of frames is not installed.
         """
         with from_part("frames", "pictures need"):
@@ -380,7 +380,7 @@ class Recorder(Observer):
         return True
 
     def add_image(self, camera: str, image: bytes, *, result: Result[Any] | None = None) -> bool:
-        """Keep a picture that a camera was asked for, as ``read_image()`` returns it.
+        """Add a picture from ``read_image()``.
 
         ::
 
@@ -390,13 +390,13 @@ class Recorder(Observer):
         Args:
             camera: name of the camera in the file.
             image: bytes of a bitmap file.
-            result: result that was made of the picture.
+            result: result of the picture.
 
         Returns:
-            True if the picture is kept, as :meth:`add_picture` says.
+            True if the picture was added, as of :meth:`add_picture`.
 
         Raises:
-            ConfigurationError: an argument is of another kind.
+            ConfigurationError: an argument has a wrong type.
             FrameFormatError: the file is no bitmap.
             MissingExtraError: the distribution of frames is not installed.
         """
@@ -417,31 +417,31 @@ class Recorder(Observer):
         count: int | None = None,
         on_start: Callable[[], None] = lambda: None,
     ) -> ReaderStatistics:
-        """Record every picture of a source until it ends, or until there are so many.
+        """Record every picture of a source until it ends, or until ``count`` pictures.
 
-        The source streams for the recording, and readers see it meanwhile as ever. One that can
-        wait, such as a file with ``pace=none``, waits for the disk; of others pictures are left
-        out and counted where the disk is too slow.
+        The source streams for the recording and for its other readers. A source that can wait, such
+        as a file with ``pace=none``, waits for the disk; pictures of others are left out and
+        counted if the disk is too slow.
 
         Args:
             source: open source.
             camera: name of the camera in the recording; default the source's.
-            count: pictures after which it ends; None: it ends with the source.
-            on_start: function that is called when the first picture is kept.
+            count: number of pictures after which the recording ends; None: at the source's end.
+            on_start: function that is called when the first picture was added.
 
         Returns:
-            Counts of what came, and what was lost before it came; ``skipped`` are those left out.
+            Counts of delivered and lost pictures; ``skipped`` counts those that were left out.
 
         Raises:
             ConfigurationError: an argument is wrong.
             LocalProtocolError: the source is not open.
-            FrameFormatError: the file becomes a video, which cannot hold the pictures without loss;
-                or one of them cannot be recorded, as :meth:`add_picture` says.
-            FrameSourceError: the source is gone, or stuck; what came before is recorded.
-            RecordingError: the recording ended, such as on a full disk.
+            FrameFormatError: the file is a video, which cannot hold the pictures without loss; or
+                one of them cannot be recorded, as of :meth:`add_picture`.
+            FrameSourceError: the source is lost, or hangs; earlier pictures are recorded.
+            RecordingError: the recording failed, such as on a full disk.
             MissingExtraError: the distribution of frames is not installed.
 
-        Cancellation: safe; everything until then is recorded.
+        Cancellation: safe; earlier pictures are recorded.
         """
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures.recorder import record_frames
@@ -450,19 +450,19 @@ class Recorder(Observer):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Paths of the files that were begun so far; a video may have several."""
+        """Paths of the files so far; a video may have several."""
         return tuple(getattr(self._file, "paths", (self.path,)))
 
     @property
     def has_room(self) -> bool:
-        """True if less than half of the pictures wait that may wait for the disk."""
+        """True if less than half of the room for waiting pictures is used."""
         return self._waiting_pictures < MAX_WAITING_PICTURE_BYTES // 2
 
     def _put(self, item: Given, size: int, kind: str | None = None) -> None:
         self._put_all((item,), size, kind)
 
     def _put_all(self, items: Sequence[Given], size: int, kind: str | None) -> None:
-        """Have items of one kind written, which have so many bytes together."""
+        """Put items of one kind into the list, with ``size`` bytes together."""
         with self._more:
             if not self._taking:
                 return
@@ -479,7 +479,7 @@ class Recorder(Observer):
     # ------------------------------------------------------------------ the thread
 
     def _fail(self, reason: str, cause: BaseException | None = None) -> None:
-        """End the recording; the first reason stays."""
+        """End the recording; keep the first reason."""
         error = RecordingError(f"recording {self.path}: {reason}")
         error.__cause__ = cause
         with self._more:
@@ -502,13 +502,13 @@ class Recorder(Observer):
                 file.finish()
         except OSError as exc:
             self._fail(exc.strerror or str(exc), exc)
-        except ValueError as exc:  # a message that nobody could read back
+        except ValueError as exc:  # a message that could not be read again
             self._fail(str(exc), exc)
-        except Exception as exc:  # noqa: BLE001 - a thread that ends silently would be worse
+        except Exception as exc:  # noqa: BLE001 - the thread must not end silently
             self._fail(f"unexpected {exc!r}", exc)
 
     def _write_some(self, file: _Written) -> bool:
-        """Wait for something, write it; return whether that was the last."""
+        """Wait for items and write them; return whether they were the last."""
         with self._more:
             self._more.wait_for(lambda: self._items or self._closing)
             self._more.wait_for(
@@ -528,7 +528,7 @@ class RecordingFile:
 
     Args:
         stream: the open file, closed at the end.
-        compress: function that packs a chunk, from :func:`load_compress`.
+        compress: function that compresses a chunk, from :func:`load_compress`.
         path: path of the file.
     """
 
@@ -542,11 +542,11 @@ class RecordingFile:
         self._numbers: dict[int, int] = {}
         self._facts: dict[str, dict[str, str]] = {}
         self._frame_texts = FrameTexts()
-        self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # numbers, by data
-        self._size = 0  # when it was closed
+        self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # frame numbers by data
+        self._size = 0  # size when the file was closed
 
     def start(self) -> None:
-        """Write what stands first."""
+        """Write the beginning of the file."""
         self._writer.start(PROFILE, f"smartcam {smartcam.__version__}")
         began = datetime.now(UTC).isoformat()
         facts = {"format": FORMAT, "version": smartcam.__version__, "began": began}
@@ -554,7 +554,7 @@ class RecordingFile:
         self.flush()
 
     def add(self, item: Given) -> None:
-        """Write one thing; it is on the disk after the next :meth:`flush`."""
+        """Write one item; it is on the disk after the next :meth:`flush`."""
         match item:
             case RawFrame():
                 text, data = self._frame_texts.text(item)
@@ -577,16 +577,16 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Bytes so far, without the chunk that is being filled."""
+        """Number of bytes so far, without the chunk that is being filled."""
         return self._size if self._stream.closed else self._stream.tell()
 
     def note(self, name: str, facts: dict[str, str]) -> None:
-        """Write facts under a name, behind what was added."""
-        self._writer.flush()  # the chunk, which would stand behind it
+        """Write facts under a name, after the items so far."""
+        self._writer.flush()  # write the chunk, which would otherwise follow the facts
         self._writer.add_metadata(name, facts)
 
     def check(self) -> None:
-        """Look whether the file is still where it was.
+        """Check that the file is still at its path.
 
         Raises:
             OSError: the file was deleted, or moved away with its folder.
@@ -596,25 +596,25 @@ class RecordingFile:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.path))
 
     def cut(self, size: int) -> None:
-        """Close the file with its first ``size`` bytes, as far as the disk does that."""
+        """Cut the file to its first ``size`` bytes, if the disk allows it, and close it."""
         self.close()
         with contextlib.suppress(OSError):
             os.truncate(self.path, size)
         self._size = size
 
     def flush(self) -> None:
-        """End the chunk and have it put on the disk."""
+        """End the chunk and sync it to the disk."""
         self._writer.flush()
         if self._on_disk:
             os.fsync(self._stream.fileno())
 
     def finish(self) -> None:
-        """Write the index and what stands last."""
+        """Write the index and the end of the file."""
         self._writer.finish()
         self._stream.flush()
 
     def close(self) -> None:
-        """Close the file; what it does not take any more is dropped."""
+        """Close the file, and drop bytes that cannot be written."""
         if self._stream.closed:
             return
         with contextlib.suppress(OSError):
@@ -629,7 +629,7 @@ class RecordingFile:
         return self._write(kind, camera, at, message_of(kind, item, raw_from))
 
     def _frame(self, camera: str, at: datetime, text: bytes, data: str) -> None:
-        """Write a frame; keep its data, as hex, for the result that is made of it."""
+        """Write a frame; keep its data, as hex, for its result."""
         number = self._write("frames", camera, at, text)
         if data:
             self._bodies.add((camera, data), number, len(data))
@@ -641,7 +641,7 @@ class RecordingFile:
         return number
 
     def _picture(self, picture: RecordedPicture) -> None:
-        """Write a picture as it is: its chunk is not packed."""
+        """Write a picture; do not compress its chunk."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import messages
 
@@ -702,7 +702,7 @@ class RecordingFile:
         return channel
 
     def _describe(self, facts: dict[str, str]) -> None:
-        """Write a camera's facts where they are new."""
+        """Write a camera's facts if they are new."""
         before = self._facts.get(facts["camera"], {})
         now = {**before, **facts}
         if now != before:
@@ -711,12 +711,12 @@ class RecordingFile:
 
 
 def address_facts(url: str) -> dict[str, str]:
-    """Return the facts about a camera that its address tells."""
-    if is_fleet(url):  # its own dialect is known to the agent
+    """Return the facts about a camera that follow from its address."""
+    if is_fleet(url):  # only the agent knows the dialect
         return {"url": url, "protocol": "fleet"}
     try:
         address = parse_address(url)
-    except ConfigurationError:  # a plug-in's that is no longer there
+    except ConfigurationError:  # a plug-in that is no longer installed
         return {"url": url}
     quirks = ",".join(address.quirks)
     said = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}

@@ -1,4 +1,4 @@
-"""Tell a camera's state at a place in a recording without reading what came before."""
+"""The state of a camera at a place in a recording, for readers that skip earlier items."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from datetime import datetime
 
 STATE_METADATA = "smartcam.state"
-"""Name of the metadata records that say what a camera was at their place in the file: where a file
-begins while there is a session, and behind a gap."""
+"""Name of the metadata records with a camera's state: at the beginning of a file during a session,
+and after a gap."""
 
 
 class RecordedState(NamedTuple):
@@ -32,7 +32,7 @@ class RecordedState(NamedTuple):
         connected: whether there was a session.
         application: id of the active application; None if it was not known.
         status: status of the camera; None if it was not known.
-        endian: byte order that the last status told.
+        endian: byte order of the last status.
         at: time of the state, UTC; None until the state is written.
     """
 
@@ -58,10 +58,10 @@ class RecordedState(NamedTuple):
                 return self
 
     def facts(self, endian: int, at: datetime) -> dict[str, str]:
-        """Return the texts by which a file tells the state that the camera has at a time.
+        """Return the texts of the camera's state at a time, for a metadata record.
 
-        The time is that of the record behind the state, not that of writing: records wait for the
-        disk, and a replay of a span would begin too early.
+        The time is that of the next record, not of writing: records wait for the disk, and a replay
+        of a span would begin too early.
         """
         found = {
             "camera": self.camera,
@@ -77,10 +77,10 @@ class RecordedState(NamedTuple):
 
     @classmethod
     def of(cls, facts: Mapping[str, str]) -> RecordedState:
-        """Return the state that the texts of a file tell.
+        """Return the state of a metadata record.
 
         Raises:
-            ValueError: the texts tell no state.
+            ValueError: the texts contain no valid state.
         """
         application, status = facts.get("application"), facts.get("status")
         camera, endian = facts.get("camera", ""), facts.get("endian", "0")

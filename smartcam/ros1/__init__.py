@@ -1,7 +1,7 @@
 """ROS 1 in asyncio, without a ROS installation: over a rosbridge.
 
-:class:`RosbridgeNode` publishes topics and serves services; programs of ROS 1 see those of the
-bridge's own node.
+:class:`RosbridgeNode` publishes topics and serves services; programs of ROS 1 see them as topics
+and services of the bridge's own node.
 """
 
 from __future__ import annotations

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from smartcam.fleet._inside import FleetAddress, RosSection
 
 TIMEOUT = 10.0
-"""Seconds to reach the fleet, and to get the first answer of a bridge."""
+"""Seconds to connect to the fleet, and to a bridge."""
 
 
 class RosbridgeFleet(RosFleet):
-    """A node of ROS 1 for each camera of a fleet, as they come and go.
+    """A node of ROS 1 for each camera that a fleet has at the time.
 
     Args:
         bridge: the URL of the rosbridge.
-        on_change: function called with the node whose bridge has come or gone.
+        on_change: function called with a node whose bridge was connected or lost.
         *given: arguments of :class:`RosFleet`.
         **said: arguments of :class:`RosFleet` by name.
     """
@@ -47,11 +47,11 @@ class RosbridgeFleet(RosFleet):
 
     @property
     def bridged(self) -> list[RosbridgeNode]:
-        """The nodes by name."""
+        """The nodes, in the order of their names."""
         return sorted((one.node for one in self.nodes.values()), key=lambda one: one.full_name)
 
     async def wait_tried(self) -> None:
-        """Wait, for a bounded time, until every node has its bridge or the reason why not."""
+        """Wait, for a bounded time, until every node is connected or has failed to connect."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TIMEOUT):
                 for node in self.bridged:
@@ -66,11 +66,11 @@ async def bridged(
     section: RosSection,
     **said: Any,
 ) -> AsyncIterator[RosbridgeFleet]:
-    """Show the cameras of a running fleet in ROS 1.
+    """Run nodes of ROS 1 for the cameras of a running fleet.
 
     Args:
         bridge: the URL of the rosbridge.
-        on_change: function called with the node whose bridge has come or gone.
+        on_change: function called with a node whose bridge was connected or lost.
         address: address of the fleet.
         section: settings of the nodes of the cameras.
         **said: arguments of :class:`RosFleet` about single cameras.

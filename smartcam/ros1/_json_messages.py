@@ -1,6 +1,6 @@
-"""Messages as a rosbridge says them: JSON in the form that ROS 1 has of each type.
+"""Messages for a rosbridge: JSON with the fields of each type in ROS 1.
 
-The types are those of ROS 2. Where ROS 1 has other names the tables here say so; bytes are base64.
+The types are those of ROS 2. The tables of this module have ROS 1's other names; bytes are base64.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ RENAMED: Final[Mapping[str, Mapping[str, str]]] = {
 """Fields that have another name in ROS 1, by type."""
 
 ONLY_ROS1: Final[Mapping[str, Mapping[str, Any]]] = {"std_msgs/msg/Header": {"seq": 0}}
-"""Fields that only ROS 1 has, and what is said there; rospy counts a header's itself."""
+"""Fields that only ROS 1 has, and their values; rospy counts a header's ``seq`` itself."""
 
 ONLY_ROS2: Final = frozenset(
     {"action_msgs", "composition_interfaces", "lifecycle_msgs", "rcl_interfaces", "rosgraph_msgs",
      "service_msgs", "statistics_msgs", "type_description_interfaces", "vision_msgs"}
 )  # fmt: skip
-"""Packages that ROS 1 has not, or with other fields."""
+"""Packages that ROS 1 does not have, or has with other fields."""
 
 _ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
     "bool": (bool,),
@@ -43,16 +43,16 @@ _ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
     "float32": (int, float),
     "float64": (int, float),
 }
-"""Types that a value of JSON may have, by the field's type; all others are integers."""
+"""Python types of a JSON value, by the field's type; all others are integers."""
 
 _BYTES: Final = ("uint8", "char")
 _MARK: Final = secrets.token_hex(12)
-_CHUNK: Final = 3 << 16  # a multiple of three: parts of base64 make a whole
+_CHUNK: Final = 3 << 16  # a multiple of three, so that parts of base64 can be joined
 _MAX_LEVELS = 32
 
 
 class Raw:
-    """Bytes that become base64 where they are sent: a picture that is dropped never does."""
+    """Bytes that are encoded as base64 only when sent: not for a picture that is dropped."""
 
     __slots__ = ("data",)
 
@@ -63,7 +63,7 @@ class Raw:
         return (len(self.data) + 2) // 3 * 4
 
     def chunks(self) -> list[memoryview]:
-        """Return the bytes in parts that take a moment each."""
+        """Return the bytes in parts, each of which is encoded in a short time."""
         return [self.data[start : start + _CHUNK] for start in range(0, len(self.data), _CHUNK)]
 
 
@@ -74,12 +74,12 @@ def ros1_name(name: str) -> str | None:
 
 
 def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
-    """Return a message, or the mapping of its fields, as JSON has it, with :class:`Raw` for bytes.
+    """Return a message, or the mapping of its fields, as JSON values, with :class:`Raw` for bytes.
 
     Raises:
-        RosMessageError: the value is no message of this type.
+        RosMessageError: the value does not fit the type.
     """
-    # what comes back fits, and is ours: who publishes may use a buffer again
+    # the decoded copy is valid, and independent of the publisher's buffers
     return _fields(kind, kind.decode(kind.encode(message)))
 
 
@@ -107,19 +107,19 @@ def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
 
 
 def _signed(value: int) -> int:
-    """Return a byte as ROS 1 has it, whose ``byte`` is an int8."""
+    """Return a byte for ROS 1, whose ``byte`` is an int8."""
     return value - 256 if value > 127 else int(value)
 
 
 def from_json(kind: MessageType, said: Any) -> Any:
-    """Return the message that JSON holds; fields that are not in it are zero.
+    """Return the message of a JSON value; missing fields are zero.
 
     Args:
         kind: type of the message.
         said: object of the fields, or array of the first fields' values in order.
 
     Raises:
-        RosMessageError: a field that the type has not, or a value that does not fit.
+        RosMessageError: the type does not have a field, or a value does not fit.
     """
     if isinstance(said, list):
         if len(said) > len(kind.fields):
@@ -130,11 +130,11 @@ def from_json(kind: MessageType, said: Any) -> Any:
         ordered = [names.get(one.name, one.name) for one in kind.fields]
         said = dict(zip(ordered, said, strict=False))
     message = kind.new(**_said(kind, said, "", _MAX_LEVELS))
-    return kind.decode(kind.encode(message))  # as ROS 2 has it: arrays of numpy, bytes
+    return kind.decode(kind.encode(message))  # makes numpy arrays and bytes, as in ROS 2
 
 
 def _said(kind: MessageType, said: Any, where: str, depth: int) -> dict[str, Any]:
-    """Return the fields of an object under our names; what they are is looked at afterwards."""
+    """Return the fields of an object under their names in ROS 2; encoding checks the values."""
     if not isinstance(said, dict):
         raise RosMessageError(
             f"{kind.name}: {where or 'the whole'}: expected an object, got {said!r:.80}"
@@ -184,7 +184,7 @@ def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:
     """Return the parts of an operation's text.
 
     Raises:
-        RosMessageError: a number that JSON has not.
+        RosMessageError: a number is not finite, which JSON cannot have.
     """
     raws: list[Raw] = []
 
@@ -203,7 +203,7 @@ def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:
         ) from exc
     if not raws:
         return (text,)
-    first, *others = text.split(_MARK)  # its quotation marks stay
+    first, *others = text.split(_MARK)  # the quotation marks remain
     parts: list[Part] = [first]
     for raw, after in zip(raws, others, strict=True):
         parts += (raw, after)

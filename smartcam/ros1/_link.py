@@ -1,4 +1,4 @@
-"""Keep a WebSocket to a rosbridge, opened again whenever it is lost."""
+"""Keep a WebSocket to a rosbridge, and open it again whenever it is lost."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 CONNECT_TIMEOUT = 10.0
-"""Seconds until a bridge has answered the handshake."""
+"""Seconds for a bridge to answer the handshake."""
 STALLED_TIMEOUT = 10.0
-"""Seconds that a bridge may take to read one message."""
+"""Seconds for a bridge to read one message."""
 GOODBYE_TIMEOUT = 1.0
-"""Seconds that a bridge gets to answer a goodbye."""
+"""Seconds for a bridge to answer a closing handshake."""
 SEND_BUFFER = 1 << 17
-"""Number of bytes that the system keeps for a slow bridge: small, as waiting data grow old."""
+"""Number of bytes of the system's send buffer: small, since waiting data become old."""
 HEARTBEAT_INTERVAL = 10.0
-"""Seconds of silence after which the bridge gets a ping; it has half of them to answer."""
+"""Seconds of silence after which the bridge gets a ping; half of them are the timeout."""
 MIN_LIFETIME = 5.0
 """Seconds that a link must have lasted for the next attempt to be immediate."""
 MAX_MESSAGE_BYTES = 8 << 20
@@ -46,13 +46,13 @@ class LinkListener(Protocol):
     """The receiver of a link's events."""
 
     def came(self) -> None:
-        """Take note that there is a bridge; advertise the topics to it."""
+        """Handle a new connection; advertise the topics."""
 
     def heard(self, operation: dict[str, Any]) -> None:
-        """Take an operation; never waits."""
+        """Handle an operation; never wait."""
 
     async def lost(self, was: bool) -> None:
-        """Take note that there is no bridge, and whether there was one before."""
+        """Handle a lost connection, or a failed attempt if ``was`` is False."""
 
 
 def checked_url(url: str) -> str:
@@ -77,7 +77,7 @@ def _aiohttp() -> Any:
 
 
 def link_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that a link raises if it cannot be created, or breaks."""
+    """Return the errors of a link that cannot be opened, or breaks."""
     return OSError, TimeoutError, _aiohttp().ClientError
 
 
@@ -89,10 +89,10 @@ async def _refuse_redirect(_session: object, _context: object, sent: Any) -> Non
 
 @contextlib.asynccontextmanager
 async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-    """Open a WebSocket to a bridge; data that it has not read at the end are dropped.
+    """Open a WebSocket to a bridge; at the end drop data that the bridge has not read.
 
     Raises:
-        OSError, aiohttp.ClientError, TimeoutError: there is no bridge.
+        OSError, aiohttp.ClientError, TimeoutError: the bridge cannot be reached.
     """
     aiohttp = _aiohttp()
     timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE_TIMEOUT)
@@ -119,16 +119,16 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
                 async with asyncio.timeout(GOODBYE_TIMEOUT):
                     await web.close()
             except link_errors():
-                pass  # the bridge does not read, or is gone
+                pass  # the bridge does not read, or has ended
             finally:
                 if peer is not None:
                     with contextlib.suppress(OSError):
-                        # or waiting data would be kept for the bridge
+                        # otherwise waiting data would be kept for the bridge
                         peer.shutdown(socket.SHUT_RDWR)
 
 
 async def text_of(parts: tuple[Part, ...]) -> str:
-    """Return the text of an operation; a long one lets the loop run in between."""
+    """Return the text of an operation; for a long one, let the loop run in between."""
     pieces: list[str] = []
     for part in parts:
         if isinstance(part, str):
@@ -147,8 +147,8 @@ class BridgeLink:
     Attributes:
         url: URL of the bridge.
         outbox: operations and messages to send.
-        connected: whether there is a bridge now.
-        failure: reason why there is no bridge; "" if nothing has been tried.
+        connected: whether the bridge is connected now.
+        failure: reason why the bridge is not connected; "" before the first attempt.
         changed: condition that is notified of each change of ``connected`` and ``failure``.
     """
 
@@ -161,7 +161,7 @@ class BridgeLink:
         self._listener, self._backoff = listener, backoff
 
     async def run(self) -> None:
-        """Keep a link until this task is cancelled, or the attempts are over."""
+        """Keep a link until this task is cancelled, or the last attempt has failed."""
         clock, short_lived = asyncio.get_running_loop().time, 0
         while True:
             for delay in self._backoff.delays(short_lived=short_lived):
@@ -176,7 +176,7 @@ class BridgeLink:
                 return
 
     async def _try(self) -> str:
-        """Have one link until it is lost; return why."""
+        """Open one link and use it until it is lost; return the reason."""
         try:
             async with web_socket(self.url) as web:
                 logger.info("%s: connected", self.url)
@@ -208,7 +208,7 @@ class BridgeLink:
             self.changed.notify_all()
 
     async def _tell_lost(self, reason: str) -> bool:
-        """Log that there is no link; return True if there was one."""
+        """Log that the link is lost; return True if there was one."""
         told_before = self.failure
         was = await self.end(f"{self.url}: {reason}")
         level = logging.DEBUG if told_before == self.failure else logging.WARNING
@@ -240,7 +240,7 @@ class BridgeLink:
             message = await web.receive()
             if message.type is kinds.TEXT:
                 self._hear(message.data)
-                await asyncio.sleep(0)  # many operations may have come at once
+                await asyncio.sleep(0)  # let the loop run, if many operations came at once
                 await self.outbox.room()
             elif message.type is kinds.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))

@@ -1,4 +1,4 @@
-"""Queue what is to be sent to a rosbridge: bounded, and where there is no room the newest wins."""
+"""A bounded queue of operations and messages for a rosbridge, which drops the oldest messages."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ if TYPE_CHECKING:
     from smartcam.ros1._json_messages import Part
 
 MAX_WAITING_OPERATIONS = 256
-"""Operations that wait before nothing more is read from the bridge."""
+"""Number of waiting operations at which reading from the bridge pauses."""
 MAX_WAITING_BYTES = 32 << 20
 """Largest number of bytes that the waiting messages of one topic may have together; one message may
 have more."""
 
 
 class Lane:
-    """The messages of one topic that wait.
+    """The waiting messages of one topic.
 
     Attributes:
         dropped: messages that were not sent: no bridge, or newer ones came.
-        sent: messages that were handed to the WebSocket.
+        sent: messages that were passed to the WebSocket.
         waiting_bytes: bytes of the messages that wait.
     """
 
@@ -39,7 +39,7 @@ class Lane:
         return bool(self._waiting)
 
     def put(self, parts: tuple[Part, ...], *, connected: bool) -> None:
-        """Have a message wait; without a bridge only a latched topic's last one does."""
+        """Queue a message; without a bridge keep only a latched topic's last one."""
         if self.latched:
             self._last = parts
         elif not connected:
@@ -55,25 +55,25 @@ class Lane:
             self.dropped += 1
 
     def take(self) -> tuple[Part, ...]:
-        """Return the oldest."""
+        """Remove and return the oldest message."""
         parts = self._waiting.popleft()
         self.waiting_bytes -= sum(map(len, parts))
         return parts
 
     def clear(self) -> None:
-        """Forget what waits: the bridge is gone."""
+        """Drop waiting messages, since the bridge is lost."""
         self.dropped += 0 if self.latched else len(self._waiting)
         self._waiting.clear()
         self.waiting_bytes = 0
 
     def say_again(self) -> None:
-        """Have a latched topic's last message wait: the bridge is new."""
+        """Queue a latched topic's last message for a new bridge."""
         if self._last is not None and not self._waiting:
             self.put(self._last, connected=True)
 
 
 class Outbox:
-    """Operations first, in order; then the topics in turn."""
+    """Returns operations first, in order, then messages of the topics in turn."""
 
     def __init__(self) -> None:
         self._operations: collections.deque[tuple[Part, ...]] = collections.deque()
@@ -84,27 +84,27 @@ class Outbox:
         self._flushed = asyncio.Event()
 
     def say(self, parts: tuple[Part, ...]) -> None:
-        """Have an operation wait."""
+        """Queue an operation."""
         self._operations.append(parts)
         self.wake()
         if len(self._operations) >= MAX_WAITING_OPERATIONS:
             self._room.clear()
 
     def add(self, lane: Lane) -> None:
-        """Send the messages of a lane, too."""
+        """Include the messages of a lane."""
         self._lanes.append(lane)
 
     def remove(self, lane: Lane) -> None:
-        """Send no more messages of a lane."""
+        """Exclude the messages of a lane."""
         self._lanes.remove(lane)
 
     def wake(self) -> None:
-        """Note that something waits to be sent."""
+        """Wake the sender, since a message waits."""
         self._ready.set()
         self._flushed.clear()
 
     def clear(self) -> None:
-        """Forget all that waits."""
+        """Drop all waiting operations and messages."""
         self._operations.clear()
         for lane in self._lanes:
             lane.clear()
@@ -113,15 +113,15 @@ class Outbox:
 
     @property
     def full(self) -> bool:
-        """True if more operations wait than should."""
+        """True if more operations wait than the bound."""
         return not self._room.is_set()
 
     async def room(self) -> None:
-        """Wait while more operations wait than should."""
+        """Wait while more operations wait than the bound."""
         await self._room.wait()
 
     async def flushed(self) -> None:
-        """Wait until everything was taken, and who took it came back for more."""
+        """Wait until the sender has taken everything, and has sent it."""
         await self._flushed.wait()
 
     async def take(self) -> tuple[Part, ...]:

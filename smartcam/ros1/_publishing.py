@@ -1,4 +1,4 @@
-"""Topics that are published through a rosbridge."""
+"""Publishers of topics through a rosbridge."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RosbridgePublisher:
         type: type of the messages.
         lane: messages that wait to be sent.
         exists: whether ROS 1 has the type.
-        subscribed: whether anybody hears the topic, as far as is known.
+        subscribed: whether the topic has subscribers; True if that is not known.
     """
 
     def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
@@ -31,46 +31,46 @@ class RosbridgePublisher:
         self.type: MessageType = kind
         self.lane: Lane = Lane(qos.kept, latched=qos.latched)
         self.exists: bool = ros1_name(kind.name) is not None
-        self.subscribed = True  # or it is not known
+        self.subscribed = True  # also if it is not known
         self._node = node
 
     @property
     def published(self) -> int:
-        """Messages that were sent; the bridge does not say what became of them."""
+        """Number of messages that were sent; the bridge does not confirm them."""
         return self.lane.sent
 
     @property
     def dropped(self) -> int:
-        """Messages that were not sent: there was no bridge, or newer ones came."""
+        """Number of messages that were not sent: there was no bridge, or newer ones came."""
         return self.lane.dropped
 
     @property
     def heard(self) -> bool:
-        """True if a message may be heard: the bridge is there, and nothing says that nobody hears.
+        """True if the bridge is connected and the topic may have subscribers.
 
-        Of a topic with long messages it is asked every two seconds, where rosapi answers, as it
-        does beside most bridges.
+        For a topic with long messages, rosapi is asked for subscribers every two seconds, if it
+        answers, as it does with most bridges.
         """
         if not self.exists or self.lane.latched:
             return self.exists
         return self._node.connected and self.subscribed
 
     def publish(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message; never waits.
+        """Publish a message; never wait.
 
         Args:
-            message: one of the type's own, or a mapping of its fields.
-            **fields: the fields, where no message is given.
+            message: message of the type, or a mapping of its fields.
+            **fields: the fields, if ``message`` is not given.
 
         Raises:
-            RosMessageError: the value is no message of the type.
+            RosMessageError: the value does not fit the type.
             RosError: the publisher is closed.
         """
         if message is not None and fields:
             raise RosMessageError("expected a message or its fields, got both")
         said: dict[str, Any] = {"op": "publish", "topic": self.name}
         if self.lane.latched:
-            said["latch"] = True  # or the bridge takes it for another publisher
+            said["latch"] = True  # otherwise the bridge takes this for another publisher
         said["msg"] = to_json(self.type, fields if message is None else message)
         if not self._node.has(self):
             raise RosError(f"{self.name}: this publisher is closed")
@@ -79,7 +79,7 @@ class RosbridgePublisher:
             self._node.wake()
 
     def publish_encoded(self, data: bytes) -> None:
-        """Publish what is a message in CDR; never waits.
+        """Publish a message in CDR; never wait.
 
         Raises:
             RosMessageError, RosError: as of :meth:`publish`.
@@ -87,7 +87,7 @@ class RosbridgePublisher:
         self.publish(self.type.decode(data))
 
     def close(self) -> None:
-        """Be gone; what waits is not sent any more. Idempotent."""
+        """Close the publisher, and drop waiting messages. Idempotent."""
         self._node.forget(self)
 
     async def __aenter__(self) -> Self:
@@ -97,6 +97,6 @@ class RosbridgePublisher:
         self.close()
 
     def advertisement(self) -> dict[str, Any]:
-        """Return the operation that tells a bridge of the topic."""
-        told = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
-        return {**told, "latch": self.lane.latched}
+        """Return the operation that advertises the topic to a bridge."""
+        operation = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
+        return {**operation, "latch": self.lane.latched}

@@ -1,9 +1,9 @@
-"""Having a bridge forget services, of an earlier link or of ours at its end.
+"""Withdraw services from a bridge, those of an earlier link or at the end of a link.
 
-A bridge keeps a service whose link is gone, and has its callers wait without end. Advertised again,
-it counts its calls from one again, while the old ones wait for the same numbers: one might get the
-answer to another. So services are withdrawn before they are advertised, and at the end. Each takes
-the bridge a second, in which it does nothing else for this link; so other links do it.
+A bridge keeps the services of a lost link, and lets their callers wait forever. If a service is
+advertised again, the bridge counts its calls from one again, while old calls wait for the same
+numbers: a call might get the answer to another. So services are withdrawn before they are
+advertised, and at the end. That takes the bridge a second for each, so other links are used.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 LINK_COUNT = 8
-"""Side by side, for a node's services."""
+"""Largest number of links for the services of a node at a time."""
 PER_SERVICE = 2.0
-"""Seconds for each, of which the bridge takes one."""
+"""Seconds of the timeout for each service, of which the bridge takes one."""
 SPARE_SECONDS = 5.0
-"""Seconds more, for the link and for a bridge that is busy."""
+"""Further seconds of the timeout, for the link and for a busy bridge."""
 KNOWN = "/rosout/get_loggers"
-"""A service that every roscore has. Its answer says that what was said before is done."""
+"""A service that every roscore has; its answer comes after the bridge has handled earlier calls."""
 
 
 def question(service: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return a call, which a bridge answers when it is through with all before."""
+    """Return a call that a bridge answers when it has handled all earlier operations."""
     mark = f"smartcam:{uuid.uuid4()}"
     return {"op": "call_service", "service": service, "id": mark, "args": arguments}
 
 
 async def retire(url: str, services: Sequence[str]) -> None:
-    """Have a bridge withdraw services, whoever advertised them; what fails is logged."""
+    """Make a bridge withdraw services of any link; log failures."""
     shares = [share for start in range(LINK_COUNT) if (share := services[start::LINK_COUNT])]
     try:
         async with (
@@ -50,7 +50,7 @@ async def retire(url: str, services: Sequence[str]) -> None:
             for share in shares:
                 group.create_task(_retire(url, share))
     except TimeoutError:
-        logger.warning("%s: does not say that it has withdrawn its services", url)
+        logger.warning("%s: did not confirm that it has withdrawn services", url)
 
 
 async def _retire(url: str, services: Sequence[str]) -> None:
@@ -64,10 +64,10 @@ async def _retire(url: str, services: Sequence[str]) -> None:
 
 
 async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
-    """Wait until a bridge is through with what it was told.
+    """Wait until a bridge has handled the earlier operations.
 
     Raises:
-        ConnectionError: the bridge is gone.
+        ConnectionError: the bridge closed the link.
     """
     asked = question(KNOWN, {})
     await web.send_json(asked)
@@ -78,4 +78,4 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
             continue
         if isinstance(operation, dict) and operation.get("id") == asked["id"]:
             return
-    raise ConnectionError("it closed the link")
+    raise ConnectionError("the bridge closed the link")

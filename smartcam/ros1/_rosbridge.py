@@ -1,4 +1,4 @@
-"""A node of ROS 1 behind a rosbridge: it publishes and hears topics, and serves services."""
+"""A node of ROS 1 through a rosbridge: it publishes, subscribes, and serves services."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 FLUSH_TIMEOUT = 1.0
-"""Seconds at the end for what waits to be sent."""
+"""Seconds to send waiting operations at the end."""
 ASK_TIMEOUT = 5.0
-"""Seconds for the answer to a call by smartcam."""
+"""Seconds of the timeout of a call by smartcam."""
 REPEAT_INTERVAL = 10.0
-"""Seconds between two sayings of what is latched on a topic that nodes share, such as
+"""Seconds between two repetitions of a latched message on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
 _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
 
@@ -41,29 +41,29 @@ _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.I
 class RosbridgeNode(NamedNode):
     """A node of ROS 1 in asyncio, over a rosbridge; ``async with`` opens and closes it.
 
-    Opening it does not wait for the bridge: it is tried until it is there, and again when it is
-    lost. Everything is advertised again then, and the last message of a latched topic published
-    again; other messages without a bridge are dropped and counted. A call that is under way when
-    the bridge goes is cancelled.
+    Opening the node does not wait for the bridge: the node tries to connect until it succeeds, and
+    again after a loss. Then it advertises everything again, and publishes the last message of each
+    latched topic again; other messages without a bridge are dropped and counted. A call under way
+    is cancelled when the bridge is lost.
 
-    The protocol has no answer to an advertisement: that a bridge does not know a type, because its
-    machine has not the package, is in the bridge's log alone.
+    The protocol has no answer to an advertisement: if a bridge does not know a type, because its
+    machine does not have the package, only the bridge's log says so.
 
     Args:
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         bridge: the bridge's URL, ``ws://host:9090``.
-        types: the messages and services that are known; None for those of Jazzy. What ROS 1 has not
-            is left out where it is published or served, and told in the log.
-        backoff: delays between tries to reach a bridge; None: those of :class:`smartcam.Backoff`.
-        on_change: function called in the event loop when the bridge has come or gone.
+        types: the known messages and services; None for those of Jazzy. Topics and services of
+            types that ROS 1 does not have are left out, and logged.
+        backoff: delays between attempts to connect; None: those of :class:`smartcam.Backoff`.
+        on_change: function called in the event loop when the bridge was connected or lost.
 
     Raises:
         ConfigurationError: a name or the URL is not valid.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
-    parameters: None = None  # ROS 1 keeps parameters elsewhere
+    parameters: None = None  # nodes of ROS 1 have no parameters of their own
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class RosbridgeNode(NamedNode):
         self._services: dict[str, RosbridgeService] = {}
         self._subscriptions: list[RosbridgeSubscription] = []
         self._running: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()  # tasks that live as long as a link
+        self._tasks: set[asyncio.Task[None]] = set()  # tasks that end with the link
         self._new: list[RosbridgeService] = []  # services to be advertised
         self._leaving: list[RosbridgeService] = []  # services to be withdrawn
         self._changing: asyncio.Task[None] | None = None
@@ -98,29 +98,29 @@ class RosbridgeNode(NamedNode):
 
     @property
     def is_open(self) -> bool:
-        """True from ``start()`` until ``stop()``, whether the bridge is there or not."""
+        """True from ``start()`` until ``stop()``, with or without a bridge."""
         return self._running is not None
 
     @property
     def connected(self) -> bool:
-        """True while the bridge is there."""
+        """True while the bridge is connected."""
         return self._link.connected
 
     @property
     def failure(self) -> str:
-        """Reason for which the bridge is not there; "" if it is, or has not been tried."""
+        """Reason why the bridge is not connected; "" if it is, or before the first attempt."""
         return self._link.failure
 
     async def wait_connected(self, timeout: float | None = None) -> None:
-        """Wait until the bridge is there.
+        """Wait until the bridge is connected.
 
         Raises:
-            TimeoutError: the bridge was not within ``timeout`` seconds.
+            TimeoutError: the bridge was not connected within ``timeout`` seconds.
         """
         await self._wait(timeout, lambda: self._link.connected)
 
     async def wait_tried(self) -> None:
-        """Wait until the bridge is there, or it is known why not."""
+        """Wait until the bridge is connected, or an attempt has failed."""
         await self._wait(None, lambda: self._link.connected or bool(self._link.failure))
 
     async def _wait(self, timeout: float | None, met: Callable[[], bool]) -> None:
@@ -154,7 +154,7 @@ class RosbridgeNode(NamedNode):
             self._outbox = self._link.outbox = Outbox()
 
     async def _withdraw_all(self) -> None:
-        with contextlib.suppress(TimeoutError):  # it does not read
+        with contextlib.suppress(TimeoutError):  # the bridge does not read
             async with asyncio.timeout(FLUSH_TIMEOUT):
                 await self._outbox.flushed()
         for service in tuple(self._services.values()):
@@ -168,13 +168,13 @@ class RosbridgeNode(NamedNode):
         """Publish on a topic.
 
         Args:
-            topic: absolute, relative to the namespace, or private (``~/it``).
-            type: such as ``std_msgs/msg/String``.
+            topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
+            type: type of the messages, such as ``std_msgs/msg/String``.
             qos: quality of service, of which ``depth``, for messages that wait for the bridge, and
                 ``latched`` count.
 
         Raises:
-            ConfigurationError: the topic is not valid, is there already, or there is no such type.
+            ConfigurationError: the topic is not valid, exists already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
@@ -185,11 +185,11 @@ class RosbridgeNode(NamedNode):
         return publisher
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgeSubscription:
-        """Hear a topic.
+        """Subscribe to a topic.
 
         Args:
             topic: name of the topic, as of :meth:`publisher`.
-            type: such as ``std_msgs/msg/String``.
+            type: type of the messages, such as ``std_msgs/msg/String``.
             qos: quality of service, of which ``depth`` counts, for messages that wait for a reader.
 
         Raises:
@@ -222,10 +222,10 @@ class RosbridgeNode(NamedNode):
                 ``message`` or ``status_message``; where the response has none of these fields, the
                 call fails at its caller.
             qos: has no meaning in ROS 1.
-            timeout: seconds that the handler may take.
+            timeout: seconds of the handler's timeout.
 
         Raises:
-            ConfigurationError: the name is not valid, is there already, or there is no such type.
+            ConfigurationError: the name is not valid, exists already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.service(type), self._new_name(service, "service", self._services)
@@ -254,7 +254,7 @@ class RosbridgeNode(NamedNode):
         return end in (self._publishers.get(end.name), self._services.get(end.name))
 
     def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
-        """Have no more of it."""
+        """Remove a closed publisher or service."""
         if not self.has(end):
             return
         if isinstance(end, RosbridgePublisher):
@@ -270,35 +270,35 @@ class RosbridgeNode(NamedNode):
             self._change()
 
     def forget_subscription(self, heard: RosbridgeSubscription) -> None:
-        """Hear no more of it."""
+        """Remove a closed subscription."""
         if heard in self._subscriptions:
             self._subscriptions.remove(heard)
             heard.leave()
 
     def renew(self, service: RosbridgeService) -> None:
-        """Withdraw a service and advertise it again: its calls fail at their callers."""
+        """Withdraw a service and advertise it again, so that its calls fail at their callers."""
         service.end_turn()
         self._leaving.append(service)
         self._new.append(service)
         self._change()
 
     def say(self, parts: tuple[Part, ...]) -> None:
-        """Say something to the bridge that is there; the next one hears all it needs by itself."""
+        """Send an operation to the connected bridge; a later one gets all advertisements."""
         if self.connected:
             self._outbox.say(parts)
 
     def wake(self) -> None:
-        """Wake the task that sends: a message waits."""
+        """Wake the task that sends, since a message waits."""
         self._outbox.wake()
 
     def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Have something done as long as this bridge is there."""
+        """Start a task that is cancelled when this bridge is lost."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
-    # ------------------------------------------------------------------ what the link tells
+    # ------------------------------------------------------------------ events of the link
 
     def came(self) -> None:
         """Advertise everything to a new bridge."""
@@ -320,7 +320,7 @@ class RosbridgeNode(NamedNode):
         except ENDS_PROGRAM:
             raise
         except BaseException:
-            logger.exception("%s ! who was to be told of the bridge", self.full_name)
+            logger.exception("%s ! on_change failed", self.full_name)
 
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"
@@ -332,7 +332,7 @@ class RosbridgeNode(NamedNode):
                     self._outbox.wake()
 
     def _change(self) -> None:
-        """Have services withdrawn and advertised: one after another, those of this turn at once."""
+        """Withdraw and advertise services one after another, those of this turn together."""
         if self.connected and self._changing is None and (self._new or self._leaving):
             self._changing = self.begin(self._change_services())
             self._changing.add_done_callback(self._changed)
@@ -348,16 +348,16 @@ class RosbridgeNode(NamedNode):
         self._new = []
         await asyncio.gather(*(one.still() for one in leaving))
         await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
-        if leaving:  # what the bridge has said before: calls that it has aborted
+        if leaving:  # first handle calls that the bridge has aborted
             await self.ask(KNOWN, {})
         self._leaving = self._leaving[len(leaving) :]
         for service in new:
             service.advertise()
 
     async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
-        """Call a service of ROS 1: what the bridge says then, None if it says nothing in time.
+        """Call a service of ROS 1; return the bridge's answer, None without one in time.
 
-        All that it said before was heard by then.
+        Earlier operations of the bridge have been handled by then.
         """
         asked = question(service, arguments)
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
@@ -378,7 +378,7 @@ class RosbridgeNode(NamedNode):
             answer.set_result(operation)
 
     def heard(self, operation: dict[str, Any]) -> None:
-        """Do what the bridge says."""
+        """Handle an operation of the bridge."""
         hear = self._hears.get(operation["op"])
         if hear is None:
             logger.debug("%s: from the bridge: %.200r", self.full_name, operation)
@@ -386,7 +386,7 @@ class RosbridgeNode(NamedNode):
             hear(operation)
 
     async def lost(self, was: bool) -> None:
-        """End what was under way for a bridge that is gone."""
+        """End calls and tasks for a lost bridge."""
         if self._running is not None and was:
             self._tell_change()
         for service in self._services.values():
@@ -405,12 +405,12 @@ class RosbridgeNode(NamedNode):
             return
         service = self._services.get(name)
         if any(one.name == name for one in self._leaving):
-            return  # it fails at its caller
+            return  # the call fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
             self.say(encoded(refusal))
-        elif service.ready:  # or it is a call that the bridge aborts
+        elif service.ready:  # otherwise the bridge aborts the call
             service.call(identity, operation.get("args"))
 
     def _published(self, operation: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Services that are called through a rosbridge."""
+"""Services for callers behind a rosbridge."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 MAX_CONCURRENT_CALLS = 64
-"""Largest number of calls of a service that are carried out at the same time; one beyond is
+"""Largest number of calls of a service that are carried out at the same time; further ones are
 refused."""
 SETTLE_TIME = 0.5
-"""Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
-has not handed over stays, and is then the response to a later call."""
+"""Seconds for a bridge to pass on a response before its service is withdrawn. A response that
+remains in the bridge would become that to a later call."""
 CLOSE_TIMEOUT = 5.0
-"""Seconds for handlers that were cancelled; one that goes on is its author's."""
+"""Seconds to wait for cancelled handlers; a handler that goes on is its author's fault."""
 ERROR_FIELDS = ("error", "message", "status_message")
-"""The fields of a response that say what went wrong, the first that it has."""
+"""Fields of a response for an error's text; the first that the response has is used."""
 
 
 class RosbridgeService:
-    """Serves; made by :meth:`RosbridgeNode.serve`.
+    """A service, made by :meth:`RosbridgeNode.serve`.
 
     Attributes:
         name: absolute name of the service.
         type: type of requests and responses.
         ready: whether the service is advertised to the present bridge.
-        calls: calls that came.
-        failed: calls that were refused, or failed.
+        calls: number of calls.
+        failed: number of calls that were refused, or failed.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class RosbridgeService:
         self._node, self._handler, self._timeout = node, handler, timeout
         self._tasks: set[asyncio.Task[None]] = set()
         self._responded = float("-inf")
-        self._turn = 0  # of being advertised: what was called in another one is not answered
+        self._turn = 0  # number of the advertisement: calls of an earlier one are not answered
         self._text_field = error_field(kind.response)
 
     def close(self) -> None:
-        """Serve no more; calls under way fail at their callers. Idempotent."""
+        """Close the service; calls under way fail at their callers. Idempotent."""
         self._node.forget(self)
 
     async def wait_closed(self) -> None:
-        """Wait until the calls that were given up have ended."""
+        """Wait until cancelled calls have ended."""
         if self._tasks:
             await asyncio.wait(tuple(self._tasks))
 
@@ -83,16 +83,16 @@ class RosbridgeService:
     def advertise(self) -> None:
         """Advertise the service, unless it is closed."""
         if self._node.has(self):
-            self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
+            self._send({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True
 
     def end_turn(self) -> None:
-        """Answer no call that came up to now: the bridge counts them from one again."""
+        """Answer no earlier call, since the bridge counts calls from one again."""
         self.ready = False
         self._turn += 1
 
     async def still(self) -> None:
-        """End the calls under way, and let the bridge hand over the responses that it has."""
+        """End the calls under way, and let the bridge pass on the responses that it has."""
         self.end_turn()
         for task in self._tasks:
             task.cancel()
@@ -103,7 +103,7 @@ class RosbridgeService:
             await asyncio.sleep(left)
 
     def call(self, identity: object, said: object) -> None:
-        """Carry out a call. What it waits for ends where the bridge goes."""
+        """Carry out a call, which is cancelled if the bridge is lost."""
         self.calls += 1
         busy = len(self._tasks) >= MAX_CONCURRENT_CALLS
         task = self._node.begin(self._carry_out(identity, said, busy=busy))
@@ -132,7 +132,7 @@ class RosbridgeService:
 
     async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
         if busy:
-            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most")
+            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most")
         request = from_json(self.type.request, {} if said is None else said)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)
@@ -146,8 +146,8 @@ class RosbridgeService:
             values = to_json(kind, {self._text_field: text})
             self._respond(turn, self._encoded(identity, values, result=False))
         elif turn == self._turn:
-            # A bridge takes no notice of the result and would hand over zeros: the service goes for
-            # a moment, which is an error for its callers.
+            # A bridge ignores ``result`` and would pass on zeros. So the service is withdrawn for a
+            # moment, which is an error for its callers.
             self._respond(turn, self._encoded(identity, None, result=False))
             self._node.renew(self)
 
@@ -164,11 +164,11 @@ class RosbridgeService:
             self._responded = asyncio.get_running_loop().time()
             self._node.say(parts)
 
-    def _say(self, operation: dict[str, Any]) -> None:
+    def _send(self, operation: dict[str, Any]) -> None:
         self._node.say(encoded({**operation, "service": self.name}))
 
 
 def error_field(kind: MessageType) -> str:
-    """Return the field of a response that says what went wrong, "" if it has none."""
+    """Return the field of a response for an error's text, "" if it has none."""
     texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
     return next((one for one in ERROR_FIELDS if one in texts), "")

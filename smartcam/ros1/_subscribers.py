@@ -1,4 +1,4 @@
-"""Find out who hears a topic with long messages, since a bridge sends on whatever comes."""
+"""Find out which topics with long messages have subscribers, which a bridge does not report."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
 SERVICE: Final = "/rosapi/subscribers"
 """Service of the node ``rosapi``, which rosbridge's launch file starts beside the bridge."""
 PERIOD = 2.0
-"""Seconds between two questions."""
+"""Seconds between two calls of rosapi."""
 LONG: Final = frozenset(
     {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"}
 )
-"""Types whose messages are worth a question."""
+"""Types of messages that are long enough for a call of rosapi."""
 
 
 async def listen_for_subscribers(
     node: RosbridgeNode, publishers: Mapping[str, RosbridgePublisher]
 ) -> None:
-    """Keep ``subscribed`` of the publishers as it is, as long as rosapi answers."""
+    """Update ``subscribed`` of the publishers, as long as rosapi answers."""
     for publisher in publishers.values():
         publisher.subscribed = True
     while True:

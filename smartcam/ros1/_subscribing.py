@@ -1,4 +1,4 @@
-"""Topics that are heard through a rosbridge."""
+"""Subscriptions to topics through a rosbridge."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.ros2 import MessageType, QoS
 
 MAX_WAITING_MESSAGES: Final = 1000
-"""Largest number of messages that wait for a reader, whatever the quality of service says."""
+"""Largest number of messages that wait for a reader, whatever the quality of service."""
 
 
 class RosbridgeSubscription(TopicReader[object]):
@@ -37,24 +37,24 @@ class RosbridgeSubscription(TopicReader[object]):
         return from_json(self.type, item)
 
     def close(self) -> None:
-        """Hear no more; iterating ends. Idempotent."""
+        """End the subscription and its iterators. Idempotent."""
         self._node.forget_subscription(self)
         self._queue.close()
 
     # ------------------------------------------------------------------ for the node
 
     def ask(self) -> None:
-        """Ask the bridge for the topic's messages."""
-        told = {"op": "subscribe", "topic": self.name, "type": ros1_name(self.type.name)}
-        self._node.say(encoded({**told, "id": self._id, "queue_length": self._depth}))
+        """Subscribe at the bridge."""
+        operation = {"op": "subscribe", "topic": self.name, "type": ros1_name(self.type.name)}
+        self._node.say(encoded({**operation, "id": self._id, "queue_length": self._depth}))
 
     def leave(self) -> None:
-        """Tell the bridge to send them no more."""
-        told = {"op": "unsubscribe", "topic": self.name, "id": self._id}
-        self._node.say(encoded(told))
+        """Unsubscribe at the bridge."""
+        operation = {"op": "unsubscribe", "topic": self.name, "id": self._id}
+        self._node.say(encoded(operation))
 
     def take(self, said: object) -> None:
-        """Take a message as the bridge says it."""
+        """Handle a message from the bridge."""
         self._queue.offer(said, 0.0, 0)
 
     @property

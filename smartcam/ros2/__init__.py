@@ -1,6 +1,6 @@
 """ROS 2 in asyncio, without a ROS installation: over the wire format of rmw_zenoh.
 
-:class:`Node` publishes, hears, serves and calls; other nodes see it as one of their own.
+:class:`Node` publishes, subscribes, serves and calls; other nodes see it as a node of ROS.
 :class:`CameraNode` is a camera as a node.
 """
 

@@ -26,7 +26,8 @@ def first_cells(heading: str) -> list[str]:
 
 
 def test_yaml_example_loads(tmp_path: Path) -> None:
-    (text,) = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    page = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    text = re.findall(r"^```yaml\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)[0]
     path = tmp_path / "line.yaml"
     path.write_text(text, encoding="utf-8")
     scenario = load_scenario(path)

@@ -1,8 +1,8 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room for its helpers of tests, or for several tests."""
 
 from __future__ import annotations
 
-from smartcam.fleet._agent import agent, workers
+from smartcam.fleet._agent import agent
 from smartcam.fleet._agent.agent import Agent, CallNumbers
 from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
 from smartcam.fleet._agent.gate import Change, Gate, InLine

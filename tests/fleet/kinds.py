@@ -1,4 +1,4 @@
-"""Kinds of cameras: at the wire, and of a fleet over either bus; made as ``connect()`` does."""
+"""Kinds of cameras, directly and in a fleet over either bus, created like by ``connect()``."""
 
 from __future__ import annotations
 

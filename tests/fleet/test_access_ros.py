@@ -1,4 +1,4 @@
-"""ROS 2 in a fleet with roles: operators' nodes see and call, viewers' nodes see nobody."""
+"""ROS 2 in a fleet with roles: operators' nodes may do everything, viewers' nodes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nothing is lost unseen: every result is in one place of each subscriber's account."""
+"""Every result is counted once in each subscriber's account."""
 
 from __future__ import annotations
 

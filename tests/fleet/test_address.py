@@ -1,4 +1,4 @@
-"""Addresses of fleets, names of cameras, and what ``connect()`` makes of them."""
+"""Addresses of fleets, names of cameras, and ``connect()`` with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values over the bus from other people's programs are checked as users' values are."""
+"""Values from other programs on the bus are checked like users' values."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def pattern_of(listed: str) -> str:
     return "/".join([PREFIX, *chunks])
 
 
-LISTED = {one: pattern_of(one) for row in cells(section("Keys"), "key behind") for one in row}
+LISTED = {one: pattern_of(one) for row in cells(section("Keys"), "key after") for one in row}
 """Patterns of the page's keys."""
 
 

@@ -1,4 +1,4 @@
-"""Files that ``smartcam fleet certificates`` makes, and the users whom a fleet file lets in."""
+"""Files of ``smartcam fleet certificates``, and access from a fleet file."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ async def test_configuration_of_a_router(tmp_path: Path) -> None:
 
 # ---------------------------------------------------------------------- the fleet file
 
-TO_ALL = "takes everybody who reaches it, without a certificate, and who is in may command the"
+TO_ALL = "accepts every program without a certificate, and each may command"
 
 
 @pytest.mark.parametrize(
@@ -190,8 +190,8 @@ TO_ALL = "takes everybody who reaches it, without a certificate, and who is in m
         ("tcp/192.168.0.5:7447", None, TO_ALL),
         ("tcp/plant-server:7447", None, TO_ALL),
         ("tcp/0.0.0.0:7447", "anyone-may-command", ""),
-        ("tcp/127.0.0.1:0", "roles", "asks for no certificate, so nobody there has a role"),
-        ("tcp/127.0.0.1:0", "any-certificate", "any-certificate wants listen: tls/"),
+        ("tcp/127.0.0.1:0", "roles", "asks for no certificate, so its programs have no role"),
+        ("tcp/127.0.0.1:0", "any-certificate", "any-certificate needs listen: tls/"),
         ("tcp/0.0.0.0:0", "any-certificate", TO_ALL),
     ],
 )

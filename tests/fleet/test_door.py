@@ -1,4 +1,4 @@
-"""The door of an agent's port: who may reach the engine, and who gets the last descriptors."""
+"""The door of an agent's port: half-open connections, and the last descriptors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every error crosses the bus as what it is."""
+"""Errors keep their class, text and attributes on the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fleet files: what they may say, and how a mistake in one is told."""
+"""Fleet files: valid contents, and errors for mistakes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fleet of many cameras: patterns, one outcome for each, streams, who comes and goes."""
+"""Fleets of many cameras: patterns, one outcome for each camera, streams, and events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame's time on this side's clock: never further off than is said."""
+"""A frame's time by this computer's clock: the error is within its bound."""
 
 from __future__ import annotations
 

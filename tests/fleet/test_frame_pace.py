@@ -1,4 +1,4 @@
-"""Frames that a stream is given, and when: at sources and links of any pace, in no time at all."""
+"""The pace of streams, with sources and links of any speed, in simulated time."""
 
 from __future__ import annotations
 

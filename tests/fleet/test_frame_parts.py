@@ -1,4 +1,4 @@
-"""Frames in parts: within a window, whole or not at all, and never waited for by anybody else."""
+"""Frames in parts: within a window, complete or dropped, without delaying other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that may pass: in order, nobody between, and nothing is left behind."""
+"""The gate of commands: their order, reservations, and the end of waiting callers."""
 
 from __future__ import annotations
 

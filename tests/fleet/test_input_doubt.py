@@ -1,4 +1,4 @@
-"""Input of a trigger without a result: the agent empties the queue for who triggers next."""
+"""Input of a trigger without a result: the agent empties the queue before the next trigger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The keys that each pattern means."""
+"""Keys that match patterns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A reservation is kept until the end of its block, or its program is told that it is lost."""
+"""Reservations last until the end of their block, or their program gets an event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two agents of one name: one keeps it and its cameras, the other one says so and ends."""
+"""Two agents of one name: one keeps the name and its cameras, the other ends with an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The things that cannot cross the bus, each line of the table in ``docs/sharing-a-camera.md``."""
+"""Values that cannot cross the bus: each line of the table in ``docs/sharing-a-camera.md``."""
 
 from __future__ import annotations
 

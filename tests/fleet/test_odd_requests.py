@@ -1,4 +1,4 @@
-"""Fields of JSON requests that cannot be: refused, whichever service, and nothing is sent."""
+"""Invalid fields of JSON requests: every service refuses them, and sends nothing."""
 
 from __future__ import annotations
 

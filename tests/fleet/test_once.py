@@ -1,4 +1,4 @@
-"""A command is done once per call, over a bus that loses, doubles, delays and mixes up."""
+"""Commands are carried out once per call, on a bus that loses, repeats, delays and reorders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fleet as programs without smartcam hear it: the list of its cameras, and topics of JSON."""
+"""The fleet for programs without smartcam: the list of its cameras, and topics in JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plant of many cameras: what goes together costs one message, and nothing is lost by it."""
+"""Plants of many cameras: bundles cost one message, and lose nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An agent that was stopped knows that what comes may have waited; its tasks for triggers."""
+"""An agent that was stopped does not carry out waiting messages too late; its tasks for triggers."""
 
 from __future__ import annotations
 

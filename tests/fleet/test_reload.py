@@ -1,4 +1,4 @@
-"""A fleet file read again: what changed is done, all else goes on; a wrong one does nothing."""
+"""Reloading a fleet file: changes are applied, the rest continues; a wrong file changes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An end of Zenoh's bus that is opened again: all that is declared is there again."""
+"""Opening an end of Zenoh's bus again: all declarations are restored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reservations over the bus: nobody's command comes between, and none is left behind."""
+"""Reservations over the bus: no command comes between, and each one ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents that stand by: who has a camera, when it is taken over, and what programs see of it."""
+"""Agents that stand by: who has a camera, takeovers, and their effect on programs."""
 
 from __future__ import annotations
 

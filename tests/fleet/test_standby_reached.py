@@ -1,4 +1,4 @@
-"""An end knows that it is on the bus before it is told that the others are gone."""
+"""An end learns of its own loss of the bus before it loses the other ends."""
 
 from __future__ import annotations
 

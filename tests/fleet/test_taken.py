@@ -1,4 +1,4 @@
-"""A camera that another client took from its agent: told, tried again slowly, taken back."""
+"""Cameras that another client took from their agent: the event, slow attempts, taking back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fleet over TLS: who comes in, what is said to who does not, and what becomes of the others."""
+"""Fleets over TLS: accepted and refused programs, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting for a session over a bus that loses what is said."""
+"""Waiting for a session on a bus that loses messages."""
 
 from __future__ import annotations
 

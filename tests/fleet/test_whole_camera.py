@@ -1,4 +1,4 @@
-"""A camera of a fleet is a whole camera: in both faces, by its types, and who has it in words."""
+"""Cameras of a fleet: the same interface as other cameras, their types, and names of holders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages between the ends of a fleet as bytes: there and back, and broken ones."""
+"""Encoding and decoding messages of a fleet, and broken ones."""
 
 from __future__ import annotations
 

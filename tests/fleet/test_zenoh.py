@@ -1,4 +1,4 @@
-"""The end of a bus that Zenoh makes: what it opens, what it does where the other side is not."""
+"""Ends of the bus over Zenoh: opening, and a missing other side."""
 
 from __future__ import annotations
 

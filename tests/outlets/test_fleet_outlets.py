@@ -1,4 +1,4 @@
-"""Outlets of a fleet's agent, of one camera, and the commands that show what they did."""
+"""Outlets of a fleet's agent and of one camera, and the commands for their accounts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MQTT over TLS, against Debian's mosquitto: whom an outlet trusts, and what it says of others."""
+"""MQTT over TLS, against Debian's mosquitto: trusted and untrusted brokers."""
 
 from __future__ import annotations
 

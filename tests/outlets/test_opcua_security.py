@@ -1,4 +1,4 @@
-"""Users who may come in to a server of OPC UA, and a fleet's cameras in one server."""
+"""Users of a server of OPC UA, and a fleet's cameras in one server."""
 
 from __future__ import annotations
 

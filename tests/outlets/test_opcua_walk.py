@@ -1,4 +1,4 @@
-"""Random calls of several clients: the nodeset's own XML, read here, says what may happen."""
+"""Random calls of several clients, checked with the nodeset's own XML."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The spool: what is in it survives, and what is not is counted."""
+"""The spool: entries in it survive, and others are counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags that a recorder writes, and what becomes of a recording, as other programs read them."""
+"""Bags from recorders and recordings, read by other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A result's bytes stand in the file once, in its frame, and are found there again."""
+"""A result's bytes are in the file once, in its frame, and are read from there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures recorded beside an agent: which belong to results, what bounds them, what is lost."""
+"""Pictures recorded by an agent: those of results, bounds, and losses."""
 
 from __future__ import annotations
 

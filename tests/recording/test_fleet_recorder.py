@@ -1,4 +1,4 @@
-"""Recording beside an agent: seams, age, the bound on the disk, disks that fail."""
+"""Recording by an agent: consecutive files, their age, the bound on the disk, disks that fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings that lie: bounds hold, and whatever is wrong is told in a typed error or a remark."""
+"""Hostile recordings: bounds hold, and mistakes lead to a typed error or a remark."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures in recordings, as other programs read them, and as a source that plays them again."""
+"""Pictures in recordings, read by other programs, and replayed as a source."""
 
 from __future__ import annotations
 

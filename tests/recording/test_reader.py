@@ -1,4 +1,4 @@
-"""Reading recordings: whole, cut off, damaged, and what is none."""
+"""Reading recordings: whole, cut off, damaged, and other files."""
 
 from __future__ import annotations
 

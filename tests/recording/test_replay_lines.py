@@ -1,4 +1,4 @@
-"""Recordings of cameras of lines, played to real clients."""
+"""Recordings of cameras of lines, replayed for real clients."""
 
 from __future__ import annotations
 

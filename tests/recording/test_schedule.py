@@ -1,4 +1,4 @@
-"""Containers by the trigger that each belongs to, and those that came by themselves."""
+"""Containers of triggers, and those without a trigger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A software camera of a fleet, recorded by its agent: each result has the picture behind it."""
+"""Software cameras of a fleet, recorded by the agent: each result has its picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names behind the wall of the room that its kits or several of its tests use."""
+"""Private names of the room for its helpers of tests, or for several tests."""
 
 from __future__ import annotations
 

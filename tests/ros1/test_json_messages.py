@@ -1,4 +1,4 @@
-"""Messages as a rosbridge says them."""
+"""Messages in a rosbridge's JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node behind a rosbridge: what it says, and what it does when the bridge does not."""
+"""Nodes through a rosbridge: their operations, and a bridge that fails."""
 
 from __future__ import annotations
 
@@ -473,7 +473,7 @@ async def test_too_many_calls(
     node.serve("~/trigger", TRIGGER, never)
     calls = [asyncio.create_task(bridge.call("/line1/cam3/trigger")) for _ in range(4)]
     response = await calls[3]
-    assert "3 calls of it are under way, which is the most" in response["values"]["message"]
+    assert "3 calls of it are running, which is the most" in response["values"]["message"]
     await node.stop()
     for call in calls[:3]:
         with pytest.raises(Gone):

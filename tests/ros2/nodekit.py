@@ -1,4 +1,4 @@
-"""A node that only notes what is published and served, on the loop's time; and emulated cameras."""
+"""A node that records publications and services, in the loop's time; and emulated cameras."""
 
 from __future__ import annotations
 

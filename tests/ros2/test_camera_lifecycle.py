@@ -1,4 +1,4 @@
-"""The life cycle: its states and transitions, its services, and what they mean for a camera."""
+"""The life cycle: its states and transitions, its services, and their effect on a camera."""
 
 from __future__ import annotations
 

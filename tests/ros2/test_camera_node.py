@@ -1,4 +1,4 @@
-"""A camera's node as a whole: what other nodes see of it, its parameters, and how it ends."""
+"""A camera's node: its topics and services, its parameters, and its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Services of a camera's node: what they do, and how they say that they could not."""
+"""Services of a camera's node, and their errors."""
 
 from __future__ import annotations
 

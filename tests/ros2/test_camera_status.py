@@ -1,4 +1,4 @@
-"""The status of a camera, and its diagnostics, as faults come and go."""
+"""The status of a camera, and its diagnostics, with faults that come and go."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of two cameras on topics of ROS: subscribers get what was found."""
+"""Depth of two cameras on topics of ROS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Latched ends that come and go while others hear: nothing hangs, whoever has the interpreter."""
+"""Latched endpoints that come and go while there are subscribers: nothing hangs."""
 
 from __future__ import annotations
 

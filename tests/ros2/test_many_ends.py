@@ -1,4 +1,4 @@
-"""Many ends in one process, and somebody who comes later."""
+"""Many endpoints in one process, and a late one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results as ROS is told them: values, frames, stamps, and those that no message can hold."""
+"""Results as messages of ROS: values, frames, stamps, and values that no message can hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cameras of a fleet that is served already, seen through rclpy by ``smartcam ros2 fleet://…``."""
+"""Cameras of a running fleet through rclpy, with ``smartcam ros2 fleet://…``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters of a node: what may be declared, what fits, and how sets go wrong."""
+"""Parameters of a node: declarations, values, and sets that fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters of a node, as other nodes see them over TCP."""
+"""Parameters of a node, used by other nodes over TCP."""
 
 from __future__ import annotations
 
@@ -368,7 +368,7 @@ async def test_the_client(shared: tuple[Node, Node]) -> None:
 
 async def test_a_client_of_who_is_not_there_or_answers_nonsense(nodes: tuple[Node, Node]) -> None:
     here, there = nodes
-    with pytest.raises(ServiceTimeoutError, match="nobody serves"):
+    with pytest.raises(ServiceTimeoutError, match="no server for"):
         await there.parameters_of("/nobody", timeout=0.2).list()
     with pytest.raises(ConfigurationError):
         there.parameters_of("line 1")

@@ -1,4 +1,4 @@
-"""A camera's pictures over TCP: while somebody hears them, the newest, each with its lens."""
+"""A camera's pictures over TCP: the newest, while they have subscribers, each with its lens."""
 
 from __future__ import annotations
 

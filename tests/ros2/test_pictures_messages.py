@@ -1,4 +1,4 @@
-"""Pictures, lenses and clouds as messages of ROS and back: what was sent is what is there."""
+"""Converting pictures, lenses and clouds to messages of ROS and back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trees of frames, their times, and the transforms that are refused; all are of our own making."""
+"""Trees of frames, their times, and refused transforms, from generated messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``/tf_static``: where calibrations put a camera, and who hears of it."""
+"""``/tf_static``: places of calibrated cameras, and their subscribers."""
 
 from __future__ import annotations
 

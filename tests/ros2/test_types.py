@@ -1,4 +1,4 @@
-"""Types of a distribution: what is there, what is added, and who shares what."""
+"""Types of a distribution: known ones, added ones, and sharing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bytes of messages: as rosbags writes them, in both byte orders, and only those."""
+"""Bytes of messages, compared with rosbags, in both byte orders."""
 
 from __future__ import annotations
 

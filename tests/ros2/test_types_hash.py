@@ -1,4 +1,4 @@
-"""Type hashes against those that ROS' own generator wrote, and our package against what we send."""
+"""Type hashes compared with ROS' own generator, and the package's files with the built-in texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""@foxglove/rosmsg2-serialization, which shares no line with us, reads and writes our bytes."""
+"""Test messages with @foxglove/rosmsg2-serialization, an independent implementation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tree of frames as tf2 keeps it, of what is heard on ``/tf`` and ``/tf_static``."""
+"""Trees of frames from ``/tf`` and ``/tf_static``, compared with tf2."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def test_live_page_has_its_numbers() -> None:
     assert f"The last {MAX_RESULTS}." in LIVE_PAGE
     assert MAX_BARS * BAR_SECONDS == 10 * 3600  # "Last ten hours"
     assert f"the last {MAX_PICTURES} pictures of failures" in LIVE_PAGE
-    assert f"More than {MAX_NEWS / streams.PERIOD:g} per second" in LIVE_PAGE
+    assert f"more than {MAX_NEWS / streams.PERIOD:g} come per second" in LIVE_PAGE
     words = PASS_WORDS | FAIL_WORDS
     named = set(
         re.findall(r"`(\w+)`", LIVE_PAGE.partition("## Pass and fail")[2].partition("##")[0])
@@ -73,11 +73,11 @@ def test_fleet_page_has_its_numbers() -> None:
     assert (PERIOD, SERIES, BUCKET, ALIVE_INTERVAL) == (0.2, 600, 5, 5.0)  # which it has as words
     said = {
         f"for {BAD_SECONDS:g} s after a loss",
-        f"in sight, {MAX_ROWS} at most",
+        f"that it shows, {MAX_ROWS} at most",
         f"shows nothing for {streams.SLOW:g} s",
-        f"may be {MAX_FLEET_VIEWERS} at a time, and {MAX_CAMERAS} cameras",
+        f"may be {MAX_FLEET_VIEWERS} browsers at a time, and {MAX_CAMERAS} cameras",
         f"and {LINGER:g} s longer",
-        f"two looks, {MAX_QUEUE} are looked at",
+        f"two updates, {MAX_QUEUE} are shown",
         "`filter` is " + _listed(get_args(Filter)),
         "`sort` is " + _listed(["name", *SORTS]),
     }

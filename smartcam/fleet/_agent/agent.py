@@ -1,7 +1,7 @@
-"""An agent: it has the sessions with its cameras, and does what programs call for.
+"""An agent: it has the sessions with its cameras, and carries out programs' calls.
 
-Each call has a number of its program's, and is done once however often it arrives; one that comes
-after its deadline is not done at all. Every call is a task of the agent's, which ends with its
+Each call has a number of its program, and is carried out once even if it arrives twice; a call that
+comes after its deadline is not carried out. Every call is a task of the agent, which ends with its
 deadline, with the program's cancellation, and with the program itself.
 """
 
@@ -69,37 +69,37 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_PROGRAMS_PER_ROLE = 4096
-"""Largest number of programs of each role that may be here at a time; a crowd of one role keeps no
-other out."""
+"""Largest number of programs of each role at a time, so that one role cannot keep the others
+out."""
 
 PRESENCE_WITHIN = 10.0
-"""Seconds behind its first call within which a program's presence must be seen: the call may have
-come before it. One without presence is forgotten then, as nobody would see that it is gone."""
+"""Seconds after its first call within which a program's presence must be seen, since the call may
+come before it. A program without presence is forgotten, since its end would not be noticed."""
 
 MAX_CALLS_PER_PROGRAM = 256
-"""Largest number of calls of one program that may be under way at a time, for each camera of the
-agent; questions and commands each."""
+"""Largest number of running calls of one program for each camera of the agent; of questions and
+commands each."""
 
 MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
-"""Questions of all programs of one role that may be under way at a time, for each camera."""
+"""Largest number of running questions of all programs of one role, for each camera."""
 
 KNOWN_CALLS = 4096
-"""Numbers of calls that are remembered for each program; older ones are not done any more."""
+"""Number of remembered calls for each program; older calls are not carried out any more."""
 
 KNOWN_CAMERAS = 1000
-"""Cameras shared no more whose numbers go on where they ended, should they come back."""
+"""Largest number of unshared cameras whose numbers would continue if they came back."""
 
 FIRST_TRY = 30.0
-"""Seconds that the first try to reach a camera is waited for at the start."""
+"""Seconds of the timeout at the start for the first attempt to connect to a camera."""
 
 
 WORD_AHEAD = 0.02
-"""Seconds from what is said last of a camera to the end of its presence, which the engine would
-let overtake it."""
+"""Seconds between the last message about a camera and the end of its presence, which would
+overtake the message in the engine."""
 
 
 class CallNumbers:
-    """Numbers of the calls that were seen.
+    """Numbers of received calls.
 
     Args:
         floor: number up to which all calls count as seen.
@@ -111,11 +111,11 @@ class CallNumbers:
 
     @property
     def last(self) -> int:
-        """The highest number that was seen."""
+        """The highest received number."""
         return max(self._known, default=self.floor)
 
     def is_new(self, call: int) -> bool:
-        """Return True if a call was not seen before; the call is known from now on."""
+        """Return True if a call is received for the first time, and remember it."""
         if call <= self.floor or call in self._known:
             return False
         self._known.add(call)
@@ -130,17 +130,17 @@ class CallNumbers:
 class Guest:
     """A program that calls.
 
-    Questions and commands are kept apart: neither keeps the other from being done.
+    Questions and commands have separate bounds, so that neither blocks the other.
 
     Attributes:
         who: name and secret of the program.
         number: number of the program in the results of its triggers.
         present: whether the program's presence was seen.
         questions, commands: numbers of its calls of each kind.
-        tasks: calls under way, by kind (True: a command) and number.
-        under_way: numbers of questions and of commands among ``tasks``.
+        tasks: running calls, by kind (True: a command) and number.
+        under_way: counts of questions and of commands among ``tasks``.
         entered: applications to go back to after the program's temporary switches.
-        told: number up to which the program's replies have told it of states, by camera.
+        told: number of the last state in the program's replies, by camera.
     """
 
     who: ProgramName
@@ -157,20 +157,20 @@ class Guest:
 
     @property
     def last(self) -> int:
-        """The highest number of a call that was seen."""
+        """The highest received number of a call."""
         return max(self.questions.last, self.commands.last)
 
     def is_new(self, call: int, command: bool) -> bool:
-        """Return True if a call was not seen before; the call is known from now on."""
+        """Return True if a call is received for the first time, and remember it."""
         return (self.commands if command else self.questions).is_new(call)
 
     def begin(self, command: bool, call: int, task: asyncio.Task[None]) -> None:
-        """Count a call as under way."""
+        """Count a call as running."""
         self.tasks[command, call] = task
         self.under_way[command] += 1
 
     def end(self, command: bool, call: int) -> asyncio.Task[None] | None:
-        """Count a call as under way no more; return its task, None if it was counted before."""
+        """Count a call as ended; return its task, None if it has ended before."""
         task = self.tasks.pop((command, call), None)
         if task is not None:
             self.under_way[command] -= 1
@@ -185,16 +185,16 @@ class Agent:
         keys: keys of the fleet.
         bus: the agent's own end of the bus.
         cameras: options of the client of each camera, by the camera's name.
-        history: numbers of results and of bytes that are kept for each camera at most.
-        on_event: callback for what happens to the cameras.
-        frames: sources of frames, by camera's name, for the cameras that have any.
+        history: largest numbers of kept results and of their bytes for each camera.
+        on_event: callback for events of the cameras.
+        frames: sources of frames, by camera's name, for the cameras with frames.
         observers: observers of all sessions.
-        standby: settings of standing by for cameras that others have; None: the agent does not.
+        standby: settings of standing by for other agents' cameras; None: it does not stand by.
         on_retired: callback for the end of all cameras, since another agent has the name.
         calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Attributes:
-        retired_by: why the agent has no cameras any more.
+        retired_by: reason why the agent has no cameras any more.
     """
 
     def __init__(
@@ -223,11 +223,11 @@ class Agent:
         self._cameras, self._history, self._on_event = cameras, history, on_event
         self.hosts: dict[str, Host] = {}
         self._programs: dict[str, Guest] = {}
-        # of each role: programs that are present, by their tokens; and those that left, oldest
-        # first, with their last call
+        # by role: present programs, by their tokens; and programs that left, oldest first, with
+        # their last call
         self._present = collections.defaultdict[str, set[str]](set)
         self._gone = collections.defaultdict[str, dict[str, int]](dict)
-        self._of_role: collections.Counter[str] = collections.Counter()  # programs that are here
+        self._of_role: collections.Counter[str] = collections.Counter()  # number of programs
         # running questions, by program
         self._questions: collections.Counter[str] = collections.Counter()
         self._numbers = 0
@@ -238,7 +238,7 @@ class Agent:
         # numbers of cameras that were shared before
         self._numbers_at: dict[str, tuple[int, ...]] = {}
         self._plain = Plain(self, keys, bus, calibrations)
-        self.leaving: set[Host] = set()  # are being closed
+        self.leaving: set[Host] = set()  # hosts that are being closed
         self.past: Totals = Totals()  # counts of cameras that are no longer shared
         self._summaries = Summaries(self, keys, bus)
         self._bundle = AgentBundle(name, self.epoch, keys, bus)
@@ -248,11 +248,11 @@ class Agent:
     # ------------------------------------------------------------------ life
 
     async def open(self, timeout: float) -> Self:
-        """Come to the bus, and begin to have sessions with the cameras.
+        """Connect to the bus, and start the sessions with the cameras.
 
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
-            ConfigurationError: an option of a camera cannot work, or another agent has it and
+            ConfigurationError: an option of a camera is wrong, or another agent has the camera and
                 neither stands by; or another agent has this one's name.
         """
         await self._bus.open(timeout)
@@ -277,7 +277,7 @@ class Agent:
     async def close(self) -> None:
         """Leave the bus, end calls and sessions; bounded. Idempotent.
 
-        Cancellation: the sessions' links are dropped at once; the bus is left nevertheless.
+        Cancellation: the sessions' links are dropped at once; the bus is still left.
         """
         declared, self._declared = self._declared, []
         self._claims.close()
@@ -304,7 +304,7 @@ class Agent:
             await self._bus.close()
 
     def retire(self, why: ConfigurationError) -> None:
-        """End the sessions, and be no agent any more: another one has this name."""
+        """End the sessions and the agent, since another agent has this name."""
         if self.retired_by is not None:
             return
         logger.error("%s ! %s", self.name, why)
@@ -327,7 +327,7 @@ class Agent:
             self._on_retired(why)
 
     def share(self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None) -> Host:
-        """Begin to have a session with a camera, and to share it.
+        """Start a session with a camera, and share the camera.
 
         Args:
             name: name of the camera.
@@ -335,7 +335,7 @@ class Agent:
             frames_of: source of the camera's frames; None for none.
 
         Raises:
-            ConfigurationError: an option of the camera cannot work.
+            ConfigurationError: an option of the camera is wrong.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         if frames_of is not None:
@@ -369,10 +369,10 @@ class Agent:
     async def want(
         self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
     ) -> None:
-        """Share one more camera, or stand by for it.
+        """Share a further camera, or stand by for it.
 
         Raises:
-            ConfigurationError: an option of it cannot work; or another agent has it.
+            ConfigurationError: an option of the camera is wrong; or another agent has it.
         """
         if self.retired_by is not None:
             raise self.retired_by.with_traceback(None)
@@ -381,30 +381,30 @@ class Agent:
         await self._claims.want(name, settings)
 
     async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
-        """Raise if the fleet has a camera under another name already.
+        """Raise if the fleet has a camera already under another name.
 
         Raises:
-            ConfigurationError: the fleet has it; says which camera and whose that is.
+            ConfigurationError: the fleet has it; the text names the camera and its agent.
         """
         await self._claims.refuse_taken({name: settings})
 
     async def drop(self, name: str, why: str) -> None:
-        """Share a camera no more, nor stand by for it; bounded. Its programs are told ``why``."""
+        """Stop sharing a camera or standing by for it; bounded. Its programs get ``why``."""
         self._claims.drop(name)
         if name in self.hosts:
             await self.unshare(name, why)
 
     async def unshare(self, name: str, why: str) -> None:
-        """End the session with a camera, and share it no more; bounded.
+        """End the session with a camera, and stop sharing it; bounded.
 
         Args:
             name: name of the camera.
-            why: reason that the camera's programs are told, in words.
+            why: reason for the camera's programs, as a text.
 
-        Cancellation: takes effect when it is done.
+        Cancellation: takes effect at the end.
         """
         host = self.hosts.pop(name)
-        host.say_removed(why)  # before its presence ends, which alone would say that we are gone
+        host.say_removed(why)  # before its presence ends, which alone would mean a lost agent
         self.leaving.add(host)
         token, running = self._shared.pop(name)
         try:
@@ -427,12 +427,12 @@ class Agent:
 
     @property
     def programs(self) -> int:
-        """Number of programs that are here."""
+        """Number of programs that use the agent."""
         return len(self._programs)
 
     @property
     def calls(self) -> int:
-        """Number of calls of programs that are under way."""
+        """Number of running calls of programs."""
         return sum(len(guest.tasks) for guest in self._programs.values())
 
     def _on_camera_event(self, event: CameraEvent) -> None:
@@ -440,13 +440,13 @@ class Agent:
         self._on_event(event)
 
     async def wait_tried(self) -> None:
-        """Wait until each camera was tried once, well or not; bounded."""
+        """Wait until the first attempt with each camera has ended; bounded."""
         end = asyncio.get_running_loop().time() + FIRST_TRY
         for host in tuple(self.hosts.values()):
             await host.tried(max(0.0, end - asyncio.get_running_loop().time()))
 
     def begin(self, work: Any, name: str) -> asyncio.Task[None]:
-        """Have something done in a task, which ends with the agent."""
+        """Run a coroutine in a task, which ends with the agent."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._own(task)
         return task
@@ -456,13 +456,13 @@ class Agent:
         task.add_done_callback(self._tasks.discard)
 
     def _end(self, call: asyncio.Task[None]) -> None:
-        """Cancel a call, which nobody else looks after from now on."""
+        """Cancel a call's task, and keep the task until it has ended."""
         self._own(call)
         call.cancel()
 
     @property
     def busy(self) -> bool:
-        """True while a program has a camera reserved, or a command under way."""
+        """True while a program has reserved a camera, or a command runs."""
         return (
             self._plain.busy
             or any(command for guest in self._programs.values() for command, _ in guest.tasks)
@@ -488,7 +488,7 @@ class Agent:
             self._forget(who.name)
 
     def _forget(self, program: str, *, going_back: bool = True) -> None:
-        """End all that a program has here: it is gone."""
+        """End the calls and reservations of a lost program."""
         guest = self._programs.pop(program, None)
         if guest is None:
             return
@@ -509,12 +509,12 @@ class Agent:
                 camera.leave(before)
 
     def _known(self, who: ProgramName) -> Guest | None:
-        """Return a program that is here; None also where another one says its name."""
+        """Return a known program; None also if another one uses its name."""
         guest = self._programs.get(who.name)
         return guest if guest is not None and guest.who == who else None
 
     def _guest(self, who: ProgramName, call: int) -> Guest | None:
-        """Return the program that says hello; None if the program has left since it said so."""
+        """Return the program that sent a hello; None if the program has left since then."""
         known, role = self._known(who), who.role
         left = self._gone[role].get(who.name, 0)
         if known is None and call > left:
@@ -538,7 +538,7 @@ class Agent:
             self._forget(guest.who.name)
 
     def next_program(self) -> int:
-        """Return the number of another program, by which results say whose they are."""
+        """Return the number for a new program, which marks the results of its triggers."""
         self._numbers += 1
         return self._numbers
 
@@ -640,7 +640,7 @@ class Agent:
         command: bool,
         reservation: int | None,
     ) -> float | None:
-        """Return the seconds that a call may take; None if it is not done, or not again."""
+        """Return the seconds of a call's timeout; None if it is refused, or a repetition."""
         if guest is None or epoch != self.epoch:
             kind = ConnectionLostError if reservation is None else ReservationLostError
             stranger = kind(
@@ -651,7 +651,7 @@ class Agent:
             self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
             return None
         if not guest.is_new(number, command):
-            return None  # it is done, or under way: a double
+            return None  # a repetition of a call that runs or has ended
         error: SmartCamError | None = None
         left = 1.0
         try:
@@ -671,7 +671,7 @@ class Agent:
     def _refusal(
         self, host: Host, guest: Guest, said: str, left: float, command: bool
     ) -> SmartCamError | None:
-        """Return why a call is not done, None if it is."""
+        """Return the error that refuses a call, None if it is accepted."""
         if said not in ACTIONS or (said in COMMANDS) != command:
             return UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         if left < 0:
@@ -704,7 +704,7 @@ class Agent:
         guest = self._programs.get(program)
         if guest is None:
             return
-        guest.is_new(number, command)  # if it comes yet, it comes too late
+        guest.is_new(number, command)  # so that a late call is not carried out
         task = guest.end(command, number)
         if task is not None:
             self._end(task)
@@ -713,12 +713,12 @@ class Agent:
             return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
-        if entered is not None:  # it was done, and its program does not know
+        if entered is not None:  # it was carried out, which its program does not know
             camera, before = entered
             camera.leave(before)
 
     async def _do(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
-        """Do a call, and reply; a program that has cancelled gets none."""
+        """Carry out a call, and reply; a program that has cancelled gets no reply."""
         host = call.host
         inside, outcome = False, "cancelled"
         try:
@@ -752,7 +752,7 @@ class Agent:
         self._reply(call.program, call.owner.call, reply, blobs)
 
     def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
-        """Reply, with the states that nobody was told of; others hear of them a little later."""
+        """Reply, with the states that were not sent yet; other programs get them a little later."""
         host, following = call.host, call.host.states.following
         told = host.untold(guest.told.get(host.name, 0))
         guest.told[host.name] = following

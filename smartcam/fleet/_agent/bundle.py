@@ -1,8 +1,8 @@
-"""Results of all cameras of an agent in one message, for programs that hear them all.
+"""Send results of all cameras of an agent in one message, for programs that receive all.
 
-With a message for each camera a result costs what its message costs. So an agent has one more key,
-under which the results of all its cameras go together, if anybody hears it. Bundles are numbered:
-who finds that one is missing asks where each camera's numbers stand.
+With a message for each camera, a result costs as much as its message. So an agent has a further key
+for the results of all its cameras together, if the key has a subscriber. Bundles are numbered: a
+program that misses one asks for the next numbers of each camera.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 BUNDLE_INTERVAL = 0.005
-"""Seconds that must pass between two bundles."""
+"""Least seconds between two bundles."""
 
 FULL_BUNDLE_BYTES = 1 << 15
-"""Bytes of results with which a bundle goes at once."""
+"""Bytes of results with which a bundle is sent at once."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds behind the last bundle after which the next number is told again."""
+"""Seconds after the last bundle until the next number is sent again."""
 
 _HEAD = struct.Struct("<4sQQQI")
 _PART = struct.Struct("<HI")
@@ -39,7 +39,7 @@ class Bundled(NamedTuple):
         epoch: number of the agent's start.
         number: number of the bundle; an empty bundle has the number of the next one.
         following: number of the next bundle.
-        parts: cameras, and their results as :func:`encode_runs` gives them.
+        parts: cameras, and their results in the form of :func:`encode_runs`.
     """
 
     epoch: int
@@ -74,7 +74,7 @@ def decode_bundle(payload: bytes, what: str) -> Bundled:
 
 
 class AgentBundle:
-    """Says the results of an agent's cameras together.
+    """Sends the results of an agent's cameras together.
 
     Args:
         agent: the agent's name.
@@ -93,7 +93,7 @@ class AgentBundle:
         self._reminder: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Begin to look whether anybody hears."""
+        """Start to check for subscribers."""
         self._out = self._bus.publisher(self._key, self._on_heard)
 
     def close(self) -> None:
@@ -106,11 +106,11 @@ class AgentBundle:
 
     @property
     def heard(self) -> bool:
-        """True if anybody hears the bundles."""
+        """True if the bundles have a subscriber."""
         return self._out is not None and self._out.heard
 
     def add(self, camera: str, runs: bytes) -> None:
-        """Have a camera's results said soon, with those of others."""
+        """Add a camera's results, which are sent soon with those of others."""
         name = camera.encode()
         self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
         self._count += 1
@@ -152,7 +152,7 @@ class AgentBundle:
             self._reminder = None
 
     def _remind(self, step: int) -> None:
-        """Tell the next number again in a while; after the last reminder, no more."""
+        """Send the next number again later; stop after the last reminder."""
         self._end_reminding()
         if step < len(REMINDERS):
             loop = asyncio.get_running_loop()

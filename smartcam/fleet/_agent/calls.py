@@ -1,4 +1,4 @@
-"""The calls that an agent takes from programs: the name, the effect, and which are commands."""
+"""Carry out the calls of programs at an agent."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ T = TypeVar("T")
 Answer = tuple[dict[str, Any], list[bytes]]
 NOTHING: Answer = ({}, [])
 MAX_REPLY_BYTES = 1 << 20
-"""Largest number of bytes of results, or of states, that one reply brings."""
+"""Largest number of bytes of results, or of states, in one reply."""
 
 
 class ProgramCall(NamedTuple):
-    """A call under way.
+    """A running call.
 
     Attributes:
-        host: the camera that it is for.
+        host: camera of the call.
         program: name of the calling program.
         owner: numbers of the program and of its call.
         arguments: arguments of the call, by name.
         blobs: byte strings that came with the call.
-        timeout: seconds that the call may take.
+        timeout: seconds of the call's timeout.
         entered: applications to go back to after this program's temporary switches, by call number.
-        order: a trigger in binary form, in place of arguments.
-        reservation: the call that made the reservation in whose block it is; None outside of one.
+        order: a trigger in binary form, instead of arguments.
+        reservation: number of the call that reserved the camera; None outside of a reservation.
     """
 
     host: Host
@@ -74,13 +74,13 @@ class ProgramCall(NamedTuple):
             bounds: further arguments of ``check``.
 
         Raises:
-            ConfigurationError: the value cannot work.
+            ConfigurationError: the value is not valid.
         """
         value = self.arguments.get(name)
         return None if value is None else check(value, name, *bounds, who=self.host.name)
 
     def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
-        """Return an argument that has to be there."""
+        """Return a required argument."""
         value = self.argument(name, check, *bounds)
         if value is None:
             raise ConfigurationError(f"{self.host.name}: {name} is missing")
@@ -88,7 +88,7 @@ class ProgramCall(NamedTuple):
 
 
 def _check_layouts(value: object, what: str, who: str) -> Any:
-    """Return the layouts with a number in them: one, or one for each application."""
+    """Return the layouts that have a number: one, or one for each application."""
     if not isinstance(value, dict):
         return check_text(value, what, who)
     try:
@@ -119,7 +119,7 @@ async def _trigger(call: ProgramCall) -> Answer:
     wanted = check_integer(results, "results", 1, MAX_RESULTS_PER_TRIGGER, call.host.name)
     if application is not None:
         application = check_application(application, "application", call.host.name)
-    if expected is not None:  # below 0 where the camera does not say its program's id
+    if expected is not None:  # below 0 if the camera does not report its application
         expected = check_integer(expected, "expected", -1, MAX_APPLICATION_ID, call.host.name)
     if layouts is None and not each:
         carrier = _PLAIN.of(call.owner)
@@ -137,9 +137,9 @@ async def outcomes(
     application: int | None,
     timeout: float,
 ) -> list[bytes]:
-    """Trigger for a program, and return the runs that this caused.
+    """Trigger for a program, and return the trigger's runs.
 
-    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
+    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is the trigger's owner.
     """
     runs: list[bytes] = []
     host.outcomes[owner] = runs
@@ -176,7 +176,7 @@ async def _leave(call: ProgramCall) -> Answer:
     if found is not None:
         camera, before = found
         if call.argument("wait", check_flag) is False:
-            camera.leave(before)  # a failure is told by the next command
+            camera.leave(before)  # the next command reports a failure
         else:
             await camera.leave_and_wait(before)
     return NOTHING
@@ -244,7 +244,7 @@ async def _reboot(call: ProgramCall) -> Answer:
 
 
 async def _take_back(call: ProgramCall) -> Answer:
-    """Try now to take back a camera that another client took, and wait for the session."""
+    """Try now to take back a camera from another client, and wait for the session."""
     camera = call.host.require()
     camera.take_again()
     await camera.wait_connected(call.timeout)
@@ -262,7 +262,7 @@ async def _request(call: ProgramCall) -> Answer:
 
 
 MAX_FRAME_INTERVAL = 3600.0
-"""Seconds from one frame of a stream to the next that a program may ask for at most."""
+"""Largest number of seconds between two frames of a stream that a program may request."""
 
 
 def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
@@ -369,7 +369,7 @@ async def _hello(call: ProgramCall) -> Answer:
 
 
 async def _find(call: ProgramCall) -> Answer:
-    """Find the first result that came since a time of the agent's clock."""
+    """Return the number of the first result since a time of the agent's clock."""
     results = call.host.results
     since = call.wanted("since", check_moment)
     return {"first": results.first_since(since), "following": results.following}, []
@@ -433,5 +433,5 @@ PASSES_GATE = COMMANDS - {"reserve", "release", "leave"}
 
 
 def now() -> float:
-    """Return the agent's clock, its loop's, seconds; only differences mean anything."""
+    """Return the agent's clock: its event loop's, seconds; only differences have a meaning."""
     return asyncio.get_running_loop().time()

@@ -1,14 +1,14 @@
 """Decide which agent of a fleet has a name and a camera, and let one that stands by take over.
 
-Two agents of one name see each other's starts. The earlier start keeps the name; the later one
-gives up its cameras, and says so.
+Two agents of one name see each other's starts. The earlier start keeps the name; the later agent
+gives up its cameras, and logs that.
 
-An agent says by its presence that it has a camera. Another one with the same camera either refuses
-to start, or stands by: without a session, until that presence ends. If a split of the network made
-two agents have one camera, the camera decides, which serves the newcomer: the agent that has lost
-its session and sees the other's presence asks that one, and lets it have the camera. Both may let
-go of it at the same time; so an agent that gave the camera up, and sees that the other one does not
-have it any more, stands by again.
+An agent announces a camera by a presence. Another agent with the same camera either refuses to
+start, or stands by: without a session, until that presence ends. If two agents share one camera
+after a split of the network, the camera decides, which serves the newcomer: the agent that has lost
+its session and sees the other's presence asks the other, and leaves the camera to it. Both may give
+up at the same time; so an agent that gave the camera up, and sees that the other does not have it
+any more, stands by again.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ HOLD_OFF = 0.2
 """Seconds per step of preference until an agent that stands by takes a camera without agent."""
 
 ASK_TIMEOUT = 0.5
-"""Seconds for another agent's answer, and between two looks at what it has."""
+"""Seconds for another agent's answer, and between two checks of its cameras."""
 
 RESOLVE_TIMEOUT = 2.0
-"""Seconds for finding the addresses of a host's name."""
+"""Seconds of the timeout for the addresses of a host's name."""
 
 RETURN_WAIT = 4.0
-"""Seconds for others to be back on a bus that was away, before what they had is taken over."""
+"""Seconds for others to return to a bus that was lost, before their cameras are taken over."""
 
 CONTESTED_SECONDS = 30.0
 """Seconds after another agent with the same camera came or went, in which that agent may be the one
-that takes the camera from us."""
+that takes the camera."""
 
 TAKE_ONCE_SECONDS = 600.0
-"""Seconds in which a camera that was lost to somebody is not taken back a second time: a client
-that is no agent would take it again, too."""
+"""Seconds in which a camera that another client took is not taken back a second time: a client that
+is not an agent would take it again, too."""
 
 
 class Claims:
@@ -71,29 +71,29 @@ class Claims:
         standby: settings of standing by; None: the agent does not stand by.
 
     Attributes:
-        given_up: why a camera is another agent's now, by its name.
+        given_up: errors for cameras that another agent has now, by the camera's name.
     """
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:
         self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
         self._wanted: dict[str, CameraSettings] = {}
-        self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
-        self._contested: dict[str, float] = {}  # until when it may be one of them who takes it
-        self._calm: dict[str, float] = {}  # until when that is not so, whoever comes and goes
+        self._others: dict[str, set[str]] = {}  # other agents with a camera of this agent
+        self._contested: dict[str, float] = {}  # time until which one of them may take it
+        self._calm: dict[str, float] = {}  # time until which this is excluded
         self._settling: set[str] = set()
         self._again: set[str] = set()
-        self._back: dict[str, asyncio.Event] = {}  # another one's presence that is waited for
+        self._back: dict[str, asyncio.Event] = {}  # awaited presences of other agents
         self._watch: Handle | None = None
         self.given_up: dict[str, ConnectionTakenError] = {}
         self._start = f"{agent.epoch}-{secrets.token_hex(4)}"
         self._name: list[Handle] = []
 
     async def refuse_namesake(self, timeout: float) -> None:
-        """Raise if an agent of this name is there; before anything is said under it.
+        """Raise if there is another agent of this name; before using the name on the bus.
 
         Raises:
-            ConfigurationError: an agent is there, and stays for longer than one that has died
-                would.
+            ConfigurationError: there is another agent, whose presence stays for longer than that of
+                a dead one.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         patience = loop.time() + LEASE_TIME + 1.0
@@ -106,10 +106,10 @@ class Claims:
             await asyncio.sleep(ASK_TIMEOUT)
 
     async def claim_name(self, timeout: float) -> None:
-        """Have the agent's name from now on, as long as no agent that was started before has it.
+        """Take the agent's name, unless an agent that was started earlier has it.
 
         Raises:
-            ConfigurationError: another agent has it.
+            ConfigurationError: another agent has the name.
         """
         keys, bus, name = self._keys, self._bus, self._agent.name
         self._name.append(bus.be_present(keys.start(name, self._start)))
@@ -119,7 +119,7 @@ class Claims:
         self._name.append(bus.watch(keys.start(name, "*"), self._on_namesake))
 
     def _is_earlier(self, key: str) -> bool:
-        """Return True if another start of this name is earlier; of two at once one is."""
+        """Return True if another start of this name is earlier; there are no ties."""
         return _order(self._keys.tail(key, "presence/start")[-1]) < _order(self._start)
 
     def _namesake(self) -> ConfigurationError:
@@ -138,14 +138,14 @@ class Claims:
             )
         elif not present:
             for host in self._agent.hosts.values():
-                host.camera.take_again()  # what it took
+                host.camera.take_again()  # the camera that it took
 
     async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
-        """Have the cameras that no other agent has.
+        """Share the cameras that no other agent has.
 
         Raises:
-            ConfigurationError: another one has a camera, and neither stands by; nothing is shared.
-                Or an option of a camera cannot work.
+            ConfigurationError: another agent has a camera, and neither stands by; then nothing is
+                shared. Or an option of a camera is wrong.
         """
         self._wanted = dict(cameras)
         keys, bus = self._keys, self._bus
@@ -162,10 +162,10 @@ class Claims:
                 self._agent.share(name, settings)
 
     async def want(self, name: str, settings: CameraSettings) -> None:
-        """Have one more camera, at once or when no other agent has it.
+        """Share a further camera, at once or when no other agent has it.
 
         Raises:
-            ConfigurationError: another one has it, and this one does not stand by.
+            ConfigurationError: another agent has it, and this one does not stand by.
         """
         self._wanted[name] = settings
         for key in await self._bus.present(self._keys.camera("*", name), ASK_TIMEOUT):
@@ -187,13 +187,13 @@ class Claims:
             )
 
     async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
-        """Raise if the fleet has a camera of these under another name: it serves one client.
+        """Raise if the fleet has one of these cameras under another name: it serves one client.
 
-        Nothing happens between the last look at this agent's own cameras and the return. Two agents
-        that look at the same time do not see each other.
+        There is no await between the last check of this agent's own cameras and the return. Two
+        agents that check at the same time do not see each other.
 
         Raises:
-            ConfigurationError: one of the addresses is taken; says which and by whom.
+            ConfigurationError: one of the addresses is taken; the text names it and its agent.
         """
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
@@ -230,7 +230,7 @@ class Claims:
                         )
 
     def drop(self, name: str) -> None:
-        """Want a camera no more."""
+        """Stop claiming a camera."""
         self._wanted.pop(name, None)
         self._others.pop(name, None)
         self._contested.pop(name, None)
@@ -238,7 +238,7 @@ class Claims:
         self.given_up.pop(name, None)
 
     def close(self) -> None:
-        """Claim nothing more. Idempotent."""
+        """Stop claiming cameras. Idempotent."""
         self._wanted.clear()
         for handle in self._name:
             handle.close()
@@ -248,10 +248,10 @@ class Claims:
             self._watch = None
 
     async def _refuse(self) -> None:
-        """Raise if another agent has a camera of this agent, and neither is one that stands by.
+        """Raise if another agent has a camera of this agent, and neither stands by.
 
-        One that neither answers nor goes may have died a moment ago: its presence ends with the
-        engine's lease.
+        An agent that does not answer while its presence stays may have died a moment ago: the
+        presence ends with the engine's lease.
         """
         loop = asyncio.get_running_loop()
         patience = loop.time() + LEASE_TIME + 1.0
@@ -278,10 +278,10 @@ class Claims:
                 )
             await asyncio.sleep(ASK_TIMEOUT)
 
-    # ------------------------------------------------------------------ who has what
+    # ------------------------------------------------------------------ other agents
 
     def _note(self, key: str, present: bool) -> str:
-        """Return the camera that somebody else comes or goes for; nothing if it is none of ours."""
+        """Note another agent's presence at a camera; return the camera, "" for other cameras."""
         agent, *chunks = self._keys.tail(key, "presence/camera")
         name = "/".join(chunks)
         if agent == self._agent.name or name not in self._wanted:
@@ -300,7 +300,7 @@ class Claims:
             self._consider(name)
 
     def on_event(self, event: CameraEvent) -> None:
-        """Take in an event of a camera that this agent has."""
+        """Handle an event of a camera of this agent."""
         if isinstance(event, Disconnected):
             name = event.camera
             if not self._bus.reached or self._is_contested(name):
@@ -312,7 +312,7 @@ class Claims:
         return bool(self._others.get(name)) or now < self._contested.get(name, now)
 
     def _consider(self, name: str) -> None:
-        """Look whose a camera is, in a task; once at a time for each."""
+        """Decide about a camera in a task; one at a time for each."""
         self._again.add(name)
         if name not in self._settling:
             self._settling.add(name)
@@ -330,15 +330,15 @@ class Claims:
             self._settling.discard(name)
 
     async def _stand_by(self, name: str) -> None:
-        """Take a camera over if nobody has it."""
+        """Take over a camera without agent."""
         if self._standby is None or self._others.get(name):
             return
-        away = not self._bus.reached  # we are gone, and not the others
+        away = not self._bus.reached  # this agent was cut off, not the others
         await asyncio.sleep(HOLD_OFF * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
                 if await self._appears(name, RETURN_WAIT):
-                    return  # should it go again, that is another matter
+                    return  # a further loss is handled by a new task
                 away = False
             else:
                 away = True
@@ -360,7 +360,7 @@ class Claims:
         self._agent.share(name, settings)
 
     async def _appears(self, name: str, timeout: float) -> bool:
-        """Wait until another agent says that it has a camera; return whether one did."""
+        """Wait until another agent announces a camera; return whether one did."""
         if self._others.get(name):
             return True
         back = self._back[name] = asyncio.Event()
@@ -375,13 +375,13 @@ class Claims:
             del self._back[name]
 
     async def _defend(self, name: str) -> None:
-        """Settle whose a camera is that this agent has, without a session.
+        """Decide about a camera of this agent that has no session.
 
-        Another one that says it has it, too, keeps it if the camera serves that one. Where nobody
-        else has it, and the camera was taken, this one stands by.
+        Another agent that announces the camera, too, keeps it if it has a session. If no other
+        agent announces it, and a client took the camera, this agent stands by.
         """
         agent, away = self._agent, False
-        while (host := agent.hosts.get(name)) and not host.connected:  # its loss is an event
+        while (host := agent.hosts.get(name)) and not host.connected:  # a later loss is an event
             if others := self._others.get(name):
                 away = False
                 other = min(others)
@@ -405,9 +405,9 @@ class Claims:
                 return
 
     async def _yields(self, host: Host, other: str) -> bool:
-        """Return True if this agent, without a session, leaves a camera to another that has it.
+        """Return True if this agent, without a session, leaves a camera to another agent.
 
-        Of two that have no session the first one by name goes on trying.
+        Of two agents without a session the first one by name continues.
         """
         agent, name = self._agent, host.name
         told = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
@@ -427,13 +427,13 @@ class Claims:
 
 
 def _order(start: str) -> tuple[int, str]:
-    """Return the key by which agents' starts are ordered: their time, then a random word."""
+    """Return the sort key of agents' starts: their time, then a random word."""
     epoch, _, chance = start.partition("-")
     return int(epoch) if epoch.isdecimal() else 0, chance
 
 
 async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
-    """Return the addresses of each host, and its name where there are none; bounded."""
+    """Return the addresses of each host, or its name if it has none; bounded."""
     found: dict[str, set[str]] = {}
     names: list[str] = []
     for host in hosts:
@@ -448,7 +448,7 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
         try:
             told = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
-            return  # whoever connects there says so
+            return  # the client reports an unknown host
         found[host] |= {str(one[4][0]) for one in told}
 
     if names:
@@ -462,5 +462,5 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
 
 
 def _is_taken(host: Host) -> bool:
-    """Return True if no session will come any more, as another client has the camera."""
+    """Return True if there will be no further session, since another client has the camera."""
     return isinstance(host.camera.trouble, ConnectionTakenError)

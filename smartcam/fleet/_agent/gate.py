@@ -84,7 +84,7 @@ class Gate:
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of others out; wait for those that are running.
 
-        A program may reserve again what it has reserved; each reservation is released separately.
+        A program may reserve the camera again; each reservation is released separately.
 
         Raises:
             TimeoutError: the turn did not come within ``timeout`` seconds.

@@ -87,7 +87,7 @@ class Host:
         observers: observers of the camera's sessions.
 
     Attributes:
-        epoch: number of the agent's start, or of its present hold of the camera.
+        epoch: number of the agent's start, or of its current hold of the camera.
         began: number of the first result since then.
         final: whether no other agent takes the camera over after the last session.
         gate: gate that decides which program's commands may pass.
@@ -96,7 +96,7 @@ class Host:
         outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: why there is no session yet, None if there is or was one.
+        failure: reason why there is no session yet, None if there is or was one.
         triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
     """
 

@@ -1,4 +1,4 @@
-"""Outlets over the bus: agents tell the accounts of theirs, and what their stores say."""
+"""Serve an agent's outlets over the bus: their accounts, and rows of their stores."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_STORE_QUESTIONS = 4
-"""Questions to stores of one agent that are under way at most; each has a thread."""
+"""Largest number of running questions to stores of one agent; each has a thread."""
 
 MAX_STORED_ROWS = 1000
 """Largest number of rows of a store in one answer."""
 
 MAX_ROWS_BYTES = 1 << 23
-"""Largest number of bytes of rows in one answer; beyond, the oldest are left out."""
+"""Largest number of bytes of rows in one answer; beyond it the oldest are left out."""
 
 ROW_BYTES = 300
-"""Bytes of a row beside its value and its error, about."""
+"""Approximate number of bytes of a row besides its value and its error."""
 
 
 class ToldOutlet(NamedTuple):
-    """An outlet's account, as its agent told it: ``results == delivered + spooled + dropped``.
+    """An outlet's account from its agent: ``results == delivered + spooled + dropped``.
 
     Attributes:
         agent: name of the agent.
         outlet: name of the outlet.
-        results: results and errors that came.
-        delivered: results and errors that the far end took.
-        spooled: results and errors that wait.
-        dropped: results and errors that were given up, by the reason.
-        trouble: why nothing is delivered, or spooled, at the time; "" if all is well.
+        results: number of results and errors that came.
+        delivered: number of delivered results and errors.
+        spooled: number of waiting results and errors.
+        dropped: numbers of dropped results and errors, by the reason.
+        trouble: reason why nothing is delivered or spooled now; "" if there is no trouble.
     """
 
     agent: str
@@ -64,20 +64,20 @@ class ToldOutlet(NamedTuple):
 
 
 class ToldStore(NamedTuple):
-    """The answer of a store of results, as its agent told it.
+    """The answer of a store of results, from its agent.
 
     Attributes:
         agent: name of the agent.
         outlet: name of the outlet that writes the store; "" if the agent could not answer.
-        rows: rows that were asked for, the oldest first, with the columns of the store's table
-            ``results`` by their names.
-        total: results, errors and gaps of the time and the cameras, shown or not.
-        failed: number of them that are errors, gaps, or did not pass.
+        rows: requested rows, the oldest first, with the columns of the store's table ``results`` by
+            their names.
+        total: number of results, errors and gaps of the time and the cameras, also beyond the rows.
+        failed: number of errors, gaps, and results that did not pass.
         errors: number of errors.
         gaps: number of gaps.
-        lost: results that the gaps tell of.
+        lost: number of lost results in the gaps.
         at_least: whether more may be lost than the gaps count.
-        error: why the store could not be asked; "" if it was.
+        error: reason why the store could not be read; "" if it was read.
     """
 
     agent: str
@@ -121,14 +121,14 @@ class StoredRequest(BaseModel):
 
 
 class OutletService:
-    """Answers programs that want to know what an agent's outlets did.
+    """Answers programs' questions about an agent's outlets.
 
     Args:
-        agent: the agent, which does the work in tasks of its own.
+        agent: the agent, whose tasks do the work.
         bus: the agent's end of the bus.
         keys: keys of the fleet.
         states: function that returns the states of the outlets, by name.
-        stored: function that returns what the stores say, by the outlet's name.
+        stored: function that returns the answers of the stores, by the outlet's name.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class OutletService:
         self._declared: Handle = bus.answer(pattern, self._on_question, patient=always)
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering."""
         self._declared.close()
 
     def _on_question(self, question: BusQuestion) -> None:
@@ -190,7 +190,7 @@ class OutletService:
 
 
 def _bounded(store: dict[str, Any]) -> dict[str, Any]:
-    """Return a store's answer without the oldest rows that there is no room for."""
+    """Return a store's answer without the oldest rows beyond the bound."""
     rows, size = list[dict[str, Any]](), 0
     for row in reversed(store["rows"]):
         size += ROW_BYTES + len(row["value"] or "") + len(row["error"] or "")

@@ -1,8 +1,8 @@
-"""The pulse of an agent: how long it was stopped, and what came may have waited for it.
+"""The pulse of an agent: for how long it was stopped, while messages may have waited.
 
-A process that is stopped, or whose event loop is held up, does not see when something comes: what
-waited in the system for 3 s looks like what comes now. But it sees by its clock that it did nothing
-for 3 s.
+A process that is stopped, or whose event loop is blocked, does not see when a message comes: one
+that waited in the system for 3 s looks like a new one. But its clock shows that it did nothing for
+3 s.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import asyncio
 from typing import Final
 
 BEAT_INTERVAL: Final = 0.1
-"""Seconds between two looks at the clock."""
+"""Seconds between two readings of the clock."""
 
 STOPPED_AFTER: Final = 0.25
-"""Seconds between two looks from which on the agent counts as having been stopped."""
+"""Seconds between two readings beyond which the agent counts as stopped."""
 
 SETTLE_TIME: Final = 1.0
-"""Seconds after a stop in which messages may have waited: they lay in the system's buffers."""
+"""Seconds after a stop in which messages may come that have waited in the system's buffers."""
 
 
 class Pulse:
-    """Looks at the clock of its event loop, again and again, from :meth:`open` to :meth:`close`."""
+    """Reads the clock of its event loop periodically, from :meth:`open` to :meth:`close`."""
 
     def __init__(self) -> None:
         self._last = self._since = 0.0
@@ -29,18 +29,18 @@ class Pulse:
         self._timer: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Look from now on."""
+        """Start to read the clock."""
         self._last = asyncio.get_running_loop().time()
         self._beat()
 
     def close(self) -> None:
-        """Look no more. Idempotent."""
+        """Stop reading the clock. Idempotent."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def waited(self) -> float:
-        """Return the seconds that a message heard now may have waited; 0 if it has not."""
+        """Return the seconds for which a message that comes now may have waited."""
         now = self._look()
         return now - self._since if now < self._settled else 0.0
 

@@ -1,8 +1,8 @@
-"""A fleet file read again by a running agent: what did not change goes on untouched.
+"""Reload a fleet file in a running agent; unchanged cameras are not touched.
 
-All that can go wrong goes wrong before anything is changed: the file is read and checked whole, and
-new emulated cameras are started. What comes then cannot fail any more, and is a task of its own,
-which goes on to its end whoever waits for it.
+Failures come before the first change: the file is read and checked completely, and new emulated
+cameras are started. The rest cannot fail, and runs in its own task, which continues if its caller
+is cancelled.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet file has changed"
-"""Reasons why a reload ends a camera, as the camera's programs are told."""
+"""Reasons why a reload ends a camera, for the camera's programs."""
 
 READ_TIMEOUT = 10.0
-"""Seconds for reading a file and those that it names; they may be on a network's disk."""
+"""Seconds for reading a file and those that it names; they may be on a network drive."""
 
 LIVE = frozenset({"cameras"})
-"""Fields of a fleet file that are changed while the agent runs; each other one wants a restart."""
+"""Fields of a fleet file that are changed while the agent runs; the others need a restart."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FleetChanges:
-    """The changes in a fleet file that was read again, by the cameras' names.
+    """The changes of a reloaded fleet file, by the cameras' names.
 
     Attributes:
         agent: name of the agent that read the file.
-        added: cameras that are shared from now on.
-        removed: cameras that are shared no more.
-        changed: cameras that are given up and opened again, as the file says now.
-        kept: number of cameras that did not change; their sessions were not touched.
+        added: new cameras.
+        removed: cameras that are no longer shared.
+        changed: cameras that were closed and opened again.
+        kept: number of unchanged cameras, whose sessions were not touched.
     """
 
     agent: str
@@ -72,12 +72,12 @@ def _some(names: tuple[str, ...], most: int = 5) -> str:
 
 
 class CameraSource(NamedTuple):
-    """The parts of which the session with a camera is made.
+    """The source of a session with a camera.
 
     Attributes:
         settings: settings of the client that has the session.
         frames: source of the camera's frames; None for none.
-        emulator: closes the emulated camera, where it is one.
+        emulator: stack that closes the emulated camera; None if it is not emulated.
     """
 
     settings: CameraSettings
@@ -91,8 +91,8 @@ class LoadedFleet(NamedTuple):
     Attributes:
         file: contents of the fleet file.
         plan: cameras of the file, by name.
-        marks: text by camera's name that tells whether a camera has changed: what the file says of
-            it, and what stands in the files that it names.
+        marks: texts by camera's name that show a change of the camera: its entry, and the contents
+            of the files that the entry names.
     """
 
     file: FleetFile
@@ -121,7 +121,7 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
 
     def mark(planned: Planned) -> object:
         entry, emulated = planned.entry, planned.entry.emulated
-        if emulated is not None:  # that there are others does not change this one
+        if emulated is not None:  # the number of cameras does not change a single one
             emulated = emulated.model_copy(update={"count": 1})
             entry = entry.model_copy(update={"emulated": emulated})
         files = [entry.ros2.calibration, entry.ros2.hand_eye]
@@ -141,24 +141,24 @@ def _files_in(given: object, folder: Path) -> list[str | None]:
         return [one for part in given for one in _files_in(part, folder)]
     try:
         return [given] if isinstance(given, str) and (folder / given).is_file() else []
-    except (OSError, ValueError):  # no name of a file
+    except (OSError, ValueError):  # not the name of a file
         return []
 
 
 class Reloader:
-    """Reads the file of a running agent again; one time after the other.
+    """Reloads the file of a running agent, once at a time.
 
     Args:
-        folder: folder of relative paths, where a file's contents are given and not its path.
+        folder: folder of relative paths, if a file's contents are given and not its path.
         make: function that starts a camera's source, given its plan and the folder.
-        now: the file that holds until the first reload.
+        now: the file before the first reload.
 
     Attributes:
-        now: the file that holds now.
+        now: the current file.
         sources: sources of the cameras' sessions, by name.
         last: changes, or error, of the last reload; None before the first.
-        outcomes: numbers of reloads that were done, and that were refused.
-        tell: callback for the begin of a reload (None) and for its end (changes or error).
+        outcomes: numbers of successful and of refused reloads.
+        tell: callback for the start of a reload (None) and for its end (changes or error).
     """
 
     def __init__(
@@ -179,13 +179,13 @@ class Reloader:
         self._closed = False
 
     async def close(self) -> None:
-        """Wait until what has begun is done; nothing else begins. Bounded."""
+        """Wait for the end of a running reload; no other is started. Bounded."""
         self._closed = True
         if self._applying is not None:
             await asyncio.wait({self._applying})
 
     async def reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
-        """Have a running agent do as ``file`` says, as :meth:`FleetServer.reload` has it."""
+        """Apply ``file`` to a running agent, like :meth:`FleetServer.reload`."""
         async with self._one:
             self.tell(None)
             try:
@@ -197,7 +197,9 @@ class Reloader:
             except BaseException:
                 self.last = ConfigurationError("the reload was cancelled; all stays as it was")
                 if self._applying is not None and not self._applying.done():
-                    self.last = ConfigurationError("nobody waited for the end of the reload")
+                    self.last = ConfigurationError(
+                        "the caller of the reload was cancelled before its end"
+                    )
                 raise
             else:
                 logger.info("the fleet file was read again: %s", changes)
@@ -220,7 +222,7 @@ class Reloader:
             raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
 
     async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
-        if self._applying is not None:  # whoever waited for it was cancelled
+        if self._applying is not None:  # its caller was cancelled
             await asyncio.wait({self._applying})
         folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
         new, changes = await self._read(file, folder, agent.name)
@@ -233,7 +235,7 @@ class Reloader:
                 await asyncio.sleep(0)
             if self._closed:
                 raise ConnectionClosedError(f"the agent {agent.name} ends; nothing was changed")
-            _refuse_added(agent, changes)  # it may have come meanwhile
+            _refuse_added(agent, changes)  # a program may have added one meanwhile
             stack.pop_all()
             self.now = new
             work = self._apply(agent, (*changes.removed, *changes.changed), made)
@@ -244,8 +246,8 @@ class Reloader:
     async def _read(
         self, file: str | Path | FleetFile, folder: Path, agent: str
     ) -> tuple[LoadedFleet, FleetChanges]:
-        """Read and check a file, and see what it changes, in a thread."""
-        if self._reading is not None:  # whoever waited for it was cancelled, or gave up
+        """Read and check a file, and find its changes, in a thread."""
+        if self._reading is not None:  # its caller was cancelled, or timed out
             _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
             if late:
                 raise ConfigurationError(
@@ -275,7 +277,7 @@ class Reloader:
     async def _apply(
         self, agent: Agent, ending: tuple[str, ...], made: dict[str, CameraSource]
     ) -> None:
-        """Have the agent share other cameras. What ends comes first: addresses may change hands."""
+        """Apply changes to the agent; first remove cameras, whose addresses may be reused."""
         ended = await asyncio.gather(
             *(self._end(agent, name, CHANGED if name in made else REMOVED) for name in ending),
             return_exceptions=True,
@@ -286,7 +288,7 @@ class Reloader:
         for name, source in made.items():
             self.sources[name] = source
             if self._closed:
-                continue  # the agent ends, and with it what was made
+                continue  # the agent ends, and closes the source
             if name in agent.hosts:
                 logger.error("%s ! it is not shared: a program has added one meanwhile", name)
                 continue
@@ -309,7 +311,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
     """Return the changes that a new fleet file makes.
 
     Raises:
-        ConfigurationError: something that cannot be changed while the agent runs; names the field.
+        ConfigurationError: a field cannot be changed while the agent runs; the text names it.
     """
     for field in FleetFile.model_fields:
         if field not in LIVE and getattr(old.file, field) != getattr(new.file, field):
@@ -334,10 +336,10 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
 
 
 def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
-    """Refuse cameras whose names others have that programs have added.
+    """Refuse cameras whose names are those of cameras that programs have added.
 
     Raises:
-        ConfigurationError: there is one.
+        ConfigurationError: a program has added a camera of the same name.
     """
     for name in changes.added:
         if name in agent.hosts:
@@ -354,4 +356,4 @@ def _seen(planned: Planned | None) -> RosCamera:
 
 def _looked_at(future: asyncio.Future[tuple[LoadedFleet, FleetChanges]]) -> None:
     if not future.cancelled():
-        future.exception()  # it was told to who waited, if anybody did
+        future.exception()  # the caller got the error, unless it was cancelled

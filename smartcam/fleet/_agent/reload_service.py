@@ -1,4 +1,4 @@
-"""``reload`` over the bus: an agent is told to read its file again, and says what came of it."""
+"""Serve ``reload`` over the bus: an agent reads its file again, and answers with the changes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 MAX_WAITING_QUESTIONS = 16
-"""Questions that are under way at one agent at most."""
+"""Largest number of running reloads at one agent."""
 
 
 class ReloadService:
-    """Answers programs that want an agent's file read again.
+    """Answers programs' requests to reload an agent's file.
 
     Args:
-        agent: the agent, which does the work in tasks of its own.
+        agent: the agent, whose tasks do the work.
         bus: the agent's end of the bus.
         keys: keys of the fleet.
         reload: function that reads the file again and returns the changes.
@@ -44,7 +44,7 @@ class ReloadService:
         self._declared: Handle = bus.answer(keys.reload(agent.name), self._on_question)
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering."""
         self._declared.close()
 
     def _on_question(self, question: BusQuestion) -> None:
@@ -75,7 +75,7 @@ class ReloadService:
 async def reload_agents(
     bus: Bus, keys: Keys, agents: list[str], timeout: float
 ) -> dict[str, FleetChanges | SmartCamError]:
-    """Have agents read their files again; return what each said, by its name."""
+    """Reload the files of agents; return the answer of each, by its name."""
     found: dict[str, FleetChanges | SmartCamError] = {}
     pattern = keys.reload(agents[0] if len(agents) == 1 else "*")
     for key, payload in await bus.ask(pattern, b"", timeout):

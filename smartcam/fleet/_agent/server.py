@@ -1,4 +1,4 @@
-"""An agent with its cameras, as a fleet file says: what ``smartcam serve`` runs."""
+"""Run an agent with the cameras of a fleet file, for ``smartcam serve``."""
 
 from __future__ import annotations
 
@@ -58,18 +58,18 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 OPEN_TIMEOUT = 10.0
-"""Seconds for coming to the bus."""
+"""Seconds for connecting to the bus."""
 
 
 class FleetServer(Server):
-    """An agent that shares the cameras of a fleet file; made by :func:`smartcam.fleet.serve`.
+    """An agent that shares the cameras of a fleet file; created by :func:`smartcam.fleet.serve`.
 
     Args:
         file: path of a fleet file, or the contents of one.
-        bus: end of another bus than the file says.
-        folder: folder of the file's relative paths, where ``file`` is not a path itself.
-        restore: whether cameras have their application and run state back after a reconnect, where
-            their entries say nothing; None: where ``ros2`` in the file has nodes that become active
+        bus: end of another bus than that of the file.
+        folder: folder of the file's relative paths, if ``file`` is not a path itself.
+        restore: whether application and run state of a camera are restored after a reconnect, if
+            its entry does not set that; None: if ``ros2`` in the file has nodes that become active
             by themselves.
 
     Attributes:
@@ -77,11 +77,11 @@ class FleetServer(Server):
         folder: folder of the file's relative paths.
         observers: observers of all sessions; add them before the server is started.
         outlet_states: function that returns the states of the outlets, by name.
-        stored_results: function that returns what the stores of results say, by outlet.
+        stored_results: function that returns the answers of the stores of results, by outlet.
         calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Raises:
-        ConfigurationError: something in the file cannot work.
+        ConfigurationError: the file is not valid.
         MissingExtraError: PyYAML, or the bus' engine, is not installed.
     """
 
@@ -112,7 +112,7 @@ class FleetServer(Server):
         for _, mistake in access_mistakes(self.file.access, listen):
             raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
         self._listen, self._connect = listen, connect = with_ports(listen), connect
-        # with certificates nobody may come in beside the router
+        # with certificates all connections must come through the router
         peer = self.file.ros2 is not None and self.file.certificates is None
         link = BusLink(listen, connect, self.file.certificates, peer)
         self._bus = bus or ZenohEnd(link, self._more())
@@ -130,13 +130,13 @@ class FleetServer(Server):
         self._stack = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
-        """Start the emulated cameras, come to the bus, and begin to have sessions.
+        """Start the emulated cameras, connect to the bus, and start the sessions.
 
         Raises:
             ConnectFailedError: an endpoint cannot be listened on, or reached.
-            ConfigurationError: an option of a camera cannot work.
+            ConfigurationError: an option of a camera is wrong.
 
-        Cancellation: leaves it stopped.
+        Cancellation: the server is stopped.
         """
         if self._agent is not None:
             return
@@ -163,7 +163,7 @@ class FleetServer(Server):
                 on_retired=self._retire,
                 calibrations=self.calibrations,
             )
-            self._hosts = agent.hosts  # observers want them from their first result on
+            self._hosts = agent.hosts  # observers need them from the first result on
             stack.callback(self._forget_hosts)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
@@ -192,7 +192,7 @@ class FleetServer(Server):
             self._agent, self._stack = agent, stack.pop_all()
 
     def _desks(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
-        """Return the calibrations of the cameras, in the folder that the file says.
+        """Return the calibrations of the cameras, in the folder of the file.
 
         Raises:
             ConfigurationError: the folder cannot be created.
@@ -212,7 +212,7 @@ class FleetServer(Server):
         return found
 
     def _retire(self, why: ConfigurationError) -> None:
-        """End all who follow the cameras' events with the error: another agent has the name."""
+        """End the streams of the cameras' events with the error: another agent has the name."""
         for stream in self._events:
             stream.end(why)
 
@@ -239,7 +239,7 @@ class FleetServer(Server):
         return access_of(self.file.access, self._listen)
 
     def _check_role(self) -> None:
-        """Refuse to guard by roles with a certificate that has none: nobody could use it.
+        """Refuse access by roles with a certificate that has none, which no program could use.
 
         Raises:
             ConfigurationError: the certificate has another role, or none.
@@ -254,7 +254,7 @@ class FleetServer(Server):
             )
 
     def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
-        """Take renewed certificates from now on."""
+        """Use renewed certificates from now on."""
         watch = CertificateWatch(
             bus, listens=bool(self._listen), busy=lambda: agent.busy, away=self._away_from_ros
         )
@@ -274,7 +274,7 @@ class FleetServer(Server):
 
     @contextlib.asynccontextmanager
     async def _away_from_ros(self) -> AsyncIterator[None]:
-        """Have no nodes for a while: what is said once for all would be lost with the session."""
+        """Close the nodes for a while: their latched messages would be lost with the session."""
         await self._leave_ros()
         yield
         while True:
@@ -317,41 +317,40 @@ class FleetServer(Server):
             stream.end(None)
 
     def __del__(self) -> None:
-        # the event loop has it until it is stopped; so nobody has it when that is gone, too
+        # the event loop refers to it until it is stopped; so it is collected only after the loop
         if vars(self).get("_agent") is not None:
             text = f"agent {self.file.agent_name} of fleet {self.file.fleet} was not stopped"
             warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
 
     async def reload(self, file: str | Path | FleetFile | None = None) -> FleetChanges:
-        """Read the fleet file again, and do as it says now; cameras that did not change go on.
+        """Read the fleet file again, and apply its changes; unchanged cameras are not touched.
 
-        Those keep their sessions, and what is under way ends as if nothing was. A camera that
-        changed is closed and opened again, one that is new is shared at once, whether it is
-        connected or not. Only ``cameras`` can be changed; another field wants a restart. Several
-        at a time are done one after the other.
+        Those keep their sessions and running calls. A changed camera is closed and opened again, a
+        new one is shared at once, connected or not. Only ``cameras`` can be changed; other fields
+        need a restart. Several calls at a time are carried out one after the other.
 
         Args:
-            file: another file, or what stands in it; None for the one that it was made with.
+            file: another file, or the contents of one; None for the server's own.
 
         Returns:
-            What has changed.
+            The changes.
 
         Raises:
-            ConfigurationError: the file is wrong, or changes what wants a restart; says where. All
-                stays as it was.
+            ConfigurationError: the file is wrong, or a change needs a restart; the text names the
+                place. Nothing was changed.
             ConnectionClosedError: the agent is not started, or it ends.
 
-        Cancellation: nothing has changed; or all of it is changed, also when nobody waits for it.
+        Cancellation: nothing is changed, or everything.
         """
         if self._agent is None:
             raise ConnectionClosedError("the agent is not started: there is nothing to reload")
         return await self.reloads.reload(self._agent, self._given if file is None else file)
 
     async def _source(self, planned: Planned, folder: Path) -> CameraSource:
-        """Return the source of a camera's session; an emulated camera is started for it.
+        """Return the source of a camera's session; start an emulated camera for it.
 
         Raises:
-            SmartCamError: the session cannot be done.
+            SmartCamError: the source cannot be created.
         """
         async with contextlib.AsyncExitStack() as stack:
             entry = planned.entry
@@ -369,7 +368,7 @@ class FleetServer(Server):
             settings = entry.settings(planned.name, url, restore=self._restore)
             if entry.frames is not None:
                 make = functools.partial(entry.frames.source, folder)
-                make()  # what cannot work is told now
+                make()  # so that wrong options are reported now
                 address = FrameAddress.parse(entry.frames.url)
                 frames = FramesOf(make, address.shown)
                 if address.scheme in ("v4l2", "gige"):
@@ -433,7 +432,7 @@ class FleetServer(Server):
         return camera.url
 
     async def wait_tried(self) -> None:
-        """Wait until every camera was tried once, well or not; bounded by ``connect_timeout``."""
+        """Wait for the end of each camera's first attempt; bounded by ``connect_timeout``."""
         if self._agent is not None:
             await self._agent.wait_tried()
 
@@ -445,8 +444,8 @@ class FleetServer(Server):
     ) -> Subscription[CameraEvent]:
         """Subscribe to the events of all cameras: :meth:`smartcam.Camera.events` of each.
 
-        The stream ends with a :exc:`~smartcam.exceptions.ConfigurationError` where another agent
-        of the same name was started before: this one has no cameras then.
+        The stream ends with a :exc:`~smartcam.exceptions.ConfigurationError` if another agent of
+        the same name was started earlier: then this one has no cameras.
         """
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
         self._events.add(stream)
@@ -465,7 +464,7 @@ class FleetServer(Server):
 
     @property
     def agent(self) -> Agent | None:
-        """The agent, None before it is started."""
+        """The agent, None before the start."""
         return self._agent
 
     @property
@@ -475,17 +474,17 @@ class FleetServer(Server):
 
     @property
     def bus_bytes(self) -> int:
-        """Bytes that wait to be said on the bus."""
+        """Number of bytes that wait to be sent on the bus."""
         return self._bus.waiting_bytes
 
     @property
     def busy(self) -> bool:
-        """True while a command of a program is under way."""
+        """True while a command of a program runs."""
         return self._agent is not None and self._agent.busy
 
     @property
     def warning(self) -> str:
-        """Warning that the agent's certificate ends soon, with the cure; empty: nothing to do."""
+        """Warning that the agent's certificate ends soon, with the cure; empty for none."""
         return "" if self._bus.identity is None else self._bus.identity.warning
 
     @property
@@ -495,22 +494,22 @@ class FleetServer(Server):
 
     @property
     def ros_nodes(self) -> list[str]:
-        """The full names of its cameras' nodes in ROS 2, if it has any."""
+        """The full names of the cameras' nodes in ROS 2."""
         return [] if self._ros is None else self._ros.names
 
     @property
     def hosts(self) -> dict[str, Host]:
-        """Its cameras by name, empty before it is started."""
+        """The agent's cameras by name, empty before the start."""
         return self._hosts
 
     @property
     def address(self) -> FleetAddress:
-        """Address at which programs on this host find the agent."""
+        """Address of the agent for programs on this host."""
         return address_of((*self._listen, *self._connect)[0], self.file)
 
     @property
     def urls(self) -> dict[str, str]:
-        """The fleet URLs of its cameras, by name."""
+        """The fleet URLs of the cameras, by name."""
         address = self.address
         return {name: address.of(name).url for name in self.reloads.now.plan}
 
@@ -540,17 +539,17 @@ async def _end(task: asyncio.Task[None]) -> None:
 
 
 def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
-    """Return the address of a fleet by an endpoint such as ``tcp/127.0.0.1:7447``."""
+    """Return the address of a fleet from an endpoint such as ``tcp/127.0.0.1:7447``."""
     kind, _, place = endpoint.partition("/")
     host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
     host = host.strip("[]") or place
-    if host in {"0.0.0.0", "::"}:  # noqa: S104 - what is listened on everywhere is here, too
+    if host in {"0.0.0.0", "::"}:  # noqa: S104 - listening on all addresses includes this host
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    # where there are roles each program has a certificate of its own: the agent's commands nothing
+    # with roles each program has its own certificate: the agent's own may not command
     own = scheme == "fleet+tls" and file.access == "any-certificate"
     certificates = file.certificates if own else None
-    # a router that others stand around may have several fleets
+    # a router of several agents may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

@@ -1,7 +1,7 @@
-"""The camera that an agent shares: a client like any other, whose results stay what came.
+"""The client of a shared camera at its agent, whose results are the containers themselves.
 
-What a container holds is for each program to say, so here its value is the container itself; with
-which program's trigger brought it. A layout matters only as far as it has an ``@sequence``.
+Each program interprets containers by itself, so here the value of a result is the container, with
+the owner of its trigger. A layout is used only for its ``@sequence``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Owner(NamedTuple):
-    """The owner of a trigger: the program's number at its agent, and its call's. 0 is nobody."""
+    """The owner of a trigger: the program's number at its agent, and the call's. 0 for no owner."""
 
     program: int
     call: int
@@ -35,19 +35,19 @@ NOBODY = Owner(0, 0)
 
 
 class Carried(NamedTuple):
-    """The value of a result at an agent: whose it is, and the texts it was put together from."""
+    """The value of a result at an agent: its owner, and the texts that made up the container."""
 
     owner: Owner
     cells: bytes
 
 
 class Carrier(Interpretation):
-    """Reads nothing but the number of a container, where ``layouts`` have one.
+    """Reads only the sequence number of a container, if ``layouts`` have one.
 
     Args:
-        owner: owner of the trigger whose results are carried.
+        owner: owner of the trigger of the results.
         layouts: a layout with ``@sequence``, or such layouts by application; None for none.
-        by_application: whether the program reads each application's results in its own way.
+        by_application: whether the program has an interpretation for each application.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Carrier(Interpretation):
         self.by_application = by_application
 
     def of(self, owner: Owner) -> Carrier:
-        """Return the same for another's trigger, which costs less than a new one."""
+        """Return a copy for another owner's trigger, which is cheaper than a new object."""
         other = Carrier.__new__(Carrier)
         other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
         return other
@@ -85,7 +85,7 @@ class Carrier(Interpretation):
 
 
 class Tap(NamedTuple):
-    """The functions by which an agent is told of one of its cameras."""
+    """The agent's callbacks for one of its cameras."""
 
     results: Callable[[Sequence[Result[Carried]], bool, bool], None]
     status: Callable[[Status], None]
@@ -95,7 +95,7 @@ class Tap(NamedTuple):
 
 
 class TappedListeners(Listeners):
-    """Hands everything to the agent, too."""
+    """Passes everything to the agent, too."""
 
     tap: Tap | None = None
 
@@ -142,11 +142,11 @@ class TappedListeners(Listeners):
 
 
 class SharedCamera(SmartCamera[Carried]):
-    """A camera whose agent shares it.
+    """A camera that its agent shares.
 
     Args:
         settings: validated options; their interpretation is for the programs.
-        tap: receiver of all that the session brings.
+        tap: the agent's callbacks for the session.
         observers: observers of the session; a result's value is a :class:`Carried`.
     """
 
@@ -175,26 +175,26 @@ class SharedCamera(SmartCamera[Carried]):
         return self._supervisor.taken
 
     def take_again(self) -> None:
-        """Try again now where another client has the camera."""
+        """Try again now if another client has the camera."""
         self._supervisor.take_back()
 
     @property
     def endian(self) -> int:
-        """The byte order that its last status told."""
+        """The byte order in the camera's last status."""
         return self._state.endian
 
     async def trigger_for(
         self, request: TriggerRequest, application: int | None, timeout: float
     ) -> list[Result[Carried]]:
-        """Trigger for a program, as :meth:`trigger` does.
+        """Trigger for a program, like :meth:`trigger`.
 
         Args:
-            request: work that the trigger is to do.
-            application: application to have running for the trigger; None for any.
-            timeout: seconds.
+            request: options of the trigger.
+            application: application that must run for the trigger; None for any.
+            timeout: seconds of the timeout.
 
-        Input data of a trigger without a result, which the camera may still have queued, is no
-        other program's fault: the application is loaded again first, which empties the queue.
+        If the camera may still have input data queued, from a trigger without a result, the
+        application is loaded again first, which empties the queue.
         """
         if not self._observed:
             return await self._trigger_in_order(application, request, timeout)
@@ -219,25 +219,25 @@ class SharedCamera(SmartCamera[Carried]):
         return await self._trigger(application, request, timeout)
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Have an application running and ready, as ``application=`` does at the start."""
+        """Load and run an application, like ``application=`` at the start."""
         async with self._lock.hold(timeout) as deadline:
             await self._commands.ensure(application, deadline)
 
     async def enter(self, application: int, timeout: float) -> Any:
-        """Begin what :meth:`application` does; return what :meth:`leave` wants."""
+        """Switch like the start of :meth:`application`; return the argument for :meth:`leave`."""
         async with self._lock.hold(timeout) as deadline:
             return await self._lock.enter(application, deadline)
 
     def leave(self, before: Any) -> None:
-        """Have the camera go back, in the background."""
+        """Switch back in the background."""
         self._lock.leave(before)
 
     async def leave_and_wait(self, before: Any) -> None:
-        """Go back, and wait for it."""
+        """Switch back, and wait for the end."""
         await self._lock.leave_and_wait(before)
 
     async def refresh(self, timeout: float) -> bool:
-        """Have the last status be of now; return whether it had to be asked for."""
+        """Make sure that the last status is current; return whether the camera was asked."""
         deadline = self._deadline(timeout)
         self._require_session()
         await self._status.refresh(deadline)

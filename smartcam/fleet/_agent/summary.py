@@ -1,4 +1,4 @@
-"""Summarise all of an agent's cameras in one answer, from what the agent knows."""
+"""Summarise all of an agent's cameras in one answer, without asking the cameras."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 IN_A_TURN = 50
-"""Cameras that are told, or read, before the event loop has another turn."""
+"""Number of cameras that are written, or read, in one turn of the event loop."""
 
 MAX_PATTERN_BYTES = 4096
 """Largest number of bytes of a question."""
@@ -34,16 +34,16 @@ MAX_PATTERN_BYTES = 4096
 
 @dataclass(frozen=True, slots=True)
 class CameraSummary:
-    """An agent's knowledge of a camera.
+    """A camera's state, as known to its agent.
 
     Attributes:
         camera: name of the camera.
         agent: name of the agent that shares the camera.
         connected: whether the agent has a session with it.
-        status: last status that the camera told; None before the first.
+        status: last status from the camera; None before the first.
         application: active application; None if it is not known.
         reserved_by: the program that has reserved the camera, in words; None without one.
-        reason: why there is no session; None if there is one.
+        reason: reason why there is no session; None if there is one.
     """
 
     camera: str
@@ -59,8 +59,8 @@ class ToldCamera(NamedTuple):
     """One camera in an answer.
 
     Attributes:
-        summary: what the agent knows of the camera.
-        epoch: number of the agent's start, or of this time that it has the camera.
+        summary: the camera's state.
+        epoch: number of the agent's start, or of its current hold of the camera.
         following: number of the camera's next result.
         standby: whether the agent stands by for cameras that others have.
     """
@@ -85,12 +85,12 @@ class Summaries:
         self._declared: Handle | None = None
 
     def open(self) -> None:
-        """Answer from now on."""
+        """Start to answer."""
         key = self._keys.summary(self._agent.name)
         self._declared = self._bus.answer(key, self._on_question, patient=always)
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering."""
         if self._declared is not None:
             self._declared.close()
 
@@ -99,7 +99,7 @@ class Summaries:
         self._agent.begin(self._answer(question, pattern), "smartcam.fleet.summary")
 
     async def _answer(self, question: BusQuestion, pattern: str) -> None:
-        """Answer in parts, so that a thousand cameras hold up nobody."""
+        """Answer in parts, so that a thousand cameras do not block the event loop."""
         key = self._keys.summary(self._agent.name)
         try:
             hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
@@ -133,12 +133,12 @@ def _row(host: Host) -> list[Any]:
 async def ask_cameras(
     bus: Bus, keys: Keys, agent: str, pattern: str, timeout: float
 ) -> list[ToldCamera]:
-    """Return agents' answers on their cameras that came within ``timeout`` seconds.
+    """Return agents' answers on their cameras that come within ``timeout`` seconds.
 
     Args:
         bus: an end of the bus.
         keys: keys of the fleet.
-        agent: name of the agent that is asked; ``*`` for all agents.
+        agent: name of the agent to ask; ``*`` for all agents.
         pattern: pattern of the cameras' names.
         timeout: seconds to wait for the answers.
     """
@@ -165,7 +165,7 @@ def _read(payload: bytes) -> Iterable[ToldCamera]:
 
 
 def by_name(told: Iterable[ToldCamera], better: Callable[[ToldCamera], Any]) -> dict[str, Any]:
-    """Return one camera for each name: where two agents have it for a moment, the better one."""
+    """Return one camera for each name: if two agents have it for a moment, the better one."""
     found: dict[str, ToldCamera] = {}
     for one in told:
         known = found.get(one.summary.camera)

@@ -27,12 +27,12 @@ Data = bytes | bytearray | memoryview
 
 
 def never(_: str) -> bool:
-    """Return that nothing with a key is patient."""
+    """Return False: no key is patient."""
     return False
 
 
 def always(_: str) -> bool:
-    """Return that all with a key is patient."""
+    """Return True: each key is patient."""
     return True
 
 
@@ -319,7 +319,7 @@ class MemoryEnd(Bus):
             self._tell_heard("**")
 
     def detach(self) -> None:
-        """Leave the bus as by a broken cable: both sides see that the other is gone."""
+        """Leave the bus like after a broken cable: both sides lose each other."""
         if self.attached:
             self._tell_presence(False)
             self._bus.ends.remove(self)
@@ -469,7 +469,7 @@ class _MemoryQuestion(BusQuestion):
 
 
 def _call(one: _MemoryDeclared, *arguments: object) -> None:
-    """Call a callback that is still wanted; its error ends nothing else."""
+    """Call a callback of an open declaration; log its error."""
     if not one.closed:
         one.call(*arguments)
 

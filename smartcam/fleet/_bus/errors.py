@@ -1,4 +1,4 @@
-"""Errors on their way over the bus: their kind, text and attributes, and what caused them."""
+"""Send errors over the bus: their class, text and attributes, and their causes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_CHAIN = 8
 
 
 def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
-    """Return an error as JSON. One that is not known crosses as the nearest that is."""
+    """Return an error as JSON; one of an unknown class has its nearest known base class."""
     known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS), None)
     if known is None:
         fields: dict[str, Any] = {
@@ -41,7 +41,7 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
 
 
 def from_fields(fields: Any) -> SmartCamError:
-    """Return the error that is said by ``fields``."""
+    """Return the error in ``fields``."""
     error = _from_fields(fields)
     if isinstance(error, SmartCamError):
         return error
@@ -56,7 +56,7 @@ def _from_fields(fields: Any) -> BaseException:
     attributes: Any = said.get("attributes")
     if isinstance(attributes, dict):
         for name, value in cast("dict[str, Any]", attributes).items():
-            if name in vars(error):  # the kind's own, with their defaults
+            if name in vars(error):  # the class's own attributes, with their defaults
                 setattr(error, name, _meant(value))
     if "cause" in said:
         error.__cause__ = _from_fields(said["cause"])
@@ -86,7 +86,7 @@ _KINDS: dict[str, type[BaseException]] = {
         name: kind
         for name, kind in vars(builtins).items()
         if isinstance(kind, type) and issubclass(kind, (OSError, LookupError, ValueError))
-        if not issubclass(kind, UnicodeError)  # made of more than a text
+        if not issubclass(kind, UnicodeError)  # needs more arguments than a text
     },
     **{
         name: getattr(smartcam.exceptions, name)
@@ -94,10 +94,10 @@ _KINDS: dict[str, type[BaseException]] = {
         if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
     },
 }
-"""Classes that an error may have on the other side: smartcam's and, for causes, the system's."""
+"""Classes of errors from the bus: smartcam's and, for causes, the system's."""
 
 
 def late(said: str, text: str) -> SmartCamError:
-    """Return the error of a call whose time was over before it was done."""
+    """Return the error of a call whose deadline has passed before it was carried out."""
     kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
     return kind(text)

@@ -1,4 +1,4 @@
-"""The keys of a fleet, and which pattern means which key. ``docs/bus.md`` lists them."""
+"""The keys of a fleet, and the matching of patterns. ``docs/bus.md`` lists the keys."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 ROOT = "smartcam"
 
 ANYONE = "anyone"
-"""The role of a program without a certificate, or with one that names no role."""
+"""The role of a program without a certificate, or with one without a role."""
 
 COMMANDS = frozenset(
     {
@@ -39,7 +39,7 @@ COMMANDS = frozenset(
 """Calls that change something, or keep others from doing so; all others are questions."""
 
 FENCED = COMMANDS - {"release", "leave"}
-"""Commands that name the reservation in whose block they are called, and need it."""
+"""Commands that name and need the reservation in whose block they are called."""
 
 
 @lru_cache(maxsize=4096)
@@ -50,8 +50,8 @@ def meets(one: str, other: str) -> bool:
 
 def _meet(one: Sequence[str], other: Sequence[str]) -> bool:
     """Return True if the chunks of two patterns meet, in as many steps as pairs of chunks."""
-    # for each beginning of the other pattern: whether the part of the first that was seen matches
-    # it
+    # for each beginning of the other pattern: whether it matches the chunks of the first pattern so
+    # far
     row: list[bool] = [True]
     for chunk in other:
         row.append(row[-1] and chunk == "**")
@@ -70,13 +70,13 @@ def _same(one: str, other: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return True if a chunk fits a pattern such as ``cam$*``, which the engine knows, too."""
+    """Return True if a chunk fits a pattern such as ``cam$*``, which the engine has, too."""
     first, *parts = pattern.split("$*")
     if not parts or not chunk.startswith(first):
         return False
     *parts, last = parts
     place = len(first)
-    for part in parts:  # each as early as it can be: then there is most room for the others
+    for part in parts:  # each as early as possible, which leaves most room for the others
         place = chunk.find(part, place)
         if place < 0:
             return False
@@ -107,11 +107,11 @@ class Keys:
         return f"{self.root}/presence/start/{agent}/{start}"
 
     def camera(self, agent: str, camera: str) -> str:
-        """Presence of a camera: its agent has it, whether it is connected or not."""
+        """Presence of a camera at its agent, connected or not."""
         return f"{self.root}/presence/camera/{agent}/{camera}"
 
     def program(self, program: str) -> str:
-        """Presence of a program that calls; ``program`` is its name and its secret."""
+        """Presence of a calling program; ``program`` is its name and its secret."""
         return f"{self.root}/presence/program/{program}"
 
     def command(self, agent: str, camera: str) -> str:
@@ -123,7 +123,7 @@ class Keys:
         return f"{self.root}/ask/{role}/{agent}/{camera}"
 
     def reload(self, agent: str) -> str:
-        """Return the key at which an agent is told to read its file again."""
+        """Return the key of requests to an agent to read its file again."""
         return f"{self.root}/administer/{agent}/reload"
 
     def reply(self, program: str) -> str:
@@ -131,7 +131,7 @@ class Keys:
         return f"{self.root}/reply/{program}"
 
     def frames(self, program: str) -> str:
-        """Return the key of frames' bytes, to a program that has asked for them."""
+        """Return the key of frames' bytes for a program."""
         return f"{self.root}/frames/{program}"
 
     def states(self, camera: str) -> str:
@@ -147,15 +147,15 @@ class Keys:
         return f"{self.root}/bundle/{agent}"
 
     def summary(self, agent: str) -> str:
-        """Return the key at which an agent answers for all its cameras; in JSON."""
+        """Return the key of questions about all cameras of an agent; in JSON."""
         return f"{self.root}/summary/{agent}"
 
     def outlets(self, agent: str, name: str) -> str:
-        """Return the key at which an agent tells of its outlets: accounts, results; in JSON."""
+        """Return the key of questions about an agent's outlets: accounts, results; in JSON."""
         return f"{self.root}/outlets/{agent}/{name}"
 
     def listing(self, camera: str) -> str:
-        """Return the key at which a camera's description is asked for; in JSON."""
+        """Return the key of questions for a camera's description; in JSON."""
         return f"{self.root}/cameras/{camera}"
 
     def topic(self, kind: str, camera: str) -> str:
@@ -171,9 +171,9 @@ class Keys:
         return f"{self.root}/thesis/{name}"
 
     def thesis_topic(self, name: str) -> str:
-        """Return the key of a topic of somebody's choice."""
+        """Return the key of a topic that a request names."""
         return f"{self.root}/thesis/topic/{name}"
 
     def tail(self, key: str, kind: str) -> list[str]:
-        """Return the chunks of ``key`` behind ``kind``, such as ``presence/camera``."""
+        """Return the chunks of ``key`` after ``kind``, such as ``presence/camera``."""
         return key.removeprefix(f"{self.root}/{kind}/").split("/")

@@ -1,9 +1,8 @@
-"""Numbered things of one camera: kept by its agent, and put in order by their receiver.
+"""Numbered messages of one camera: kept by its agent, and put in order by their receiver.
 
-An agent numbers what it says without gaps and keeps the last of it (:class:`AgentLog`). A receiver
-that hears it (:class:`Feed`) takes each number once and in order: what came twice is dropped, and
-what is missing is asked for. What the agent no longer has was missed, and how many that were is
-known.
+An agent numbers its messages without gaps and keeps the last ones (:class:`AgentLog`). A receiver
+(:class:`Feed`) takes each number once and in order: it drops repetitions, and asks for missing
+messages. Those that the agent no longer has are missed, and their number is known.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ if TYPE_CHECKING:
 
 
 MAX_EPOCHS_REMEMBERED = 16
-"""Earlier epochs whose places are remembered at most."""
+"""Largest number of earlier epochs whose next numbers are remembered."""
 
 
 class Numbered(Protocol):
-    """One thing, or several with consecutive numbers."""
+    """One message, or several with consecutive numbers."""
 
     @property
     def number(self) -> int:
-        """The first one's number."""
+        """The number of the first one."""
         ...
 
     @property
@@ -35,7 +34,7 @@ class Numbered(Protocol):
 
     @property
     def size(self) -> int:
-        """Bytes that it keeps."""
+        """Number of kept bytes."""
         ...
 
     def since(self, number: int) -> Self:
@@ -54,10 +53,9 @@ class LogPart(NamedTuple):
     """A part of a log.
 
     Attributes:
-        first: the number that it begins with; a later one than was asked for where what was before
-            is no longer kept.
+        first: first number of the part; later than the requested one if that is no longer kept.
         data: the kept entries, one after the other.
-        following: the number that the agent gives next.
+        following: the agent's next number.
     """
 
     first: int
@@ -66,14 +64,14 @@ class LogPart(NamedTuple):
 
 
 class AgentLog:
-    """The last things that an agent said of one camera, as bytes; bounded.
+    """The last messages of an agent about one camera, as bytes; bounded.
 
     Args:
-        most: number of things that are kept at most.
-        most_bytes: bytes that are kept at most; the last entry stays, however large it is.
+        most: largest number of kept messages.
+        most_bytes: largest number of kept bytes; the last entry is always kept.
 
     Attributes:
-        following: number of the next thing, from 1.
+        following: number of the next message, from 1.
     """
 
     def __init__(self, most: int, most_bytes: int) -> None:
@@ -84,21 +82,21 @@ class AgentLog:
 
     @property
     def first(self) -> int:
-        """The first number that is kept; the next one where nothing is."""
+        """The first kept number; the next number if none is kept."""
         return self._entries[0].number if self._entries else self.following
 
     @property
     def kept(self) -> int:
-        """Number of things that are kept."""
+        """Number of kept messages."""
         return self.following - self.first
 
     @property
     def kept_bytes(self) -> int:
-        """The number of bytes that are kept."""
+        """Number of kept bytes."""
         return self._bytes
 
     def add(self, count: int, clock: float, data: bytes) -> None:
-        """Keep ``count`` things with the next numbers, which ``data`` has in it."""
+        """Keep ``count`` messages with the next numbers, which are in ``data``."""
         entries, number = self._entries, self.following
         self.following = number + count
         entries.append(_Kept(number, self.following, clock, data))
@@ -111,7 +109,7 @@ class AgentLog:
     def part(self, first: int, most_bytes: int) -> LogPart:
         """Return the entries from ``first`` on: up to ``most_bytes`` bytes, and at least one.
 
-        An entry that has ``first`` in it comes whole.
+        An entry that contains ``first`` is returned completely.
         """
         begin = max(first, self.first)
         found: list[bytes] = []
@@ -125,7 +123,7 @@ class AgentLog:
         return LogPart(begin, found, self.following)
 
     def first_since(self, clock: float) -> int:
-        """Return the number of the first one that came at ``clock`` or later."""
+        """Return the number of the first message at ``clock`` or later."""
         number = self.following
         for entry in reversed(self._entries):
             if entry.clock < clock:
@@ -141,20 +139,20 @@ class Feed(Generic[NumberedT]):
     """The messages of one camera's agent, put in order.
 
     Args:
-        take: gets each thing once, in order of the numbers.
-        miss: function that is told how many could not be had any more, and what came next; None if
-            nothing did.
-        lacks: function that is called where something is missing; then who made the feed is to ask
-            the agent for what follows ``expected``, and to :meth:`fill` it in.
-        most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
-            and asked for later.
-        returns: an epoch that comes again after another one's goes on where it was; what is
-            missing of one that ends is told.
+        take: function that is called with each message once, in order of the numbers.
+        miss: function that is called with the number of missed messages, and the message after
+            them; None without one.
+        lacks: function that is called if a message is missing; then the feed's owner should ask
+            the agent for messages from ``expected`` on, and :meth:`fill` them in.
+        most_held: largest number of bytes of messages that wait for a missing one; further ones are
+            dropped, and requested later.
+        returns: whether an epoch that comes again after another one continues at its next number;
+            missing messages of an epoch that ends are reported.
 
     Attributes:
         epoch: number of the agent's start; 0 before the first.
-        expected: number of the next thing; 0 where that is not known yet.
-        lacking: whether something is missing and waited for.
+        expected: number of the next message; 0 if that is not known yet.
+        lacking: whether a message is missing and awaited.
     """
 
     def __init__(
@@ -174,15 +172,15 @@ class Feed(Generic[NumberedT]):
         self._held_epoch = 0
         self._held_bytes, self._most_held = 0, most_held
         self._returns = returns
-        self._announced = 0  # the highest number of this epoch that the agent said comes next
+        self._announced = 0  # the highest next number of this epoch from the agent
         self._places: dict[int, int] = {}  # next expected number, by earlier epoch
-        self._said: dict[int, int] = {}  # next number that was announced, by other epoch
+        self._said: dict[int, int] = {}  # next number from the agent, by other epoch
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
-        """Take what has ``expected`` or a later number, of this epoch of the agent.
+        """Take messages with ``expected`` or a later number, of this epoch of the agent.
 
-        In the epoch that is already known, what was expected stays so. ``following`` is the number
-        that the agent gives next: what is missing before it is asked for.
+        In a known epoch the expected number stays. ``following`` is the agent's next number:
+        missing messages before it are requested.
         """
         if epoch != self.epoch or not self.expected:
             if self._returns and self.expected:
@@ -196,7 +194,7 @@ class Feed(Generic[NumberedT]):
         self._go_on(following)
 
     def _end_epoch(self) -> None:
-        """End with this agent, as another goes on: take what is held, and tell what cannot come."""
+        """End this epoch, since another begins: take held messages, report missed ones."""
         held = self._now_held()
         while held:
             thing = held.popleft()
@@ -214,7 +212,7 @@ class Feed(Generic[NumberedT]):
             del self._places[next(iter(self._places))]
 
     def receive(self, epoch: int, following: int, things: list[NumberedT]) -> None:
-        """Take what the agent said by itself; ``following`` is the number it gives next."""
+        """Take messages that the agent sent by itself; ``following`` is its next number."""
         if epoch == self.epoch and self.expected and not self.lacking:
             for thing in things:
                 if thing.number == self.expected:
@@ -228,7 +226,7 @@ class Feed(Generic[NumberedT]):
             return
         if epoch == self.epoch and self.expected:
             self._announced = max(self._announced, following)
-        else:  # of what is not held then, begin() is to know
+        else:  # begin() requests messages that are not held
             self._said[epoch] = max(following, self._said.get(epoch, 0))
             if len(self._said) > MAX_EPOCHS_REMEMBERED:
                 del self._said[next(iter(self._said))]
@@ -237,13 +235,13 @@ class Feed(Generic[NumberedT]):
                 self._hold(epoch, thing)
 
     def fill(self, epoch: int, first: int, following: int, things: list[NumberedT]) -> None:
-        """Take what the agent said when asked: all that it has from ``first`` on, or a part."""
+        """Take messages that were requested: all that the agent has from ``first`` on, or some."""
         if epoch != self.epoch or not self.expected:
-            return  # a newer one begins with begin(); or nobody wants it any more
+            return  # a newer epoch starts with begin(), or the feed is stopped
         held = self._now_held()
         before, stuck = self.expected, held[0].number if held else following
         if first <= before and not things:
-            first = max(following, stuck)  # it says that there is more, and has nothing to show
+            first = max(following, stuck)  # the agent announces more, but sends nothing
         if first > before:
             self._miss(first - before, things[0] if things else None)
             self.expected = first
@@ -257,7 +255,7 @@ class Feed(Generic[NumberedT]):
         self.lacking = True
 
     def stop(self) -> None:
-        """Take nothing more, since nobody wants it."""
+        """Stop taking messages."""
         self.expected = self._announced = 0
         self._places.clear()
         self._said.clear()
@@ -270,7 +268,7 @@ class Feed(Generic[NumberedT]):
         self._take(new)
 
     def _go_on(self, following: int) -> None:
-        """Take what was held as far as it fits; ask for what is missing before the rest."""
+        """Take held messages that are next; request the missing ones before the rest."""
         self.lacking = False
         if following > self._announced:
             self._announced = following
@@ -287,7 +285,7 @@ class Feed(Generic[NumberedT]):
             self._lacks()
 
     def _now_held(self) -> collections.deque[NumberedT]:
-        """Return the things held for this epoch; those held for the next one wait for begin()."""
+        """Return the messages held for this epoch; those of the next one wait for begin()."""
         return self._held if self._held_epoch == self.epoch else collections.deque()
 
     def _hold(self, epoch: int, thing: NumberedT) -> None:
@@ -297,7 +295,7 @@ class Feed(Generic[NumberedT]):
             self._drop_held()
             self._held_epoch = epoch
         if self._held_bytes + thing.size > self._most_held:
-            return  # following tells that it is missing
+            return  # the number in following shows that it is missing
         self._held.append(thing)
         self._held_bytes += thing.size
 

@@ -1,10 +1,10 @@
-"""Turn the messages between smartcam's own ends of a fleet into bytes, and back.
+"""Encode and decode the messages between smartcam's own ends of a fleet.
 
-A message is a JSON object with byte strings behind it: calls, replies, what the camera is. Results
-go as runs: containers of one camera that came together, with consecutive numbers. What each trigger
-needs goes as a few numbers instead of JSON, which costs most of all: its call
-(:class:`TriggerOrder`), its reply (:class:`TriggerReply`), and the statuses meanwhile. Everything
-is little endian. ``docs/bus.md`` has the layouts.
+A message is a JSON object followed by byte strings: calls, replies, descriptions. Results are sent
+as runs: containers of one camera that came together, with consecutive numbers. Messages of each
+trigger are a few numbers instead of JSON, which is the largest cost: the call
+(:class:`TriggerOrder`), the reply (:class:`TriggerReply`), and statuses. Everything is little
+endian. ``docs/bus.md`` has the layouts.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def grace(timeout: float) -> float:
 
 
 class BusMessage(NamedTuple):
-    """A JSON object, and the byte strings that came behind it."""
+    """A JSON object, and the byte strings after it."""
 
     fields: dict[str, Any]
     blobs: list[bytes]
@@ -48,14 +48,14 @@ def encode_state(fields: dict[str, Any]) -> bytes:
 
 _STATUS = struct.Struct("<4sQQIq")
 _IS_STATUS = b"scs1"
-_NONE = -(1 << 63)  # in place of a number
+_NONE = -(1 << 63)  # instead of a number
 
 
 def encode_status(number: int, status: int, endian: int, application: int | None) -> bytes:
-    """Return a status as bytes, as :func:`encode_state` does; ``number`` is the event's.
+    """Return a status as bytes, like :func:`encode_state`; ``number`` is the event's.
 
     Raises:
-        struct.error: it does not fit.
+        struct.error: a value does not fit.
     """
     return _STATUS.pack(
         _IS_STATUS, number, status, endian, _NONE if application is None else application
@@ -96,7 +96,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
     """Return the message in ``payload``.
 
     Raises:
-        RemoteProtocolError: the payload is no message; ``what`` names it.
+        RemoteProtocolError: the payload is not a message; the text names ``what``.
     """
     try:
         (size,) = _LENGTH.unpack_from(payload)
@@ -123,7 +123,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
 # ---------------------------------------------------------------------- results
 
 CURRENT, LATE = 1, 2
-"""Flags of a run: CURRENT, not known to belong to an older trigger; LATE, its trigger gave up."""
+"""Flags of a run: CURRENT, not known to belong to an older trigger; LATE, after its timeout."""
 
 _RUN = struct.Struct("<QIqIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
@@ -137,18 +137,18 @@ class ResultRun(NamedTuple):
 
     Attributes:
         number: the agent's number of the first container; the others follow.
-        application: application that sent the containers; below 0 where the camera says none.
-        endian: the byte order that the camera's last status told.
-        flags: bits on what is known of all the containers.
-        owner: the agent's number of the program whose trigger brought the containers; else 0.
-        call: number of the trigger at the program that called for it; else 0.
-        clock: the agent's monotonic clock when they came, seconds.
-        at: when the containers came, seconds since 1970, UTC.
-        triggered_at: when their trigger was sent, the same way; NaN without one.
+        application: application of the containers; below 0 if the camera does not report it.
+        endian: the byte order in the camera's last status.
+        flags: bits ``CURRENT`` and ``LATE``, for all the containers.
+        owner: the agent's number of the program whose trigger brought the containers; otherwise 0.
+        call: number of the trigger's call at its program; otherwise 0.
+        clock: time of the arrival by the agent's monotonic clock, seconds.
+        at: time of the arrival, seconds since 1970, UTC.
+        triggered_at: time at which the trigger was sent, the same way; NaN without a trigger.
         latency: seconds from the trigger to the containers; NaN without a trigger.
         payloads: bytes of each container.
-        cells: JSON with the values of which the one payload was made, and objections to them;
-            empty without cells.
+        cells: JSON with the values of the one payload, and errors in them; empty without
+            cells.
     """
 
     number: int
@@ -171,12 +171,12 @@ class ResultRun(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of the containers."""
+        """Number of bytes of the containers."""
         return sum(map(len, self.payloads)) + len(self.cells)
 
     @property
     def received_at(self) -> datetime:
-        """Time at which the results came."""
+        """Time of the arrival of the results."""
         return datetime.fromtimestamp(self.at, UTC)
 
     @property
@@ -214,12 +214,12 @@ class ResultRun(NamedTuple):
 
 
 def encode_runs(epoch: int, following: int, runs: Sequence[bytes]) -> bytes:
-    """Return runs as one message; ``following`` is the number that the agent gives next."""
+    """Return runs as one message; ``following`` is the agent's next number."""
     return b"".join((_BATCH.pack(_MAGIC, epoch, following, len(runs)), *runs))
 
 
 class Batch(NamedTuple):
-    """Runs, in order; the agent's epoch, and the number that it gives next."""
+    """Runs in order, the agent's epoch, and its next number."""
 
     epoch: int
     following: int
@@ -249,7 +249,7 @@ def decode_runs(payload: bytes, what: str) -> Batch:
 
 
 def decode_own_run(data: bytes) -> ResultRun:
-    """Return the run that :meth:`ResultRun.encode` made in this process."""
+    """Decode a run of this process, from :meth:`ResultRun.encode`."""
     return _decode_run(data, 0)[0]
 
 
@@ -302,17 +302,17 @@ class TriggerOrder(NamedTuple):
 
     Attributes:
         call: number of the call.
-        epoch: number of the start of the agent that is called.
+        epoch: number of the start of the called agent.
         deadline: time of the agent's clock at which the call ends, seconds.
-        timeout: seconds that the user gave.
-        application: application to have running for the trigger; None for any.
-        expected: application that the results are to be of; None for any.
-        results: number of results that the trigger is to have.
+        timeout: the user's timeout, seconds.
+        application: application that must run for the trigger; None for any.
+        expected: application whose results are expected; None for any.
+        results: number of results of the trigger.
         wait: whether to wait until the camera takes the trigger.
-        by_application: whether each application's results are read in a way of their own.
+        by_application: whether each application has its own interpretation.
         data: input of the trigger; None for none.
-        layouts: layouts that have the number of a result in them; None for none.
-        reservation: the call that made the reservation in whose block it is; None outside of one.
+        layouts: layouts that have the sequence number of a result; None for none.
+        reservation: number of the call that reserved the camera; None outside of a reservation.
     """
 
     call: int
@@ -353,7 +353,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
                 len(name),
             )
         except struct.error:
-            pass  # the agent says what is wrong with such numbers
+            pass  # the agent reports wrong numbers
         else:
             return b"".join((head, name, fence, data or b""))
     fields: dict[str, Any] = {
@@ -415,15 +415,15 @@ def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
 
 
 class TriggerReply(NamedTuple):
-    """The reply to a trigger that has succeeded.
+    """The reply to a successful trigger.
 
     Attributes:
         call: the number of the call.
         epoch: number of the agent's start.
         clock: time of the agent's clock, seconds.
-        states: number that the agent will give its next event.
+        states: number of the agent's next event.
         told: events that were not sent before.
-        batch: results of the trigger, and the number that the agent gives the next one.
+        batch: results of the trigger, and the agent's next number.
     """
 
     call: int
@@ -437,7 +437,7 @@ class TriggerReply(NamedTuple):
 def encode_outcome(
     call: int, epoch: int, clock: float, states: int, told: Sequence[bytes], runs: bytes
 ) -> bytes:
-    """Return a reply as bytes; ``runs`` is what :func:`encode_runs` gives, the rest as it has."""
+    """Return a reply as bytes; ``runs`` is in the form of :func:`encode_runs`."""
     count = len(told)
     head = _OUTCOME.pack(_IS_OUTCOME, call, epoch, clock, states, count)
     lengths = struct.pack(f"<{count}I", *map(len, told))

@@ -1,9 +1,9 @@
-"""The bus between processes and hosts: Zenoh, whose binding calls back in threads of its own.
+"""The bus between processes and hosts: Zenoh, whose binding calls back in its own threads.
 
-What comes is put into one queue, and a burst wakes the event loop once. The loop waits for room in
-the engine's buffers, but a millisecond at most. Results, states and parts of frames that find none
-are dropped there, and who hears them finds the gap by their numbers. Calls and replies are never
-dropped for want of room: those that were slow to go are said again by a thread, which may wait.
+Received messages are put into one queue, and a burst wakes the event loop once. The loop waits for
+room in the engine's buffers for at most a millisecond. Results, states and parts of frames without
+room are dropped there, and their receivers find the gap by the numbers. Calls and replies are never
+dropped for want of room: a thread, which may wait, sends the slow ones again.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_DIRECT_BYTES = 1 << 16
-"""Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
+"""Bytes beyond which a thread sends a message, and waits until the engine has taken it."""
 
 LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
-"""The place of the other end of a connection, as the engine writes it."""
+"""The address of the other end of a connection, in the engine's form."""
 
 BURST_PERIOD = 0.01
-"""Seconds in which a few messages go out at once, and further ones together."""
+"""Seconds in which a few messages are sent at once, and further ones together."""
 
 MAX_EXPRESS_MESSAGES = 8
-"""Messages in that time that each go out at once. The engine has room for 16 packets of a kind on
-their way: the next messages go in packets of many, up to a millisecond later."""
+"""Number of messages in that time that are each sent at once. The engine has room for 16 packets of
+a kind: the next messages are sent in packets of many, up to a millisecond later."""
 
 MAX_FREQUENT_KEYS = 64
 """Largest number of keys with a publisher of their own, which routers have to know."""
@@ -64,11 +64,11 @@ IDLE_KEY_TIME = 10.0
 would overtake messages that still wait for room."""
 
 SENDERS = 8
-"""Threads that say what may have to wait; a program that does not read blocks one of them."""
+"""Threads that send messages that may have to wait; a program that does not read blocks one."""
 
 
 class ZenohEnd(ZenohSession, Bus):
-    """One end of a bus that Zenoh makes.
+    """One end of a bus over Zenoh.
 
     Args:
         link: endpoints and certificates by which this end joins the bus.
@@ -81,7 +81,7 @@ class ZenohEnd(ZenohSession, Bus):
         self._looking: asyncio.Task[None] | None = None
         self._senders: dict[int, ThreadPoolExecutor] = {}
         self._sending = 0
-        self._doubtful = 0  # messages that may have been dropped, and are not said again yet
+        self._doubtful = 0  # messages that may have been dropped, and are not sent again yet
         self._behind: collections.Counter[str] = collections.Counter()
         self._calm_since, self._said = -BURST_PERIOD, 0
         # keys that are used again and again, in the order of their last use
@@ -108,12 +108,12 @@ class ZenohEnd(ZenohSession, Bus):
     # ------------------------------------------------------------------ life
 
     async def open(self, timeout: float) -> Self:
-        """Come to the bus.
+        """Connect to the bus.
 
         Raises:
-            ConnectFailedError: this end cannot listen, or reach anybody, within ``timeout``
-                seconds; the text says what is wrong with a certificate.
-            ConfigurationError: the certificates cannot work.
+            ConnectFailedError: this end cannot listen, or reach another end, within ``timeout``
+                seconds; the text names an error of a certificate.
+            ConfigurationError: the certificates are not valid.
         """
         folder = self._link.certificates
         if folder is None:
@@ -122,7 +122,7 @@ class ZenohEnd(ZenohSession, Bus):
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
-            await super().open(timeout - min(LOOK_TIMEOUT, timeout / 3))  # to find out why not
+            await super().open(timeout - min(LOOK_TIMEOUT, timeout / 3))  # the rest: to find causes
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
@@ -142,7 +142,7 @@ class ZenohEnd(ZenohSession, Bus):
             raise ConnectFailedError(text, attempts=exc.attempts) from exc
 
     async def close(self) -> None:
-        """Leave the bus; what was declared is gone with it. Idempotent."""
+        """Leave the bus, which ends all declarations. Idempotent."""
         looking, self._looking = self._looking, None
         if looking is not None:
             looking.cancel()
@@ -150,11 +150,11 @@ class ZenohEnd(ZenohSession, Bus):
         await super().close()
 
     async def look_at_certificates(self) -> Identity:
-        """Read whose its certificates are, as they are now; warn if they end soon, also later.
+        """Read the identity of the current certificates; warn if they end soon, also later.
 
         Raises:
             ConnectFailedError: the certificates have expired.
-            ConfigurationError: the certificates cannot work.
+            ConfigurationError: the certificates are not valid.
         """
         folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
         identity = await loop.run_in_executor(None, read_identity, folder)
@@ -167,7 +167,7 @@ class ZenohEnd(ZenohSession, Bus):
         return identity
 
     async def _look_now_and_then(self) -> None:
-        """Warn of certificates that end soon, as long as it is open."""
+        """Warn of certificates that end soon, until this end is closed."""
         while self.identity is not None:
             await asyncio.sleep(self.identity.look_after)
             try:
@@ -176,7 +176,7 @@ class ZenohEnd(ZenohSession, Bus):
                 logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
 
     async def _why_refused(self, folder: Path, left: float) -> str:
-        """Return one endpoint's objection to a handshake; empty if no endpoint has any."""
+        """Return one endpoint's error of a handshake; empty if there is none."""
         each = max(0.0, min(LOOK_TIMEOUT, left / len(self._link.connect)))
         for endpoint in self._link.connect:
             kind, _, place = endpoint.partition("/")
@@ -192,17 +192,17 @@ class ZenohEnd(ZenohSession, Bus):
         session = self._session
         if session is None:
             return False
-        # links, for the engine tells that all are gone before it forgets the router that was lost
+        # links, since the engine reports their loss before it forgets the lost router
         return bool(self._link.mode != "client" or session.info.links())
 
     def linked(self) -> set[tuple[str, int]] | None:
-        """Return the places of the ends that have come in; None while they are not known."""
+        """Return the addresses of connected ends; None while they are not known."""
         if self._session is None:
             return None
         found = (place_of(str(link.dst)) for link in self._session.info.links())
         return {place for place in found if place is not None}
 
-    # ------------------------------------------------------------------ what is said
+    # ------------------------------------------------------------------ sending
 
     @property
     def waiting_bytes(self) -> int:
@@ -216,7 +216,7 @@ class ZenohEnd(ZenohSession, Bus):
         if begun - self._calm_since > BURST_PERIOD:
             self._calm_since, self._said = begun, 0
         self._said += 1
-        # what is said by itself goes out at once, a burst together: there is not room for many
+        # a single message is sent at once, a burst together: there is not room for many
         express = self._said <= MAX_EXPRESS_MESSAGES
         waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
         if waits or (self._behind and self._way(key) in self._behind):
@@ -285,22 +285,24 @@ class ZenohEnd(ZenohSession, Bus):
         *,
         doubtful: bool = False,
     ) -> None:
-        """Have a thread say it, which waits until there is room; what goes the same way, too.
+        """Let a thread send a message, which waits for room; and later ones of the same way.
 
         Args:
-            way: key of what is said in order.
+            way: key of messages that are sent in order.
             session: the engine's session.
             key: key of the message.
             payload: the message.
-            express: whether the message goes out at once.
-            doubtful: whether it was said before, and took so long that the engine may have dropped
-                it. The engine then drops what follows at once, until it has sent something; so all
-                goes by threads until this one is through. Who hears it twice knows it by its
-                number.
+            express: whether the message is sent at once.
+            doubtful: whether it was sent before, and took so long that the engine may have dropped
+                it. The engine then drops further messages at once, until it has sent one; so all
+                are sent by threads until this one is sent. A receiver recognizes a repetition by
+                its number.
         """
         size = len(payload)
         if self._sending + size > MAX_WAITING_BYTES:
-            logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
+            logger.warning(
+                "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
+            )
             return
         lane = hash(way) % SENDERS
         sender = self._senders.get(lane)
@@ -336,7 +338,7 @@ class ZenohEnd(ZenohSession, Bus):
         in_loop = self.in_loop_patiently if patient else self.in_loop
         full = functools.partial(self.full, patient=True) if patient else self.full
 
-        key = None if "*" in pattern else pattern  # which saves asking for it
+        key = None if "*" in pattern else pattern  # saves asking the engine for it
 
         def on_sample(sample: Any) -> None:
             payload = sample.payload.to_bytes()
@@ -411,7 +413,7 @@ class ZenohEnd(ZenohSession, Bus):
                 await done
         return answers
 
-    # ------------------------------------------------------------------ who is there
+    # ------------------------------------------------------------------ presence
 
     def be_present(self, key: str) -> Handle:
         return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
@@ -434,7 +436,7 @@ class ZenohEnd(ZenohSession, Bus):
                 there.pop(key, None)
             see(key, present)
 
-        def lost() -> None:  # who has gone when there is a new session is not told of then
+        def lost() -> None:  # a new session does not report ends that have gone meanwhile
             for key in [*there]:
                 on_presence(key, False)
 
@@ -448,13 +450,13 @@ class ZenohEnd(ZenohSession, Bus):
             )
         )
 
-    # ------------------------------------------------------------------ for what is declared
+    # ------------------------------------------------------------------ for declarations
 
     def publish(self, publisher: Any, payload: bytes, urgent_key: str | None) -> None:
-        """Have a publisher say something.
+        """Send a message by a publisher.
 
         Args:
-            publisher: the engine's; None while its session is about to be there.
+            publisher: the engine's publisher; None while its session is not open yet.
             payload: the message.
             urgent_key: key of the message if it waits in one line with those of :meth:`put`.
         """
@@ -572,7 +574,7 @@ class _ZenohQuestion(BusQuestion):
 
 
 def place_of(said: str) -> tuple[str, int] | None:
-    """Return the address and the port that the engine writes; None if there are none."""
+    """Return address and port in the engine's text; None if there are none."""
     there = LINK.match(said)
     return None if there is None else (plain_host(there["host"]), int(there["port"]))
 

@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on who may use the bus, and refuse what cannot work."""
+"""Read the section of a fleet file on access to the bus, and refuse wrong values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Mistake = tuple[tuple[str, ...], str]
 
 
 def access_of(said: Access | None, listen: Sequence[str]) -> Access | None:
-    """Return the access that holds: with TLS at least roles, or any certificate could command."""
+    """Return the effective access: with TLS roles, or any certificate could command."""
     tls = any(one.startswith("tls/") for one in listen)
     return said or ("roles" if tls else None)
 
@@ -32,14 +32,14 @@ def access_mistakes(said: Access | None, listen: Sequence[str]) -> Iterator[Mist
     if access == "roles" and plain:
         yield (
             ("listen",),
-            f"{plain[0]} asks for no certificate, so nobody there has a role: expected tls/ "
-            "endpoints alone, or access: any-certificate beside them",
+            f"{plain[0]} asks for no certificate, so its programs have no role: expected only "
+            "tls/ endpoints, or access: any-certificate",
         )
     elif access != ANYONE and open_to_all:
         yield (
             ("listen",),
-            f"{open_to_all[0]} takes everybody who reaches it, without a certificate, and who is "
-            f"in may command the cameras. {CURE}. Or say that you want it so: access: {ANYONE}",
+            f"{open_to_all[0]} accepts every program without a certificate, and each may command "
+            f"the cameras. {CURE}. If this is wanted: access: {ANYONE}",
         )
     elif said in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
-        yield ("access",), f"{said} wants listen: tls/... and certificates"
+        yield ("access",), f"{said} needs listen: tls/... and certificates"

@@ -1,4 +1,4 @@
-"""Fleet files: which cameras an agent shares, and where; read from YAML."""
+"""Fleet files, read from YAML: the cameras that an agent shares, and its settings."""
 
 from __future__ import annotations
 
@@ -107,19 +107,19 @@ _ENDPOINTS_SCHEMA = WithJsonSchema(
 
 
 class Retry(Fields):
-    """The delays before a camera that is not there, or was lost, is tried again."""
+    """The delays before each further attempt to connect to a camera."""
 
     initial: float = Field(0.1, ge=0, description="the first delay, seconds")
     factor: float = Field(2.0, ge=1, description="each delay is this times the last")
     maximum: float = Field(10.0, ge=0, description="the longest delay, seconds")
-    jitter: float = Field(0.3, ge=0, le=1, description="share of a delay that is left to chance")
-    attempts: int | None = Field(None, ge=1, description="tries until it is given up; none: never")
+    jitter: float = Field(0.3, ge=0, le=1, description="random share of a delay")
+    attempts: int | None = Field(None, ge=1, description="largest number of attempts; null: no end")
 
     def backoff(self) -> Backoff:
-        """Return the same for a client.
+        """Return the delays for a client.
 
         Raises:
-            ConfigurationError: the values do not go together.
+            ConfigurationError: the values do not fit together.
         """
         return Backoff(**self.model_dump())
 
@@ -137,14 +137,14 @@ def _or_bool(schema: dict[str, Any]) -> None:
 
 
 class Emulated(Fields):
-    """Emulated cameras, to try a plant on a desk."""
+    """Emulated cameras, to try a plant without hardware."""
 
     count: int = Field(1, ge=1, le=MAX_CAMERAS_PER_AGENT, description="number of cameras")
     scenario: str | None = Field(
-        None, description="a scenario file with one camera, beside this file; default as the demo's"
+        None, description="a scenario file with one camera, beside this file; default: the demo's"
     )
     seed: int = Field(
-        1, ge=0, description="seed of the first camera's noise; the next ones count on"
+        1, ge=0, description="seed of the first camera's noise; each next camera has one more"
     )
 
 
@@ -153,32 +153,32 @@ class FramesEntry(Fields):
 
     url: str = Field(description="v4l2:///dev/video0, rtsp://HOST/..., or a file beside this one")
     linger: float = Field(
-        2.0, ge=0, le=3600, description="seconds that it goes on streaming after the last who looks"
+        2.0, ge=0, le=3600, description="seconds of streaming after the last viewer"
     )
     stall: Seconds | None = Field(
         5.0,
-        description="seconds without a frame after which it counts as stuck; null: it waits for "
+        description="seconds without a frame after which the device is lost; null: it waits for "
         "triggers",
     )
     camera_info: str | None = Field(
         None,
-        description="file with the lens, beside this one: a calibration of smartcam's, or ROS' "
+        description="file with the lens, beside this one: a calibration of smartcam, or ROS' "
         "camera_info",
     )
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Show all of it but a password, which is not for logs."""
+        """Yield all fields, without a password, which is not for logs."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" else value
 
     def source(self, folder: Path) -> FrameSource:
-        """Return the source of the frames; it is not open.
+        """Return the closed source of the frames.
 
         Args:
-            folder: folder that the fleet file is in.
+            folder: folder of the fleet file.
 
         Raises:
-            SmartCamError: the URL, or the lens, cannot work.
+            SmartCamError: the URL, or the lens, is not valid.
             OSError: the lens cannot be read.
         """
         from smartcam import frames
@@ -190,7 +190,7 @@ class FramesEntry(Fields):
         """Return the lens, None if the file names none.
 
         Raises:
-            CalibrationError: the file is no lens.
+            CalibrationError: the file has no lens.
             OSError: the file cannot be read.
         """
         if self.camera_info is None:
@@ -204,7 +204,7 @@ class FramesEntry(Fields):
         return read_cameras(path, "camera_info").cameras[0]
 
     def camera_info_url(self, folder: Path) -> str:
-        """Return the URL of ROS' ``camera_info``; empty if that is none of ROS' files."""
+        """Return the URL of ROS' ``camera_info``; empty if the file is not one of ROS."""
         if self.camera_info is None:
             return ""
         path = (folder / self.camera_info).absolute()
@@ -212,7 +212,7 @@ class FramesEntry(Fields):
 
 
 def _is_ours(path: Path) -> bool:
-    """Return True if a file is a calibration of smartcam's.
+    """Return True if a file is a calibration of smartcam.
 
     Raises:
         OSError: the file cannot be read.
@@ -222,7 +222,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _frames(given: object) -> object:
-    """Take a URL alone for a mapping with nothing else in it."""
+    """Convert a URL alone to a mapping."""
     return {"url": given} if isinstance(given, str) else given
 
 
@@ -231,7 +231,7 @@ def _or_url(schema: dict[str, Any]) -> None:
 
 
 _SOURCES = ("url", "emulated", "software")
-"""The keys of an entry, one of which says where the camera is."""
+"""The keys of an entry, one of which has the camera's source."""
 
 
 class CameraEntry(Fields):
@@ -242,29 +242,29 @@ class CameraEntry(Fields):
     )
 
     url: str | None = Field(None, description="address of the camera: bvs://HOST, insight://HOST")
-    emulated: Emulated | None = Field(None, description="an emulated one instead")
+    emulated: Emulated | None = Field(None, description="an emulated camera instead")
     software: dict[str, Any] | None = Field(
         None,
         description="a plain camera whose pictures are inspected here instead: frames, calibration "
         "and applications, as in a cell file",
     )
-    model: str | None = Field(None, description="picks the protocol where url is a bare host")
+    model: str | None = Field(None, description="model, for the protocol if url is a bare host")
     application: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | str | None = Field(
-        None, description="application to have running and ready: its id, or its name"
+        None, description="application to load and run: its id, or its name"
     )
     application_names: dict[str, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(
-        {}, description="names of applications and their ids; a name stands wherever an id may"
+        {}, description="names of applications and their ids; a name may replace any id"
     )
     interpret_as: str | dict[int | str, str] | None = Field(
         None,
-        description="what result containers hold, for programs that do not say: an interpreter, a "
+        description="contents of results, for programs that give none: an interpreter, a "
         "layout, or one for each application",
     )
     y_down: bool = Field(False, description="the camera's y axis points down")
     lenient: bool = Field(False, description="any non-zero byte is a true bool")
     restore: bool | None = Field(
         None,
-        description="after a reconnect have application and run state back; default: where nodes "
+        description="restore application and run state after a reconnect; default: if nodes "
         "of ROS become active by themselves",
     )
     connect_timeout: Seconds = Field(10.0, description="longest wait for a session, all attempts")
@@ -272,7 +272,7 @@ class CameraEntry(Fields):
     request_timeout: Seconds = Field(5.0, description="longest wait for the answer to a request")
     liveness_timeout: Seconds | None = Field(
         5.0,
-        description="longest silence of a camera that is asked for a sign of life; null: no end",
+        description="longest wait for the answer to a check of the connection; null: no end",
     )
     frames: Annotated[FramesEntry | None, BeforeValidator(_frames)] = Field(
         None,
@@ -280,11 +280,11 @@ class CameraEntry(Fields):
         json_schema_extra=_or_url,
     )
     ros2: RosCamera = Field(
-        RosCamera.model_validate({}), description="how it is seen in ROS 2, if the fleet is"
+        RosCamera.model_validate({}), description="its node in ROS 2, if the fleet has nodes"
     )
     reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
         Retry.model_validate({}),
-        description="when a lost camera is tried again; false: never",
+        description="delays before a lost camera is connected again; false: never",
         json_schema_extra=_or_false,
     )
 
@@ -297,7 +297,7 @@ class CameraEntry(Fields):
         return self
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Show all of it but a password, which is not for logs."""
+        """Yield all fields, without a password, which is not for logs."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" and isinstance(value, str) else value
 
@@ -306,11 +306,11 @@ class CameraEntry(Fields):
 
         Args:
             name: name of the camera in the fleet.
-            url: where the camera is.
-            restore: value of ``restore`` where the entry has none.
+            url: address of the camera.
+            restore: value of ``restore`` if the entry has none.
 
         Raises:
-            ConfigurationError: an option cannot work.
+            ConfigurationError: an option is wrong.
         """
         own = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
         options: dict[str, Any] = self.model_dump(exclude=own)
@@ -322,10 +322,10 @@ class CameraEntry(Fields):
 
 
 class History(Fields):
-    """The results of each camera that are kept for programs which were cut off for a while."""
+    """The results of each camera that are kept for programs that were cut off for a while."""
 
-    results: int = Field(20_000, ge=1, le=10_000_000, description="results")
-    bytes: int = Field(1 << 24, ge=1, le=1 << 34, description="their bytes, about")
+    results: int = Field(20_000, ge=1, le=10_000_000, description="largest number of results")
+    bytes: int = Field(1 << 24, ge=1, le=1 << 34, description="approximate bytes of results")
 
 
 class Planned(NamedTuple):
@@ -343,7 +343,7 @@ class Planned(NamedTuple):
 
 
 def _named(given: object) -> object:
-    """Refuse what YAML has not read as a text: it takes 12 and yes for something else."""
+    """Refuse names that YAML has not read as texts, such as 12 and yes."""
     if isinstance(given, dict):
         for name in cast("dict[object, object]", given):
             if not isinstance(name, str):
@@ -359,14 +359,14 @@ def _names(schema: dict[str, Any]) -> None:
 class FleetFile(Fields):
     """The cameras that one agent shares."""
 
-    fleet: Word = Field("plant", description="name of the fleet; several agents may be of one")
+    fleet: Word = Field("plant", description="name of the fleet, which may have several agents")
     agent: Word | None = Field(
         None, description="name of this agent, unique in the fleet; default: host and process"
     )
     listen: Annotated[list[str] | str | None, _endpoints(0), _ENDPOINTS_SCHEMA] = Field(
         None,
-        description="endpoints to listen on; this agent is the router, too, then. "
-        "tcp/127.0.0.1:7447 where nothing is said to connect to; port 0 takes a free one",
+        description="endpoints to listen on, which makes this agent a router; default without "
+        "connect: tcp/127.0.0.1:7447; port 0 takes a free one",
     )
     connect: Annotated[list[str] | str | None, _endpoints(1), _ENDPOINTS_SCHEMA] = Field(
         None, description="endpoints of routers or other agents, such as tls/plant-server:7447"
@@ -377,41 +377,41 @@ class FleetFile(Fields):
     )
     access: Access | None = Field(
         None,
-        description="who may use what listens: roles (of certificates), any-certificate, or "
-        "anyone-may-command, which takes everybody who reaches it; default: roles with tls, else "
-        "whoever is on this computer",
+        description="access to the endpoints: roles (of certificates), any-certificate, or "
+        "anyone-may-command for every program that reaches the port; default: roles with tls, "
+        "otherwise programs on this computer",
     )
     history: History = Field(
-        History.model_validate({}), description="what is kept of each camera's last results"
+        History.model_validate({}), description="bounds of each camera's kept results"
     )
     ros2: RosSection | None = Field(
-        None, description="have the cameras seen in ROS 2; {} is enough"
+        None, description="a node in ROS 2 for each camera; {} is enough"
     )
     operations: OperationsSection | None = Field(
-        None, description="how smartcam serve is watched: health, numbers, log; {} is enough"
+        None, description="health, metrics and log of smartcam serve; {} is enough"
     )
     record: RecordSection | None = Field(
-        None, description="record the cameras beside the agent; {} is enough"
+        None, description="record the cameras at the agent; {} is enough"
     )
     outlets: dict[str, dict[str, Any]] | None = Field(
         None,
-        description="where results go, by the outlet's name: mqtt, opcua, sqlite or a plug-in",
+        description="outlets for results, by their names: mqtt, opcua, sqlite or a plug-in",
     )
     calibrations: str | None = Field(
         None,
         min_length=1,
-        description="folder, beside this file, that the calibration services write to; it is made "
-        "if need be. Without it they refuse",
+        description="folder, beside this file, of the calibration services, made if missing; "
+        "without it they refuse",
     )
     standby: Annotated[Standby | None, BeforeValidator(standby_of)] = Field(
         None,
-        description="stand by for cameras that another agent has, and take over when it is gone: "
+        description="stand by for cameras of another agent, and take over when it is lost: "
         "true, or a mapping with more",
         json_schema_extra=_or_bool,
     )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
-        description="by name, such as line1/cam3; emulated ones at a name that ends in /**; {}: "
-        "none, the agent is a router for others",
+        description="cameras by name, such as line1/cam3; emulated ones by a name that ends in "
+        "/**; {}: none, the agent is a router for others",
         json_schema_extra=_names,
     )
 
@@ -436,7 +436,7 @@ class FleetFile(Fields):
         """Return the cameras of the file.
 
         Raises:
-            ValueError: a name cannot be one, or comes twice; or there are too many.
+            ValueError: a name is not valid, or comes twice; or there are too many.
         """
         found: dict[str, Planned] = {}
         for name, entry in self.cameras.items():
@@ -445,7 +445,7 @@ class FleetFile(Fields):
 
 
 def _add(found: dict[str, Planned], name: str, entry: CameraEntry) -> None:
-    """Add the cameras of an entry to those that are there."""
+    """Add the cameras of an entry to the cameras so far."""
     for planned in _planned(name, entry):
         if planned.name in found:
             raise ValueError(f"there is a camera {planned.name} already")
@@ -498,7 +498,7 @@ def load_fleet(path: str | Path) -> FleetFile:
 
 
 def _no_file(url: str) -> ConfigurationError:
-    """Return the error for an address where a fleet file is wanted."""
+    """Return the error for an address instead of a fleet file."""
     shown = masked(url)
     if is_fleet(url):
         return ConfigurationError(
@@ -571,7 +571,7 @@ def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
 def _of_entry(
     name: str, entry: CameraEntry, taken: dict[tuple[str, int], str], folder: Path
 ) -> Iterator[Mistake]:
-    """Give what cannot work of a camera; ``taken``: whose each address is."""
+    """Yield the mistakes of a camera; ``taken``: cameras by their addresses."""
     if entry.url is not None:
         try:
             address = parse_address(entry.url, model=entry.model)
@@ -635,11 +635,11 @@ def _of_frames(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
 
 
 def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamera:
-    """Return the software camera that an entry says.
+    """Return the software camera of an entry.
 
     Raises:
-        ConfigurationError: something of it cannot work.
-        MissingExtraError: what it needs is not installed.
+        ConfigurationError: the entry is wrong.
+        MissingExtraError: a package that it needs is not installed.
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
         from smartcam.inspection import Software, make_camera

@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on how an agent is watched."""
+"""Read the section of a fleet file on health, metrics and the log."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-
 
 
 class OperationsSection(Fields):
-    """The ways to watch an agent: health and numbers over HTTP, and its log."""
+    """The operation of an agent: health and metrics over HTTP, and its log."""
 
     listen: Place | None = Field(
         DEFAULT_PLACE,
-        description="HOST:PORT at which /healthz, /readyz and /metrics are served, to all who ask; "
+        description="HOST:PORT of /healthz, /readyz and /metrics, which every client can read; "
         "null: nowhere; port 0 takes a free one",
     )
     names: tuple[Name, ...] = Field(
         (),
-        description="names by which others ask, where it listens on more than this computer's own "
-        "address: they are what a request may say in its Host, beside addresses and the computer's "
-        "own name; a web page that has its name point here says another one",
+        description="further names of this computer that a request may have in its Host, besides "
+        "addresses and its own name, if it listens on more than its local address; requests of a "
+        "foreign web page have another name",
     )
     latency: Literal["agent", "camera"] = Field(
         "agent",
-        description="owner of the histograms of latency: all cameras of the agent together, each "
-        "camera then has sum and count only; or each camera, which is 20 lines more for each",
+        description="histograms of latency: agent, one for all cameras, each of which has only sum "
+        "and count; or camera, one for each, with 20 lines more",
     )
     log: Literal["text", "json"] = Field(
         "text", description="form of smartcam serve's log: lines for people, or JSON"
     )
     level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="lowest level of JSON lines that are written"
+        "info", description="lowest level of written JSON lines"
     )
 
     @property

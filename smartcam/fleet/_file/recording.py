@@ -22,8 +22,8 @@ class RecordSection(Fields):
         min_length=1,
         description="folder of the files, relative to this file; made if missing",
     )
-    size: Size = Field(1e8, description="size at which a camera's next file begins, such as 100 MB")
-    age: Age = Field(3600.0, description="time after which it begins, such as 1 h, 30 min, 1 d")
+    size: Size = Field(1e8, description="size at which a camera's next file starts, such as 100 MB")
+    age: Age = Field(3600.0, description="time after which it starts, such as 1 h, 30 min, 1 d")
     keep: Size = Field(
         1e10,
         description="size of all files, beyond which the oldest are deleted, such as 10 GB",
@@ -34,13 +34,13 @@ class RecordSection(Fields):
     )
     frames: bool = Field(
         True,
-        description="record what went over the wire, too; without it a replay has results and "
-        "statuses only",
+        description="record the messages of the protocol, too; without them a replay has only "
+        "results and statuses",
     )
     pictures: Literal["none", "judged", "all"] = Field(
         "none",
-        description="record the pictures of cameras that have frames, too: of each result the one "
-        "that it was made of, or all; the device then streams all the time",
+        description="record the pictures of cameras with frames, too: judged for each result's "
+        "picture, or all; then the device always streams",
     )
 
     def chooses(self, camera: str) -> bool:

@@ -40,7 +40,7 @@ class RosSection(Fields):
         le=MAX_DOMAIN_ID,
         description="number of the domain; default: ROS_DOMAIN_ID, or 0",
     )
-    namespace: Namespace = Field("/", description="in front of the cameras' names")
+    namespace: Namespace = Field("/", description="namespace of the cameras' nodes")
     distribution: Literal["humble", "jazzy", "kilted", "lyrical", "rolling"] = Field(
         "jazzy",
         description="distribution of ROS: its type hashes are part of all names; through rclpy, "
@@ -49,8 +49,8 @@ class RosSection(Fields):
     autostart: bool = Field(True, description="the nodes become active by themselves")
     through: Literal["zenoh", "rclpy"] = Field(
         "zenoh",
-        description="who speaks: smartcam itself, as rmw_zenoh does; or the rclpy that is "
-        "installed, over any middleware",
+        description="transport: smartcam's own, compatible with rmw_zenoh; or the installed rclpy, "
+        "over any middleware",
     )
     args: tuple[str, ...] = Field(
         (), description="arguments for rclpy, such as --ros-args -p use_sim_time:=true"
@@ -64,24 +64,24 @@ class RosCamera(Fields):
         None, description="frame of reference of its results; default: the camera's name"
     )
     parent_frame: Frame | None = Field(
-        None, description="the robot's frame, such as base_link; default: as a calibration calls it"
+        None, description="the robot's frame, such as base_link; default: that of a calibration"
     )
     flange_frame: Frame | None = Field(
         None,
         description="frame of the part of the robot that carries the camera, such as tool0; "
-        "default: as a calibration calls it",
+        "default: that of a calibration",
     )
     calibration: str | None = Field(
-        None, description="file with the calibration, beside this one: results are the robot's then"
+        None, description="file with the calibration to the robot's frame, beside this one"
     )
     calibrated_at: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)] | None = Field(
         None,
-        description="where the part that carries the camera was in the robot's frame for the "
-        "calibration: x, y, z in metres, and the quaternion x, y, z, w",
+        description="pose, at the calibration, of the part that carries the camera, in the robot's "
+        "frame: x, y, z in metres, and the quaternion x, y, z, w",
     )
     hand_eye: str | None = Field(
         None,
-        description="file with a hand-eye calibration, beside this one: where the camera is, for "
+        description="file with a hand-eye calibration, beside this one: the camera's place for "
         "/tf_static",
     )
 
@@ -89,10 +89,10 @@ class RosCamera(Fields):
         """Return the calibration, None if the file names none.
 
         Args:
-            folder: folder that the fleet file is in.
+            folder: folder of the fleet file.
 
         Raises:
-            CalibrationError: the file holds something else.
+            CalibrationError: the file has no calibration.
             OSError: the file cannot be read.
         """
         if self.calibration is None:
@@ -102,7 +102,7 @@ class RosCamera(Fields):
         return load_calibration(folder / self.calibration)
 
     def load_hand_eye(self, folder: Path) -> HandEyeCalibration | None:
-        """Return the hand-eye calibration, None if none is named; as ``load_calibration``."""
+        """Return the hand-eye calibration, None without one; like ``load_calibration``."""
         if self.hand_eye is None:
             return None
         from smartcam.calibration import HandEyeCalibration
@@ -113,7 +113,7 @@ class RosCamera(Fields):
         """Return the pose of ``calibrated_at``, None if the file names none.
 
         Raises:
-            CalibrationError: the numbers are no pose.
+            CalibrationError: the numbers are not a pose.
         """
         if self.calibrated_at is None:
             return None
@@ -124,10 +124,10 @@ class RosCamera(Fields):
 
 
 def node_names(cameras: list[str]) -> dict[str, str]:
-    """Return the name in the graph of each camera.
+    """Return the name of each camera in the graph.
 
     Raises:
-        ValueError: two have the same.
+        ValueError: two cameras have the same name.
     """
     found: dict[str, str] = {}
     for camera in cameras:

@@ -8,7 +8,7 @@ from smartcam.fleet._file.ros import Fields
 
 
 class Standby(Fields):
-    """The way an agent stands by for cameras that another one of the fleet has."""
+    """The settings of standing by for another agent's cameras."""
 
     preference: int = Field(
         0, ge=0, le=3, description="rank among several that stand by: the lowest takes over first"
@@ -16,5 +16,5 @@ class Standby(Fields):
 
 
 def standby_of(given: object) -> object:
-    """Return the section that ``standby: true`` or ``false`` stands for; else what is given."""
+    """Return the section for ``standby: true`` or ``false``; other values unchanged."""
     return {} if given is True else None if given is False else given

@@ -1,4 +1,4 @@
-"""Frames of a fleet's camera at a program: one on request, and a stream that readers read."""
+"""Request frames of a fleet's camera at a program: single frames and streams."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 OPEN_TIMEOUT = 15.0
-"""Seconds for an agent to open its device."""
+"""Seconds of the timeout for an agent to open its device."""
 
 ANSWER_TIME = 2.0
-"""Seconds beyond a trigger's own in which its agent says what became of it."""
+"""Seconds beyond a trigger's timeout for the agent's reply."""
 
 MAX_LENSES = 16
 
 
 class StreamCounts:
-    """The counts that a stream's last frame gave of those before it."""
+    """The counts of earlier frames in a stream's last reply."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
     def since(self, said: dict[str, Any], came: int = 1) -> tuple[int, int]:
-        """Return the numbers of frames skipped and lost since the last reply; ``came`` are here."""
+        """Return the numbers of skipped and lost frames since the last reply; ``came`` came."""
         now = int(said["stream"]), int(said["sent"]), int(said["skipped"]), int(said["lost"])
         last, self._last = self._last, now
-        if last is None or last[0] != now[0]:  # the first one, or the agent took it for over
+        if last is None or last[0] != now[0]:  # the first reply, or of a new stream at the agent
             last = now[0], 0, 0, 0
         sent, skipped, lost = (
             max(0, new - old) for new, old in zip(now[1:], last[1:], strict=True)
         )
-        return skipped, lost + max(0, sent - came)  # those that were sent and did not come
+        return skipped, lost + max(0, sent - came)  # frames that were sent and did not come
 
 
 class FrameCaller:
@@ -62,7 +62,7 @@ class FrameCaller:
 
     Args:
         name: name of the camera, for frames and texts.
-        caller: calls the agent.
+        caller: caller of the agent.
     """
 
     def __init__(self, name: str, caller: Caller) -> None:
@@ -70,10 +70,10 @@ class FrameCaller:
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
     async def about(self, wish: StreamWish) -> StreamFormat:
-        """Return the format of the frames, as the device tells it; the device is opened for that.
+        """Return the format of the frames from the device, which is opened for that.
 
         Raises:
-            SmartCamError: as the agent says.
+            SmartCamError: the agent's error.
         """
         loop = asyncio.get_running_loop()
         reply = await self._caller.call("about_frames", loop.time() + OPEN_TIMEOUT)
@@ -83,7 +83,7 @@ class FrameCaller:
             size = int(said["width"]), int(said["height"])
             return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(f"{self.name}: what the agent says of it: {exc!r}") from exc
+            raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
     async def one(
         self,
@@ -97,24 +97,24 @@ class FrameCaller:
         """Return one frame.
 
         Args:
-            encoding: form in which the frame is to come.
+            encoding: form of the frame.
             timeout: seconds to wait for the frame.
-            max_age: seconds since the frame was captured, at most; None for any.
-            moment: time of ``time.monotonic()`` after which the frame is to be exposed.
-            fresh: whether the frame is to be exposed after this call.
+            max_age: largest age of the frame, seconds since its capture; None for any.
+            moment: time of ``time.monotonic()`` after which the frame must be exposed.
+            fresh: whether the frame must be exposed after this call.
 
         Raises:
             FrameTimeoutError: no frame came in time.
-            SmartCamError: as the agent says.
+            SmartCamError: the agent's error.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
         arguments = {**encoding.fields(), "max_age": max_age, "fresh": fresh}
         if moment is not None:
-            # what the agent's clock says then, or later: none that is older passes for it
+            # the agent's time then or a little later, so that no older frame passes
             arguments["after"] = self._caller.clock_at_most(moment + self._ahead)
         try:
-            while True:  # nothing is done by it, so it may be asked again where a part was dropped
+            while True:  # asked again if a part was dropped, since the request changes nothing
                 _, frame = await self.ask("frame", deadline, arguments, StreamCounts())
                 if frame is not None:
                     return frame
@@ -133,12 +133,12 @@ class FrameCaller:
         return FleetFeatures(self.name, self._caller)
 
     async def trigger(self, encoding: FrameForm, timeout: float, *, wait: bool) -> FleetFrame:
-        """Have the device triggered, and return the picture that this trigger caused.
+        """Trigger the device, and return the trigger's picture.
 
         Raises:
-            FrameLostError: the picture was taken, and did not come here whole.
-            TriggerTimeoutError: the agent said nothing; whether it was triggered is unknown.
-            SmartCamError: as the agent says.
+            FrameLostError: the picture was taken, but did not come completely.
+            TriggerTimeoutError: the agent did not reply; whether it was triggered is unknown.
+            SmartCamError: the agent's error.
         """
         deadline = asyncio.get_running_loop().time() + timeout + ANSWER_TIME
         arguments = {**encoding.fields(), "wait": wait}
@@ -162,14 +162,14 @@ class FrameCaller:
         counts: StreamCounts,
         timeout: float | None = None,
     ) -> tuple[dict[str, Any], FleetFrame | None]:
-        """Ask once; return what the agent says, and the frame if there is one that came whole.
+        """Send one request; return the reply, and the frame if it came completely.
 
         Args:
             do: ``frame``, ``trigger_frame``, or ``next_frame`` of a stream.
-            deadline: loop time until which the agent has to have it.
+            deadline: loop time at which the agent's work must end.
             arguments: arguments of the call.
             counts: counts of the stream.
-            timeout: seconds that the user gave; what there is until ``deadline`` by default.
+            timeout: the user's timeout, seconds; by default the time until ``deadline``.
         """
         answer, frames = await self.ask_all(do, deadline, arguments, counts, timeout)
         return answer, frames[-1] if frames else None
@@ -182,7 +182,7 @@ class FrameCaller:
         counts: StreamCounts,
         timeout: float | None = None,
     ) -> tuple[dict[str, Any], list[FleetFrame]]:
-        """Ask once, as :meth:`ask` does; of H.264 several encoded frames come together."""
+        """Send one request like :meth:`ask`; of H.264 several encoded frames come together."""
         caller = self._caller
         caller.require()
         number = caller.program.next_call()
@@ -213,7 +213,7 @@ class FrameCaller:
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
-            raise RemoteProtocolError(f"{self.name}: what the agent says: {exc!r}") from exc
+            raise RemoteProtocolError(f"{self.name}: invalid reply of the agent: {exc!r}") from exc
         finally:
             incoming.forget()
         return {**answer, "skipped": skipped}, frames
@@ -235,13 +235,13 @@ class FrameCaller:
 
     @property
     def _ahead(self) -> float:
-        """Lead of the loop's clock over the one that frames are timed by, seconds."""
+        """Lead of the loop's clock over the clock of frames, seconds."""
         if self._caller.program.bus.local:
-            return 0.0  # they keep the time that they have
+            return 0.0  # frames keep their time
         return asyncio.get_running_loop().time() - time.monotonic()
 
     async def _lens(self, epoch: int, number: int, deadline: float) -> CameraModel | None:
-        """Return the lens that a frame names."""
+        """Return the lens with a frame's number."""
         if not number:
             return None
         key = epoch, number
@@ -251,7 +251,7 @@ class FrameCaller:
             try:
                 found = None if said is None else CameraModel.from_data(said)
             except CalibrationError as exc:
-                raise RemoteProtocolError(f"{self.name}: the agent's lens: {exc}") from exc
+                raise RemoteProtocolError(f"{self.name}: invalid lens of the agent: {exc}") from exc
             self._lenses[key] = found
             if len(self._lenses) > MAX_LENSES:
                 del self._lenses[next(iter(self._lenses))]
@@ -262,12 +262,12 @@ class FrameCaller:
         self._caller.tell("leave_frames", {"stream": stream})
 
     def next_stream(self) -> int:
-        """Return the number of another stream."""
+        """Return the number of a new stream."""
         return self._caller.program.next_call()
 
 
 def as_source_error(name: str, error: SmartCamError) -> FrameSourceError:
-    """Return an error as readers of frames expect it."""
+    """Return an error as one of the kind that readers of frames expect."""
     made = FrameSourceError(str(error), source=name)
     made.__cause__ = error
     return made

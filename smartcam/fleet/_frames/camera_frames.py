@@ -436,7 +436,7 @@ class SharedFrames:
     def _done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
-            task.exception()  # tasks that waited got the error
+            task.exception()  # the waiting tasks got the error
 
     def _lens_number(self, lens: CameraModel | None) -> int:
         if lens is None:

@@ -1,4 +1,4 @@
-"""The bytes of frames at a program: parts in order, as long as somebody waits for them."""
+"""Collect the bytes of frames at a program, from parts in order, while a call waits for them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 PART_TIMEOUT = 2.0
-"""Seconds without another part after which the rest of a frame will not come: it was dropped."""
+"""Seconds without a further part after which the rest of a frame counts as dropped."""
 
 
 class Incoming:
-    """A frame whose bytes come.
+    """A frame whose bytes are being received.
 
     Args:
-        collector: collector that hands on the frame's parts.
-        caller: caller that tells the agent what has come.
+        collector: collector of the frame's parts.
+        caller: caller that reports to the agent which bytes have come.
         call: number of the call that the frame answers.
     """
 
@@ -40,7 +40,7 @@ class Incoming:
         self._stirred = asyncio.Event()
 
     def take(self, part: FramePart, data: Data) -> None:
-        """Take a part; a part that does not follow the parts before ends the frame."""
+        """Add a part; a part that does not follow the last one ends the frame."""
         if self._torn or self.complete:
             return
         have = len(self._data)
@@ -62,14 +62,14 @@ class Incoming:
 
     @property
     def complete(self) -> bool:
-        """True once all of the frame is here."""
+        """True once the frame is complete."""
         return self._total is not None and len(self._data) == self._total
 
     async def whole(self, size: int) -> Data | None:
-        """Return the frame's bytes; None if some were lost on the way, or do not come in time.
+        """Return the frame's bytes; None if some were lost, or do not come in time.
 
         Args:
-            size: number of bytes that the frame is to have.
+            size: number of bytes of the frame.
         """
         self._wanted = True
         try:
@@ -82,14 +82,14 @@ class Incoming:
         return self._data if self.complete and len(self._data) == size else None
 
     def forget(self) -> None:
-        """Drop the frame, since nobody waits for it any more."""
+        """Drop the frame, since no call waits for it any more."""
         self._collector.forget(self._call)
         if (self._wanted or self._total is not None) and not self.complete and not self._torn:
             self._caller.come(self._call, None)
 
 
 class FrameCollector:
-    """Takes the bytes of frames for a program.
+    """Receives the bytes of frames for a program.
 
     Args:
         program: the program.
@@ -101,7 +101,7 @@ class FrameCollector:
         self._incoming: dict[int, Incoming] = {}
 
     def expect(self, caller: Caller, call: int) -> Incoming:
-        """Return the incoming frame that takes the bytes that answer a call."""
+        """Return the incoming frame for the bytes that answer a call."""
         if self._handle is None:
             program = self._program
             key = program.keys.frames(program.name)
@@ -110,11 +110,11 @@ class FrameCollector:
         return incoming
 
     def forget(self, call: int) -> None:
-        """Drop a frame for which nobody waits any more, and all parts of it that come."""
+        """Drop a frame for which no call waits any more, and further parts of it."""
         self._incoming.pop(call, None)
 
     def close(self) -> None:
-        """Take nothing more. Idempotent."""
+        """Stop receiving. Idempotent."""
         handle, self._handle = self._handle, None
         if handle is not None:
             handle.close()

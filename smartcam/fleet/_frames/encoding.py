@@ -13,16 +13,16 @@ FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL", "h264": "H264"}
 
 
 class FrameEncoder:
-    """Encodes frames of all cameras of an agent, in threads that begin with the first one."""
+    """Encodes frames of all cameras of an agent, in threads that start with the first frame."""
 
     def __init__(self) -> None:
         self._codecs: Codecs | None = None
 
     async def encoded(self, frame: Frame, encoding: FrameForm) -> Frame:
-        """Return a frame encoded; one that its camera has encoded so is left as it is.
+        """Return a frame encoded; unchanged if its camera has encoded it so.
 
         Raises:
-            FrameFormatError: its pixels are not for this codec, or its bytes are wrong.
+            FrameFormatError: the codec does not support its pixels, or its bytes are wrong.
             MissingExtraError: the codec is not installed.
         """
         if frame.format.name == FORMATS[encoding.name] and encoding.quality is None:
@@ -56,7 +56,7 @@ class FrameEncoder:
         return self._codecs
 
     async def close(self) -> None:
-        """End the threads; what they are at is finished. Idempotent."""
+        """End the threads after their running work. Idempotent."""
         codecs, self._codecs = self._codecs, None
         if codecs is not None:
             await codecs.close()

@@ -34,7 +34,7 @@ def read_feature(said: object, who: str) -> Feature:
     """Return the feature in an agent's fields.
 
     Raises:
-        RemoteProtocolError: the fields describe none.
+        RemoteProtocolError: the fields are not a valid feature.
     """
     try:
         fields = cast("dict[str, Any]", said)
@@ -52,7 +52,7 @@ def read_feature(said: object, who: str) -> Feature:
             read[name] = tuple(map(str, fields[name]))
         return Feature(**read)
     except (KeyError, TypeError, ValueError) as exc:
-        raise RemoteProtocolError(f"{who}: what the agent says of a feature: {exc!r}") from exc
+        raise RemoteProtocolError(f"{who}: the agent's feature is not valid: {exc!r}") from exc
 
 
 def read_value(said: object, who: str) -> FeatureValue:
@@ -63,7 +63,7 @@ def read_value(said: object, who: str) -> FeatureValue:
     """
     if isinstance(said, (bool, int, float, str)):
         return said
-    raise RemoteProtocolError(f"{who}: what the agent says is no value of a feature: {said!r:.80}")
+    raise RemoteProtocolError(f"{who}: the agent's value of a feature is not valid: {said!r:.80}")
 
 
 def _number(said: object) -> float:
@@ -94,11 +94,11 @@ class FleetFeatures(DeviceFeatures):
         return [str(one) for one in self._list(said, "names")]
 
     async def describe_all(self) -> dict[str, Feature]:
-        """Return all features with their values and ranges as they are now."""
+        """Return all features with their current values and ranges."""
         return {one.name: one for one in await self._described()}
 
     async def describe(self, name: str) -> Feature:
-        """Return a feature with its value and range as they are now."""
+        """Return a feature with its current value and range."""
         found = await self._described(name=name)
         if len(found) != 1:
             raise RemoteProtocolError(f"{self._name}: expected one feature, got {len(found)}")
@@ -116,7 +116,7 @@ class FleetFeatures(DeviceFeatures):
         """
         found = said.get(name)
         if not isinstance(found, list) or len(found) > MAX_FEATURES:
-            raise RemoteProtocolError(f"{self._name}: the agent says no list of {name}")
+            raise RemoteProtocolError(f"{self._name}: the agent's list of {name} is not valid")
         return found
 
     async def get(self, name: str) -> FeatureValue:
@@ -125,7 +125,7 @@ class FleetFeatures(DeviceFeatures):
         return read_value(said.get("value"), self._name)
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
-        """Set a feature; return the value that the device has then."""
+        """Set a feature; return the device's new value."""
         said = await self._call("set_feature", name=name, value=value)
         return read_value(said.get("value"), self._name)
 

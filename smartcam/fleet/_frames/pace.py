@@ -43,7 +43,7 @@ class FramePace:
         self._rest = rest
         way = min(self._ways)
         since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
-        if 0 < self._period <= way:  # else the link is free before there is another
+        if 0 < self._period <= way:  # otherwise the link is free before the next frame comes
             until = came + PATIENCE * self._period
         if rest and now < self._due:
             since = max(since, self._due - self._period / 2)

@@ -1,9 +1,9 @@
-"""An agent's end of frames on their way: never more of them than a program has said it takes.
+"""Send an agent's frames, never more bytes at a time than a program's window allows.
 
-Each program has a window of bytes that are under way to it. It says what has come, and then gets
-more. So a program that is slow, stopped or dead fills no queue but its own, nobody waits for it,
-and what it does not take in time is skipped where the frames are. There is no task in it: what
-comes pushes the next part out.
+Each program has a window of sent bytes that it has not confirmed. It confirms received bytes, and
+then gets more. So a program that is slow, stopped or dead fills only its own queue, delays no other
+program, and skips frames that it does not take in time. There is no task for it: each confirmation
+sends the next part.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 PART_BYTES = 1 << 17
-"""Bytes of a part: the loop takes less than 0.1 ms to hand them to the engine."""
+"""Bytes of a part: the loop takes less than 0.1 ms to pass them to the engine."""
 
 WINDOW_BYTES = 3 * PART_BYTES
-"""Bytes under way to one program. The engine's queue has room for 16 packets of 64 kB, and drops
-what does not fit; behind a router two programs share that queue."""
+"""Unconfirmed bytes of one program. The engine's queue has room for 16 packets of 64 kB, and drops
+further ones; two programs that are connected through one router share that queue."""
 
 MAX_UNCOUNTED_BYTES = 1 << 16
-"""Largest number of bytes of a frame that is one packet, and not counted: nobody says that it has
-come."""
+"""Largest number of bytes of a frame that is one packet, and not counted, since it is not
+confirmed."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of frames that may wait for one program; the oldest of which no part is
-under way are given up."""
+"""Largest number of bytes of frames that may wait for one program; beyond it the oldest frame that
+was not begun is dropped."""
 
 STALE_AFTER = 10.0
-"""Seconds after which a frame of which nothing came there is given up."""
+"""Seconds without a confirmation after which a frame is dropped."""
 
 
 @dataclass(eq=False)
 class _Transfer:
-    """A frame under way."""
+    """A frame that is being sent."""
 
     call: int
     data: memoryview
@@ -56,7 +56,7 @@ class _Transfer:
 
 @dataclass(eq=False)
 class _Window:
-    """All frames under way to one program, oldest first."""
+    """All frames that are being sent to one program, oldest first."""
 
     transfers: collections.OrderedDict[int, _Transfer] = field(
         default_factory=collections.OrderedDict[int, _Transfer]
@@ -85,16 +85,16 @@ class FrameSender:
 
     @property
     def ahead(self) -> float:
-        """Lead of the agent's clock over the one that frames are timed by, seconds.
+        """Lead of the agent's clock over the clock of frames, seconds.
 
-        Where all ends are in one process, frames keep the time that they have.
+        If all ends are in one process, frames keep their time.
         """
         if self._bus.local:
             return 0.0
         return asyncio.get_running_loop().time() - time.monotonic()
 
     def send(self, program: str, call: int, data: Data) -> None:
-        """Send a frame's bytes as the answer to a call: what there is room for now."""
+        """Send a frame's bytes as the answer to a call, as far as there is room now."""
         total = len(data)
         if self._bus.local or total <= MAX_UNCOUNTED_BYTES:
             self._put(program, FramePart(call, 0, total), data)
@@ -102,7 +102,7 @@ class FrameSender:
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
         for one in [*window.transfers.values()]:
-            # what is under way stays so, unless it is long ago
+            # a frame that was begun stays, unless it is old
             full = window.waiting + total > MAX_WAITING_BYTES and not one.under_way
             if full or now - one.moved_at > STALE_AFTER:
                 del window.transfers[one.call]
@@ -110,7 +110,7 @@ class FrameSender:
         self._push(program, window)
 
     def come(self, program: str, call: int, offset: int | None) -> None:
-        """Note up to where a frame has come at a program; None: whole, or no more is wanted."""
+        """Note the confirmed bytes of a frame; None: all, or no more are wanted."""
         window = self._windows.get(program)
         transfer = None if window is None else window.transfers.get(call)
         if window is None or transfer is None:
@@ -125,15 +125,15 @@ class FrameSender:
             del self._windows[program]
 
     def forget(self, program: str) -> None:
-        """Drop the frames of a program that is gone."""
+        """Drop the frames of a lost program."""
         self._windows.pop(program, None)
 
     def close(self) -> None:
-        """Send nothing more."""
+        """Stop sending."""
         self._windows.clear()
 
     def _push(self, program: str, window: _Window) -> None:
-        """Send parts as long as there is room; of those begun first, first."""
+        """Send parts while there is room, the oldest frame's first."""
         room = WINDOW_BYTES - window.under_way
         for one in window.transfers.values():
             while one.sent < len(one.data):

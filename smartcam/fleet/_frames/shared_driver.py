@@ -1,4 +1,4 @@
-"""Frames of a fleet's camera as a source: one asked for after the other."""
+"""Read the frames of a fleet's camera as a source: one request after the other."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 ANSWER_TIMEOUT = 4.0
-"""Seconds for the answer to a request of a stream, beyond those that it waits for a frame: to
-encode it, and for the way."""
+"""Seconds of the timeout for the answer to a stream's request, beyond its wait for a frame: for
+the encoding and the transfer."""
 
 MAX_UNANSWERED_REQUESTS = 3
-"""Requests in a row without an answer after which a stream has ended."""
+"""Number of consecutive requests without an answer after which a stream has ended."""
 
 MAX_BROKEN_FRAMES = 10
-"""Frames in a row that did not come whole after which a stream has ended, too."""
+"""Number of consecutive incomplete frames after which a stream has ended, too."""
 
 
 class SharedFrameDriver(FrameDriver):
-    """Frames of a fleet's camera that is open.
+    """Frames of an open camera of a fleet.
 
     Args:
         address: address of the camera.
         frames: caller that asks the agent for frames.
-        wish: form and rate in which the frames are to come.
+        wish: form and rate of the frames.
     """
 
     times_frames = True
@@ -72,12 +72,12 @@ class SharedFrameDriver(FrameDriver):
         return self._frames.name
 
     async def open(self) -> StreamFormat:
-        """Have the agent open the device.
+        """Make the agent open the device.
 
         Raises:
-            FrameSourceError: the agent cannot, or there is no agent.
+            FrameSourceError: the agent cannot open it, or there is no agent.
             UnsupportedError: the camera has no frames.
-            MissingExtraError: what decodes H.264 is not installed here.
+            MissingExtraError: the package that decodes H.264 is not installed here.
         """
         if self._wish.form.name == VIDEO and self._wish.decode:
             load("av")
@@ -90,14 +90,14 @@ class SharedFrameDriver(FrameDriver):
 
     @property
     def features(self) -> DeviceFeatures:
-        """The features of the device, which the camera's agent has."""
+        """The features of the device, through the camera's agent."""
         return self._frames.features
 
     async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame:
-        """Have the camera's agent trigger the device, and return the picture.
+        """Trigger the device through the camera's agent, and return the picture.
 
         Raises:
-            SmartCamError: as the agent says.
+            SmartCamError: the agent's error.
         """
         form = self._wish.form
         picture = FrameForm("raw", None) if form.name == VIDEO else form
@@ -106,7 +106,7 @@ class SharedFrameDriver(FrameDriver):
     async def trigger(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
     ) -> None:
-        """Refuse to have a line set: the agent cannot call a function of this program.
+        """Refuse a trigger line: the agent cannot call a function of this program.
 
         Raises:
             UnsupportedError: always.
@@ -117,7 +117,7 @@ class SharedFrameDriver(FrameDriver):
         )
 
     async def start(self, sink: FrameSink) -> None:
-        """Ask for one frame after the other."""
+        """Start to request one frame after the other."""
         if self._wish.form.name == VIDEO:
             from smartcam.fleet._frames.units import VideoUnits
 
@@ -129,7 +129,7 @@ class SharedFrameDriver(FrameDriver):
         self._task.add_done_callback(lambda _: self._frames.leave(stream))
 
     async def stop(self) -> None:
-        """Ask no more."""
+        """Stop requesting frames."""
         task, self._task = self._task, None
         video, self._video = self._video, None
         try:
@@ -141,7 +141,7 @@ class SharedFrameDriver(FrameDriver):
                 await video.close()
 
     async def close(self) -> None:
-        """Ask no more."""
+        """Stop requesting frames."""
         await self.stop()
 
     async def _ask(self, sink: FrameSink, stream: int) -> None:
@@ -153,7 +153,7 @@ class SharedFrameDriver(FrameDriver):
         sink.ended(end)
 
     async def _until_end(self, sink: FrameSink, stream: int) -> FrameSourceError | None:
-        """Take frames until there will be none, and return why."""
+        """Receive frames until the end, and return its reason."""
         loop = asyncio.get_running_loop()
         counts, silent, torn = StreamCounts(), 0, 0
         while True:
@@ -200,7 +200,7 @@ class SharedFrameDriver(FrameDriver):
     async def _give(
         self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]
     ) -> None:
-        """Give the frames that came to the readers."""
+        """Pass received frames to the readers."""
         if self._video is not None:
             await self._video.give(sink, answer, frames)
             return

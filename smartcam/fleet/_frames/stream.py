@@ -1,4 +1,4 @@
-"""The streams of frames that programs have at an agent: what each is given next."""
+"""The streams of frames at an agent, which choose the next frames for programs."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ IDLE_TIMEOUT = 3.0
 """Seconds without a request after which a stream has ended."""
 
 HOLD_TIMEOUT = 1.0
-"""Seconds that a request may wait for a frame; then the answer is that there is none."""
+"""Seconds for which a request waits for a frame; then the answer is that there is none."""
 
 
 class FrameOrder(NamedTuple):
-    """An order of a frame: the program that wants it, and the form.
+    """A request for a frame: the program, and the form.
 
     Attributes:
         program: name of the program.
         call: number of the program's call.
-        encoding: form in which the frame is to come.
-        timeout: seconds that the call may take.
-        rest: seconds from one frame of a stream to the next, at least.
+        encoding: form of the frame.
+        timeout: seconds of the call's timeout.
+        rest: least seconds from one frame of a stream to the next.
         have: number, for H.264, of the last encoded frame that the program has; 0 for none.
     """
 
@@ -47,9 +47,9 @@ class TakenFrame(NamedTuple):
     """A frame for a program.
 
     Attributes:
-        frame: the frame in the form in which it is to come.
+        frame: the encoded frame.
         took: seconds to encode it.
-        number: place, for H.264, of the frame in the stream; else 0.
+        number: place of a frame of H.264 in the stream; otherwise 0.
     """
 
     frame: Frame
@@ -63,7 +63,7 @@ class FrameStream(ABC):
 
     Attributes:
         number: number of the stream.
-        busy: whether a frame of the stream is asked for.
+        busy: whether a request of the stream is running.
     """
 
     number: int
@@ -76,7 +76,7 @@ class FrameStream(ABC):
         self.idle = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, close)
 
     def wake(self) -> None:
-        """Count the stream as busy: something is asked for."""
+        """Count the stream as busy with a request."""
         self.busy = True
         if self.idle is not None:
             self.idle.cancel()
@@ -89,12 +89,12 @@ class FrameStream(ABC):
         Raises:
             TimeoutError: there is no frame for now.
             StopAsyncIteration: the stream has ended.
-            SmartCamError: the stream has ended, and why.
+            SmartCamError: the stream has ended with this error.
         """
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """Return the numbers of frames sent, skipped and lost, to be told with the next frames."""
+        """Return the numbers of sent, skipped and lost frames, for the next reply."""
 
     def close(self) -> None:
         """End the stream. Idempotent."""
@@ -103,7 +103,7 @@ class FrameStream(ABC):
 
 @dataclass(eq=False)
 class PictureStream(FrameStream):
-    """A stream of frames that are each for themselves: the newest one.
+    """A stream of independent frames, of which the newest is next.
 
     Args:
         reader: reader of the source.
@@ -137,10 +137,10 @@ class PictureStream(FrameStream):
 
 @dataclass(eq=False)
 class VideoStream(FrameStream):
-    """A stream of H.264: all encoded frames since those that are there.
+    """A stream of H.264: all encoded frames after those that the program has.
 
     Args:
-        video: the encoder's stream, at which others look, too.
+        video: the encoder's stream, shared with other viewers.
         leave: function that is called at the end; None after it.
     """
 
@@ -148,7 +148,7 @@ class VideoStream(FrameStream):
     leave: Callable[[SharedVideo], None] | None
     _highest: int = 0
     _sent: int = 0
-    _first: tuple[int, int] | None = None  # offered and lost before the first one
+    _first: tuple[int, int] | None = None  # frames offered and lost before the first one
     _last: tuple[int, int] = (0, 0)
 
     async def take(self, order: FrameOrder) -> list[TakenFrame]:

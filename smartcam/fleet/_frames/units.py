@@ -1,4 +1,4 @@
-"""H.264 of a shared camera at a program: encoded frames in order, and pictures of them."""
+"""Decode H.264 of a shared camera at a program: encoded frames in order, or pictures."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ TAKE_TIMEOUT = 1.0
 
 
 class VideoUnits:
-    """Takes encoded frames, and gives pictures.
+    """Receives encoded frames, and gives pictures to the readers.
 
     Args:
-        decode: False: it gives the encoded frames.
+        decode: False to give the encoded frames instead.
 
     Attributes:
         have: number of the last encoded frame that was decoded; 0: no frame was.
 
     Raises:
-        MissingExtraError: what decodes is not installed.
+        MissingExtraError: the package that decodes is not installed.
     """
 
     def __init__(self, *, decode: bool) -> None:
@@ -44,15 +44,15 @@ class VideoUnits:
         await self._codecs.close()
 
     async def give(self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]) -> None:
-        """Give what came, in order; what cannot be decoded counts as lost, and is asked for anew.
+        """Give received frames in order; those that cannot be decoded count as lost.
 
         Raises:
-            RemoteProtocolError: the agent does not say which frames these are.
+            RemoteProtocolError: the agent's numbers of the frames are not valid.
         """
         try:
             numbers = [int(unit["number"]) for unit in answer["units"]]
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(f"what the agent says of H.264: {exc!r}") from exc
+            raise RemoteProtocolError(f"the agent's reply on H.264 is not valid: {exc!r}") from exc
         for place, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
             if self._decoder is None:
                 self.have = number
@@ -65,7 +65,7 @@ class VideoUnits:
             except FrameFormatError as exc:
                 logger.warning("%s", exc)
                 picture = None
-            if picture is None:  # the next one that comes is a key frame
+            if picture is None:  # the next received frame is a key frame
                 self.have = 0
                 sink.lost(len(frames) - place)
                 return

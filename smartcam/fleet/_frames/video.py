@@ -1,8 +1,8 @@
 """Encode a camera's frames as H.264 at its agent: one encoder per setting for all programs.
 
-A frame of H.264 needs those before it. So the last few are kept, and a program that asks gets all
-since the last one that it has; one that is too late gets nothing until the next key frame, which is
-made for it, but not more often than every :data:`KEY_EVERY` seconds.
+A frame of H.264 needs those before it. So the last few are kept, and a request gets all frames
+since the program's last one; a program that is too late gets nothing until the next key frame,
+which is made for it, but at most once in :data:`KEY_EVERY` seconds.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource, H264Encoder
 
 LATE_SECONDS = 0.3
-"""Seconds that an encoded frame is kept for programs that have the frames before it."""
+"""Seconds for which an encoded frame is kept for programs that have the frames before it."""
 
 MAX_UNITS_KEPT = 64
 
 KEY_EVERY = 1.0
-"""Seconds that must pass from one key frame to the next."""
+"""Least seconds from one key frame to the next."""
 
 
 class VideoUnit(NamedTuple):
@@ -91,7 +91,7 @@ class SharedVideo:
         await asyncio.wait([self.end()])
 
     def end(self) -> asyncio.Task[None]:
-        """Begin to close; return the task, which then ends."""
+        """Start to close; return the task, which then ends."""
         if self._over is None:
             self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
         self._reader.close()
@@ -100,7 +100,7 @@ class SharedVideo:
         return self._task
 
     async def after(self, have: int) -> list[VideoUnit]:
-        """Wait for encoded frames that follow one, or begin with a key frame; return them.
+        """Wait for encoded frames after a frame, or from a key frame on; return them.
 
         Args:
             have: number of the last frame that the reader has; 0: none.
@@ -143,7 +143,7 @@ class SharedVideo:
             self._over = self._over or (None,)
         except asyncio.CancelledError:
             raise
-        except Exception as error:  # noqa: BLE001 - it is told to who looks
+        except Exception as error:  # noqa: BLE001 - passed to the viewers
             self._over = (error,)
 
     async def _encode(self, frame: Frame, offered: int, lost: int) -> None:

@@ -1,8 +1,8 @@
-"""Frames on their way over the bus: what is said of one, and the parts that its bytes come in.
+"""Encode and decode frames on the bus: their fields, and the parts of their bytes.
 
-The reply to a call for a frame says all of it but its bytes. These come under a key of their own,
-in parts, since the engine drops what is longer than its queue; a part is dropped where there is no
-room, and never waited for.
+The reply to a call for a frame has all its fields, without its bytes. The bytes are sent under
+their own key, in parts, since the engine drops messages that are longer than its queue; a part
+without room is dropped, and never waits.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_FRAME_BYTES = 1 << 28
 """Largest number of bytes of a frame: 14,000 x 10,000 pixels of 16 bits."""
 
 ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
-"""Encodings of frames; raw is as the camera gave them."""
+"""Encodings of frames; raw is the camera's own."""
 
 
 VIDEO = "h264"
@@ -35,7 +35,7 @@ MIN_BITRATE, MAX_BITRATE = 10_000, 1_000_000_000
 
 
 class FrameForm(NamedTuple):
-    """The form in which frames are to come.
+    """The requested form of frames.
 
     Attributes:
         name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
@@ -62,7 +62,7 @@ class FrameForm(NamedTuple):
         Args:
             name: the encoding.
             quality: quality of a JPEG; None: not given.
-            who: name of the asker, for error texts.
+            who: name of the caller, for error texts.
             bitrate: bits per second; None: not given.
             stream: whether the order is for a stream, which video can be.
 
@@ -101,9 +101,9 @@ class FleetFrame(Frame):
     """A frame that came over the bus.
 
     Attributes:
-        encoding_time: seconds that its agent took to encode it; 0 where it is as the camera gave
-            it, or was encoded for somebody else before.
-        rate: what held the stream's bit rate or latency when it came, and why; None: nothing did.
+        encoding_time: seconds that its agent took to encode it; 0 if it has the camera's own
+            encoding, or was encoded for another program before.
+        rate: state of the control of the stream's bit rate or latency; None without control.
     """
 
     encoding_time: float = 0.0
@@ -115,8 +115,8 @@ def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> di
 
     Args:
         frame: the frame.
-        ahead: seconds that the agent's clock is ahead of ``time.monotonic()``.
-        encoding_time: as :class:`FleetFrame` has it.
+        ahead: seconds by which the agent's clock is ahead of ``time.monotonic()``.
+        encoding_time: as in :class:`FleetFrame`.
         lens: number of the frame's ``camera_info``; 0 for none.
     """
     return {
@@ -140,7 +140,7 @@ def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> di
 
 
 def _more(frame: Frame, ahead: float) -> dict[str, Any]:
-    """Return the fields that few frames have."""
+    """Return the fields that only some frames have."""
     said: dict[str, Any] = {}
     chunks = {
         name: value
@@ -161,7 +161,7 @@ def _more(frame: Frame, ahead: float) -> dict[str, Any]:
 
 
 def _read_more(said: dict[str, Any], captured: float, who: str) -> dict[str, Any]:
-    """Return the fields that :func:`_more` made, by this side's clock."""
+    """Return the fields from :func:`_more`, by this side's clock."""
     chunks, remark, trigger = said.get("chunks", {}), said.get("remark", ""), said.get("trigger")
     if not isinstance(chunks, dict):
         raise TypeError("its chunks are not valid")
@@ -189,22 +189,22 @@ def from_fields(
     source: str,
     camera_info: CameraModel | None,
 ) -> FleetFrame:
-    """Return the frame that an agent's fields describe; other arguments give what they lack.
+    """Return the frame of an agent's fields and these arguments.
 
     Args:
-        said: fields made by :func:`to_fields`.
+        said: fields from :func:`to_fields`.
         data: bytes of the frame.
-        captured: when the frame was taken, by this side's ``time.monotonic()``.
+        captured: time of the capture by this side's ``time.monotonic()``.
         doubt: seconds by which ``captured`` may be wrong.
         lost: number of frames lost before this one.
         source: the camera's name.
         camera_info: model of the camera's lens; None for none.
 
     Raises:
-        RemoteProtocolError: the fields describe no frame.
-        FrameFormatError: pixels that this version does not know.
+        RemoteProtocolError: the fields are not valid.
+        FrameFormatError: this version does not know the pixel format.
     """
-    from smartcam.frames import find_format  # with numpy, which not everybody needs
+    from smartcam.frames import find_format  # imports numpy, which not every program needs
 
     try:
         width, height, stride = int(said["width"]), int(said["height"]), int(said["stride"])
@@ -221,7 +221,7 @@ def from_fields(
             **_read_more(said, captured, source),
         }
     except (KeyError, TypeError, ValueError) as exc:
-        raise RemoteProtocolError(f"{source}: what the agent says of a frame: {exc!r}") from exc
+        raise RemoteProtocolError(f"{source}: the agent's frame is not valid: {exc!r}") from exc
     return FleetFrame(
         data=data,
         format=find_format(pixels),
@@ -261,10 +261,10 @@ def encode_part(part: FramePart) -> bytes:
 
 
 def decode_part(head: bytes) -> FramePart:
-    """Return the part of a frame that its head describes.
+    """Return the part of a frame from its head.
 
     Raises:
-        RemoteProtocolError: the head is not that of a part.
+        RemoteProtocolError: the head is not valid.
     """
     try:
         magic, call, offset, total = _PART.unpack(head)

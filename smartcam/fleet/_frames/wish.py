@@ -1,4 +1,4 @@
-"""Read a program's wish for a stream: its encoding, and the control of bit rate or latency."""
+"""A program's request for a stream: the encoding, and the control of bit rate or latency."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from smartcam.frames import RateControl, find_format
 
 
 class StreamWish(NamedTuple):
-    """A program's wish for a stream.
+    """A program's request for a stream.
 
     Attributes:
         form: form in which frames come.
@@ -34,10 +34,10 @@ class StreamWish(NamedTuple):
         *,
         decode: bool = True,
     ) -> StreamWish:
-        """Return a checked wish; ``who`` asks, the rest is as for :meth:`smartcam.Camera.frames`.
+        """Return a checked request of ``who``, with arguments of :meth:`smartcam.Camera.frames`.
 
         Raises:
-            ConfigurationError: these do not go together, or one is out of its range.
+            ConfigurationError: the arguments do not fit together, or one is out of range.
         """
         if bitrate is None and latency is None:
             return cls(FrameForm.checked(encoding, quality, who, stream=True), None, decode)
@@ -58,7 +58,7 @@ class StreamWish(NamedTuple):
         return cls(FrameForm("jpeg"), RateControl(bitrate, latency), decode)
 
     def pixels(self, given: str) -> str:
-        """Return the format in which frames come from a camera whose format is given."""
+        """Return the format of received frames from the camera's format."""
         if self.form.name != VIDEO or not self.decode:
             return FORMATS.get(self.form.name, given)
         from smartcam.frames._inside import colour_properties, format_of

@@ -1,4 +1,4 @@
-"""The thesis' five calibration services in JSON: a face of them on the fleet's bus."""
+"""Serve the thesis' five calibration services in JSON, on the fleet's bus."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 GATE_TIMEOUT = 10.0
-"""Seconds for a program that has the camera reserved to give it back."""
+"""Seconds of the timeout for another program's reservation to end."""
 
 PICTURE_TIMEOUT = 20.0
-"""Seconds for a picture of the camera itself."""
+"""Seconds of the timeout for a picture of the camera itself."""
 
 
 class JsonCalibrationCamera:
-    """A camera of an agent, as a calibration uses it.
+    """A camera of an agent, for a calibration.
 
     Args:
-        work: the service under way.
+        work: the running service.
     """
 
     def __init__(self, work: Work) -> None:
@@ -83,7 +83,7 @@ class JsonCalibrationCamera:
 
     @contextlib.asynccontextmanager
     async def _allowed(self) -> AsyncIterator[None]:
-        """See that no other program reserves the camera meanwhile."""
+        """Keep other programs from reserving the camera meanwhile."""
         program = f"{self._work.request.program or 'a program'} without smartcam"
         await self._host.enter(program, "a calibration", GATE_TIMEOUT)
         try:
@@ -92,15 +92,15 @@ class JsonCalibrationCamera:
             self._host.gate.leave(program)
 
     def _within(self, seconds: float) -> Work:
-        """Return the work, bounded to a number of seconds."""
+        """Return the work with a timeout."""
         return self._work._replace(timeout=min(self._work.timeout, seconds))
 
 
 class JsonCalibrationFace:
-    """A camera of an agent as the five services see it.
+    """The part of an agent's camera that the five services use.
 
     Args:
-        work: the service under way.
+        work: the running service.
     """
 
     def __init__(self, work: Work) -> None:
@@ -129,7 +129,7 @@ def _on_bus(name: str) -> Service:
         return {**found, "kind": "CalibrationError"} if found.get("error") else found
 
     nothing: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
-    # what triggers the camera waits by itself for who has it reserved: abort does not
+    # a trigger waits by itself for the end of a reservation, and abort needs no wait
     return Service(request, do, command=False, timeout=five.timeout, nothing=nothing)
 
 

@@ -1,7 +1,7 @@
-"""Serve programs without smartcam: list an agent's cameras, and do what is asked of them.
+"""Serve programs without smartcam: list an agent's cameras, and carry out services.
 
-Every question is answered, but those about cameras that another agent has: these that one answers.
-A service is done in a task of the agent's, which ends with its deadline and with the agent.
+Every question is answered, except those about another agent's cameras, which that agent answers. A
+service runs in a task of the agent, which ends with its deadline and with the agent.
 """
 
 from __future__ import annotations
@@ -54,38 +54,38 @@ MAX_REQUEST_BYTES = 1 << 18
 """Largest number of bytes of a request."""
 
 MAX_CONCURRENT_CALLS = 256
-"""Largest number of commands to one camera that may be under way at a time, and questions."""
+"""Largest number of running commands of one camera, and of running questions."""
 
 MAX_WAITING_REPEATS = 16
 """Largest number of questions that wait for the answer of one call."""
 
 MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
-"""Answers of commands with an id that are remembered, and their bytes; the oldest are forgotten.
-So it is with questions, for themselves: whoever may only ask pushes no command's answer out."""
+"""Largest number of remembered answers of commands with an id, and of their bytes; the same for
+questions, separately, so that a viewer cannot displace the answers of commands."""
 
 MAX_CAMERAS_ADDED = 100
 """Largest number of cameras that Setup adds."""
 
 GRACE = 0.5
-"""Seconds beyond a service's timeout after which it is given up, whatever it does."""
+"""Seconds beyond a service's timeout after which its task is cancelled."""
 
 FIRST_TRY = 600.0
-"""Seconds that Setup waits for a camera; its timeout is shorter."""
+"""Seconds for which Setup waits for a camera; its own timeout is shorter."""
 
 LOOK_TIMEOUT = 2.0
-"""Seconds for asking the bus who is there."""
+"""Seconds of the timeout for a question about presences on the bus."""
 
 
 class _Order(NamedTuple):
-    """A question, read.
+    """A decoded question.
 
     Attributes:
-        camera: name of the camera whose service is asked for.
+        camera: name of the camera of the service.
         name: name of the service.
         service: the service.
         fields: fields of the request; None if they cannot be read.
-        error: what is wrong with the request; None if nothing is.
-        waited: seconds that the request may have waited before the agent heard it.
+        error: error of the request; None if there is none.
+        waited: seconds for which the request may have waited before it was received.
     """
 
     camera: str
@@ -97,14 +97,14 @@ class _Order(NamedTuple):
 
     @property
     def operates(self) -> bool:
-        """True if only operators may ask for the service; else viewers may, too."""
+        """True if only operators may use the service; otherwise viewers may, too."""
         return self.service.command or self.name not in SERVICES
 
     def request(self) -> Any:
         """Return the request.
 
         Raises:
-            SmartCamError: the fields are no request.
+            SmartCamError: the fields are not a valid request.
         """
         if self.error is not None:
             raise self.error
@@ -116,19 +116,19 @@ class _Order(NamedTuple):
         return {**failure(error), **self.service.nothing}
 
     def what(self, request: PlainRequest) -> object:
-        """Return a key for the work to be done, equal for the same call made again."""
+        """Return a key of the work, equal for a repetition of the same call."""
         same = request.model_copy(update={"timeout": None, "epoch": None})
         return self.camera, self.service, same
 
 
 @dataclass(eq=False)
 class _PlainCall:
-    """A call, under way or done.
+    """A running or remembered call.
 
     Attributes:
-        what: key of the work, by which the same call is known again.
-        waiting: questions that want the call's answer.
-        answer: the answer; None before it is there.
+        what: key of the work, by which a repetition of the call is recognized.
+        waiting: questions that wait for the call's answer.
+        answer: the answer; None while the call runs.
     """
 
     what: object
@@ -137,22 +137,22 @@ class _PlainCall:
 
 
 class _KnownAnswers:
-    """Calls of one kind with an id, under way or remembered."""
+    """Calls of one kind with an id, running or remembered."""
 
     def __init__(self) -> None:
         self._calls: dict[tuple[str, str], _PlainCall] = {}  # oldest first
         self._bytes = 0
 
     def of(self, request: PlainRequest) -> _PlainCall | None:
-        """Return the call that had a request's id."""
+        """Return the call with a request's id."""
         return self._calls.get((request.program, str(request.id)))
 
     def begin(self, request: PlainRequest, call: _PlainCall) -> None:
-        """Remember a call under way."""
+        """Remember a running call."""
         self._calls[request.program, str(request.id)] = call
 
     def end(self, answer: bytes) -> None:
-        """Keep one more answer, and no more than are to be; calls under way stay."""
+        """Keep a further answer, and drop the oldest beyond the bounds; running calls stay."""
         self._bytes += len(answer)
         for key in [*self._calls]:
             if (
@@ -167,7 +167,7 @@ class _KnownAnswers:
 
 
 class Plain:
-    """The side of an agent that programs without smartcam use.
+    """The part of an agent for programs without smartcam.
 
     Args:
         agent: the agent.
@@ -195,7 +195,7 @@ class Plain:
         self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
 
     def open(self) -> None:
-        """Answer from now on."""
+        """Start to answer."""
         keys, answer = self._keys, self._bus.answer
         self.topics.open()
         self._pulse.open()
@@ -206,7 +206,7 @@ class Plain:
         ]
 
     def close(self) -> None:
-        """Answer no more; calls under way end with the agent's tasks."""
+        """Stop answering; running calls end with the agent's tasks."""
         declared, self._declared = self._declared, []
         for handle in declared:
             handle.close()
@@ -215,7 +215,7 @@ class Plain:
 
     @property
     def busy(self) -> bool:
-        """True while a command is under way."""
+        """True while a command runs."""
         return any(operates for _, operates in self._under_way)
 
     # ------------------------------------------------------------------ questions
@@ -288,7 +288,7 @@ class Plain:
         self._start(self._for_stranger(question, order), order)
 
     def _is_full(self, question: BusQuestion, order: _Order) -> bool:
-        """Refuse what is too much for one camera, or for all together that are not here."""
+        """Refuse a question beyond the bound of its camera, or of all unknown cameras."""
         full = self._under_way[self._place(order)] >= MAX_CONCURRENT_CALLS
         if full:
             kind = "commands" if order.operates else "questions"
@@ -298,7 +298,7 @@ class Plain:
         return full
 
     def _start(self, work: Any, order: _Order) -> None:
-        """Do something for a camera in a task; counted."""
+        """Run work for a camera in a counted task."""
         place, counts = self._place(order), self._under_way
         counts[place] += 1
 
@@ -317,7 +317,7 @@ class Plain:
     # ------------------------------------------------------------------ other cameras
 
     async def _for_stranger(self, question: BusQuestion, order: _Order) -> None:
-        """Answer for a camera that is not here; if nobody has it, one agent does so."""
+        """Answer for an unknown camera, if no agent has it and this agent is the first one."""
         try:
             speaks = await self._speaks_for_all(order.camera)
         except BaseException:
@@ -348,7 +348,7 @@ class Plain:
     # ------------------------------------------------------------------ calls
 
     def _begin(self, question: BusQuestion, order: _Order) -> None:
-        """Have a call done, unless it is one that was done before or is under way."""
+        """Start a call, unless it is a repetition."""
         try:
             request = order.request()
             if request.epoch not in {None, str(self._agent.epoch)}:
@@ -387,7 +387,7 @@ class Plain:
         return known
 
     async def _do(self, order: _Order, request: PlainRequest, call: _PlainCall) -> None:
-        """Do a call, and answer all who asked for it."""
+        """Carry out a call, and answer all its questions."""
         name = order.name
         answer: dict[str, Any] = {}
         try:
@@ -412,10 +412,10 @@ class Plain:
                 self._known[order.operates].end(call.answer)
 
     async def _bounded(self, order: _Order, request: PlainRequest) -> dict[str, Any]:
-        """Do a call within its time.
+        """Carry out a call within its timeout.
 
         Raises:
-            SmartCamError: as it ends; or nobody knows how, since it did not in time.
+            SmartCamError: the call failed; or it did not end in time, with an unknown outcome.
         """
         service = order.service
         wanted = timeout = request.timeout or service.timeout
@@ -439,7 +439,7 @@ class Plain:
             async with asyncio.timeout(timeout + GRACE) as limit:
                 host = await self._host(order, request)
                 if getattr(request, "application", 0) or getattr(request, "application_id", 0):
-                    # a switch there and one back have times of their own
+                    # switching there and back takes further time
                     limit.reschedule(begun + timeout + GRACE + 2 * host.settings.switch_timeout)
                 try:
                     return await self._serve(order, request, host, begun + timeout)
@@ -481,7 +481,7 @@ class Plain:
     # ------------------------------------------------------------------ cameras that Setup adds
 
     async def _host(self, order: _Order, request: PlainRequest) -> Host:
-        """Return the camera; Setup adds one that nobody has."""
+        """Return the camera; Setup adds one that no agent has."""
         host = self._agent.hosts.get(order.camera)
         if host is not None:
             if isinstance(request, SetupRequest):
@@ -506,7 +506,7 @@ class Plain:
         return host
 
     async def _take_back(self, camera: str, request: PlainRequest) -> None:
-        """Leave nothing behind of a Setup that has added a camera, and failed."""
+        """Remove the camera that a failed Setup has added."""
         if self._added.get(camera) is request:
             del self._added[camera]
             if camera in self._agent.hosts:
@@ -514,7 +514,7 @@ class Plain:
 
 
 def request_fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError | None]:
-    """Return a request's fields, or what is wrong with it. Nothing is an empty request."""
+    """Return a request's fields, or its error. No bytes are an empty request."""
     if len(payload) > MAX_REQUEST_BYTES:
         text = f"a request of {len(payload)} bytes; {MAX_REQUEST_BYTES} are taken"
         return None, ConfigurationError(text)
@@ -533,7 +533,7 @@ def _no_number(text: str) -> float:
 
 
 def _only_looks(key: str) -> bool:
-    """Return True if a service changes nothing, so that viewers may ask for it, too."""
+    """Return True if a service changes nothing, so that viewers may use it, too."""
     service = SERVICES.get(key.rpartition("/")[2])
     return service is not None and not service.command
 

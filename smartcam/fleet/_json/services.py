@@ -157,7 +157,7 @@ class Work(NamedTuple):
         host: the camera.
         topics: topics of the camera in JSON.
         request: request of the service's kind.
-        timeout: seconds that the service may take.
+        timeout: seconds of the service's timeout.
         owner: owner of the results of the service's trigger.
         calibrations: calibrations of the agent's cameras; None if there is no folder for them.
     """
@@ -178,7 +178,7 @@ class Service(NamedTuple):
         do: function that does the service and returns the fields of its answer except ``error``.
         command: whether the service waits while another program has the camera reserved.
         timeout: seconds, if the request has none.
-        nothing: fields of the answer beside an error.
+        nothing: fields of the answer besides an error.
     """
 
     request: type[PlainRequest]
@@ -200,7 +200,7 @@ async def triggered(
     """Trigger; return the containers, each as its own run.
 
     Raises:
-        SmartCamError: as :meth:`smartcam.Camera.trigger`.
+        SmartCamError: like :meth:`smartcam.Camera.trigger`.
     """
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
@@ -289,7 +289,7 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
         )
     said = to_fields(frame, 0.0, took, 0)
     own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
-    if "trigger" in own:  # its time is that of the agent's clock
+    if "trigger" in own:  # its time is by the agent's clock
         own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
     return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
 
@@ -299,7 +299,7 @@ async def _unknown(work: Work) -> dict[str, Any]:
 
 
 UNKNOWN = Service(PlainRequest, _unknown)
-"""Service that answers in place of an unknown one."""
+"""Service that answers instead of an unknown one."""
 
 _OF_ALL = {*PlainRequest.model_fields}
 

@@ -1,4 +1,4 @@
-"""The thesis' six services in JSON: a face of them on the fleet's bus."""
+"""Serve the thesis' six services in JSON, on the fleet's bus."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _said(value: object) -> object:
 
 
 class BusFields(PlainRequest):
-    """The fields that a request on the bus may have beside those over ROS."""
+    """The fields that a request on the bus may have besides those over ROS."""
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
     id: Annotated[Id | None, BeforeValidator(_said)] = None
@@ -49,7 +49,7 @@ def new_camera(request: SetupRequest) -> CameraSettings:
     """Return the settings of a camera that Setup adds.
 
     Raises:
-        ConfigurationError: the camera cannot work.
+        ConfigurationError: the request is not valid.
     """
     if not request.con_address:
         raise ConfigurationError(
@@ -63,10 +63,10 @@ def new_camera(request: SetupRequest) -> CameraSettings:
 
 
 class JsonThesisFace:
-    """A camera of an agent as the thesis' services see it.
+    """The part of an agent's camera that the thesis' services use.
 
     Args:
-        work: the service under way.
+        work: the running service.
     """
 
     def __init__(self, work: Work) -> None:
@@ -90,15 +90,15 @@ class JsonThesisFace:
 
     @property
     def reading(self) -> Interpretation | None:
-        """Interpretation by which results become JSON."""
+        """Interpretation of results for JSON."""
         return self._topics.interpretation
 
     def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError if results cannot be read by ``spec``."""
+        """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
         self._topics.reading(spec)
 
     def read_as(self, spec: str | None) -> None:
-        """Have results become JSON by ``spec`` from now on; None: as the settings say."""
+        """Interpret results by ``spec`` from now on; None: by the settings."""
         self._topics.interpret(self._host.settings.interpret_as if spec is None else spec)
 
     def is_calibrated(self, application: int) -> bool:
@@ -106,7 +106,7 @@ class JsonThesisFace:
         return False
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError if there can be no such topic."""
+        """Raise ConfigurationError if a topic is not valid."""
         _topic(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class JsonThesisFace:
         self._topics.end_publishing()
 
     async def have_session(self) -> None:
-        """Raise the error that says why there is no session, if there is none."""
+        """Raise an error with the reason if there is no session."""
         self._host.require()
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Have an application running and ready."""
+        """Load and run an application."""
         await self._host.require().ensure(application, timeout)
 
     async def switch(self, application: int, timeout: float) -> None:
@@ -137,7 +137,7 @@ class JsonThesisFace:
         )
 
     async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
-        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        """Trigger; return the result's application, and its value by ``spec``."""
         reading = self._topics.reading(spec)
         (run,) = await triggered(self._work, reading, application)
         return run.application, interpreted(run, reading, self.name).value
@@ -147,7 +147,7 @@ def _topic(text: str) -> str:
     """Return a topic without slashes around it.
 
     Raises:
-        ConfigurationError: there can be no such topic.
+        ConfigurationError: the topic is not valid.
     """
     name = text.strip("/")
     if name and not _TOPIC.fullmatch(name):

@@ -1,4 +1,4 @@
-"""Topics of JSON for programs without smartcam, made only while somebody subscribes."""
+"""Publish topics in JSON for programs without smartcam, while they have subscribers."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from smartcam.models import CameraEvent
 
 MAX_QUEUED_BYTES = 1 << 24
-"""Largest number of bytes of containers that wait for a topic with a delay; the oldest beyond are
-dropped."""
+"""Largest number of bytes of containers that wait for a topic with a delay; beyond it the oldest
+are dropped."""
 
 Kind = Literal["results", "status", "events"]
 
@@ -40,8 +40,8 @@ def as_json(fields: Mapping[str, object]) -> bytes:
 class Topics:
     """The topics of one agent's cameras.
 
-    One look tells whether anybody subscribes to any camera's; only then a camera's own publisher
-    is made. So a thousand cameras cost nothing as long as nobody asks.
+    One check shows whether any camera's topics have a subscriber; only then a camera's own
+    publisher is created. So a thousand cameras cost nothing without subscribers.
 
     Args:
         agent: the agent's name.
@@ -58,7 +58,7 @@ class Topics:
         self._made: dict[tuple[Kind, str], Publisher] = {}
 
     def open(self) -> None:
-        """Begin to look whether anybody subscribes."""
+        """Start to check for subscribers."""
         kinds: tuple[Kind, ...] = ("results", "status", "events")
         for kind in kinds:
             self._any[kind] = self.bus.publisher(self.keys.topic(kind, "**"))
@@ -72,7 +72,7 @@ class Topics:
             handle.close()
 
     def heard(self, kind: Kind, camera: str) -> Publisher | None:
-        """Return the publisher of one kind of a camera's messages; None if nobody hears."""
+        """Return the publisher of one kind of a camera's messages; None without a subscriber."""
         everyone = self._any.get(kind)
         if everyone is None or not everyone.heard:
             return None
@@ -82,19 +82,19 @@ class Topics:
         return made if made.heard else None
 
     def forget(self, camera: str) -> None:
-        """Close the publishers of a camera that is shared no more."""
+        """Close the publishers of a camera that is no longer shared."""
         for key in [key for key in self._made if key[1] == camera]:
             self._made.pop(key).close()
 
 
 @dataclass(eq=False)
 class Publication:
-    """Results of one camera under a topic of somebody's choice, not too often.
+    """Results of one camera under the topic of a request, with a delay.
 
     Args:
         publisher: publisher of the results.
         min_delay: least seconds between two results.
-        queue_size: number of results that wait at most; the oldest beyond is dropped.
+        queue_size: largest number of waiting results; beyond it the oldest is dropped.
     """
 
     publisher: Publisher
@@ -105,7 +105,7 @@ class Publication:
     _timer: asyncio.TimerHandle | None = None
 
     def offer(self, runs: Iterable[ResultRun], topics: CameraTopics) -> None:
-        """Have results said, each a run of its own."""
+        """Queue results, each as its own run."""
         if not self.publisher.heard:
             return
         for run in runs:
@@ -145,12 +145,12 @@ class CameraTopics:
 
     Attributes:
         interpret_as: contents of the camera's containers, for values in JSON.
-        interpretation: reader of the containers; None if nobody knows their contents.
-        trouble: why there is no session; empty if there is one.
+        interpretation: interpretation of the containers; None if their contents are not known.
+        trouble: reason why there is no session; empty if there is one.
         stopped: whether the thesis' SmartcameraStop has closed the camera for its services.
         statuses, events: numbers of the next status and of the next event.
-        status_out: publisher of the status under a further topic of somebody's choice.
-        results_out: publication of the results under such a topic.
+        status_out: publisher of the status under the topic of a request.
+        results_out: publication of the results under the topic of a request.
     """
 
     def __init__(self, host: Host, topics: Topics) -> None:
@@ -165,7 +165,7 @@ class CameraTopics:
         self.interpret(host.settings.interpret_as)
 
     def interpret(self, spec: Any) -> None:
-        """Have the camera's containers read in another way from now on.
+        """Interpret the camera's containers in another way from now on.
 
         Raises:
             ConfigurationError: ``spec`` is not valid.
@@ -183,9 +183,9 @@ class CameraTopics:
         return Interpretation(spec, lenient=settings.lenient, y_down=settings.y_down)
 
     def publish_status(self, topic: str) -> str:
-        """Have the status said under a topic of the thesis' interface; return its key.
+        """Publish the status under a topic of the thesis' interface; return its key.
 
-        It takes the place of the one before; an empty name ends it.
+        It replaces the previous one; an empty name ends it.
         """
         if self.status_out is not None:
             self.status_out.close()
@@ -196,9 +196,9 @@ class CameraTopics:
         return key
 
     def publish_results(self, topic: str, min_delay: float, queue_size: int) -> str:
-        """Have results said under a topic of the thesis' interface; return its key.
+        """Publish results under a topic of the thesis' interface; return its key.
 
-        It takes the place of the one before; an empty name ends it.
+        It replaces the previous one; an empty name ends it.
         """
         if self.results_out is not None:
             self.results_out.close()
@@ -210,12 +210,12 @@ class CameraTopics:
         return key
 
     def end_publishing(self) -> None:
-        """End all publishing under topics of somebody's choice."""
+        """End all publishing under topics of requests."""
         self.publish_status("")
         self.publish_results("", 0.0, 0)
 
     def close(self) -> None:
-        """End all publishing of a camera that is shared no more."""
+        """End all publishing of a camera that is no longer shared."""
         self.end_publishing()
         self._topics.forget(self._host.name)
 
@@ -227,7 +227,7 @@ class CameraTopics:
         return {**self._topics.who, **fields}
 
     def state(self) -> dict[str, Any]:
-        """Return the fields that describe the camera's state now."""
+        """Return the fields of the camera's current state."""
         host = self._host
         state = host.state()
         word: int | None = state["status"]
@@ -243,7 +243,7 @@ class CameraTopics:
         }
 
     def listing(self) -> dict[str, Any]:
-        """Return all fields that are known of the camera."""
+        """Return all known fields of the camera."""
         host = self._host
         dialect = capabilities = None
         try:
@@ -266,10 +266,10 @@ class CameraTopics:
             "next_result": host.results.following,
         }
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ from the camera
 
     def on_run(self, run: ResultRun) -> None:
-        """Publish containers that came."""
+        """Publish received containers."""
         out = self._topics.heard("results", self._host.name)
         if out is not None:
             for one in singles(run):
@@ -278,7 +278,7 @@ class CameraTopics:
             self.results_out.offer(singles(run), self)
 
     def on_state(self) -> None:
-        """Number the camera's state, and publish it where somebody hears."""
+        """Number the camera's state, and publish it if there is a subscriber."""
         number, self.statuses = self.statuses, self.statuses + 1
         out = self._topics.heard("status", self._host.name)
         if out is None and self.status_out is None:
@@ -292,7 +292,7 @@ class CameraTopics:
                 one.put(data)
 
     def on_status(self, status: Status) -> None:
-        """Take the status that the camera told; publish a change of it as an event."""
+        """Handle a status of the camera; publish its change as an event."""
         before, self._before = self._before, status
         if status != before:
             number, self.events = self.events, self.events + 1

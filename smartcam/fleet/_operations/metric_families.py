@@ -1,8 +1,8 @@
-"""An agent's numbers as Prometheus has them: families, and the text of them.
+"""Convert an agent's numbers to Prometheus' families and their text.
 
-The text of a thousand cameras takes a tenth of a second, and a thread that makes it would keep the
-event loop waiting for 5 ms at a time. So it is made in the event loop, half a millisecond at a
-time: a family of a few cameras after the other.
+The text of a thousand cameras takes a tenth of a second, and a thread for it would block the event
+loop for 5 ms at a time. So it is written in the event loop, half a millisecond at a time: one
+family of a few cameras after the other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
 
 MAX_LINES_PER_TURN = 80
-"""Largest number of lines that are made at a time."""
+"""Largest number of lines that are written at a time."""
 
 _SUMS = {
     "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),
@@ -37,7 +37,7 @@ _SUMS = {
     ),
     "ignored_datagrams": ("smartcam_ignored_datagrams", "Datagrams that were dropped"),
     "unknown_ids": ("smartcam_unknown_messages", "Messages of an unknown kind"),
-    "unexpected_messages": ("smartcam_unexpected_messages", "Answers nobody waited for"),
+    "unexpected_messages": ("smartcam_unexpected_messages", "Answers that no call waited for"),
     "long_bodies": ("smartcam_long_messages", "Messages longer than documented"),
 }
 
@@ -48,7 +48,7 @@ _GAUGES = (
     ("smartcam_agent_reserved_cameras", "reserved", "Cameras that a program has reserved"),
     ("smartcam_agent_kept_results", "kept_results", "Results kept for programs that were cut off"),
     ("smartcam_agent_kept_results_bytes", "kept_bytes", "Their bytes"),
-    ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be said on the bus"),
+    ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be sent on the bus"),
 )
 
 
@@ -74,7 +74,7 @@ async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes
             for begin in range(0, len(chosen), size):
                 family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
                 text = _text(client, family)
-                # what it means stands in front of the first ones
+                # the help text is before the first ones
                 parts.append(text.split(b"\n", 2)[2] if begin else text)
                 await asyncio.sleep(0)
     return b"".join(parts), client.CONTENT_TYPE_LATEST
@@ -91,7 +91,7 @@ def require_client() -> Any:
 
 
 class _One(NamedTuple):
-    """A family as a collector, from which prometheus-client makes a text."""
+    """A family as a collector, which prometheus-client converts to text."""
 
     family: Any
 
@@ -169,7 +169,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
 
 
 def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    """Give the accounts of outlets: what came is what was delivered, waits, or was dropped."""
+    """Yield the accounts of outlets: results that came were delivered, wait, or were dropped."""
     if not numbers.outlets:
         return
     labels = ["agent", "outlet"]
@@ -204,10 +204,10 @@ class _MetricKind(NamedTuple):
     """A family of numbers that each camera has.
 
     Attributes:
-        type: type of the family, as prometheus-client's classes are called.
+        type: type of the family, in the names of prometheus-client's classes.
         name: name of the family.
         text: help text of the family, for people.
-        labels: names of the labels beside ``agent`` and ``camera``.
+        labels: names of the labels besides ``agent`` and ``camera``.
         values: function for a camera's values: the labels, and the arguments of a number.
         lines: approximate number of lines for one camera.
         chosen: whether a camera has it.
@@ -321,7 +321,7 @@ _KINDS = (
         20,
     ),
 )
-"""Families of each camera's numbers; without ``each`` a summary takes the last one's place."""
+"""Families of each camera's numbers; without ``each`` a summary replaces the last one."""
 
 
 def _version() -> str:

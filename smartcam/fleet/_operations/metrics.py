@@ -1,4 +1,4 @@
-"""Collect an agent's numbers. Nothing is counted for them: existing counts are read.
+"""Collect an agent's numbers from existing counts.
 
 The agent belongs to its event loop, so it is read there, a few cameras at a time.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._inside import OutletState
 
 SLICE = 24
-"""Cameras that are read at a time: half a millisecond, as a hundred of them added up."""
+"""Number of cameras that are read at a time, which takes half a millisecond."""
 
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 
@@ -38,7 +38,7 @@ class CameraNumbers(NamedTuple):
 
 
 class AgentNumbers(NamedTuple):
-    """The numbers of an agent; ``gauges`` are of the moment."""
+    """The numbers of an agent; ``gauges`` are current values."""
 
     agent: str
     fleet: str
@@ -61,7 +61,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     kept = kept_bytes = waiting = reserved = 0
     for begin in range(0, len(hosts), SLICE):
         for host in hosts[begin : begin + SLICE]:
-            if agent.hosts.get(host.name) is host:  # it may be gone meanwhile
+            if agent.hosts.get(host.name) is host:  # it may have been removed meanwhile
                 read.append((host, _camera(host)))
                 kept += host.results.kept
                 kept_bytes += host.results.kept_bytes
@@ -78,7 +78,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
         "bus_bytes": server.bus_bytes,
     }
     reloads = server.reloads
-    # of one moment: each camera is counted once, here or among those that are gone
+    # at the same time, so that each camera counts once, here or among removed ones
     cameras = [one for host, one in read if agent.hosts.get(host.name) is host]
     totals = Totals(agent.past)
     totals.add(host.camera.statistics() for host in agent.leaving)

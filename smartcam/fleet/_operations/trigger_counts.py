@@ -1,4 +1,4 @@
-"""Count how triggers at an agent ended, in few words; and sum what cameras counted."""
+"""Count the outcomes of triggers at an agent, and sum the counters of cameras."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ _OUTCOMES: Final[tuple[tuple[type[BaseException], str], ...]] = (
     (ConfigurationError, "refused"),
     (UnsupportedError, "refused"),
 )
-"""Words for how a trigger failed, by the error's class; the first match decides."""
+"""Words for the failures of triggers, by the error's class; the first match decides."""
 
 OUTCOMES: Final = (RESULT, *dict.fromkeys(word for _, word in _OUTCOMES), "other")
-"""All words for how a trigger ended."""
+"""All words for the outcomes of triggers."""
 
 
 def outcome_of(error: BaseException) -> str:
-    """Return the word for how a trigger failed."""
+    """Return the word for a trigger's failure."""
     return next((word for kind, word in _OUTCOMES if isinstance(error, kind)), "other")
 
 
@@ -59,11 +59,11 @@ SUMS: Final = (
     *("empty_slots", "extra_results", "inspections_by_others", "ignored_datagrams"),
     *("unknown_ids", "unexpected_messages", "long_bodies"),
 )
-"""Counters that are told of all cameras together."""
+"""Counters that are reported as sums of all cameras."""
 
 
 class Totals:
-    """Sums over cameras, those that were given up among them: so they never go down.
+    """Sums over cameras, also over removed ones, so that they never decrease.
 
     Attributes:
         counts: sums of the counters in :data:`SUMS`.
@@ -92,6 +92,6 @@ def _sum(histograms: list[Histogram]) -> Histogram:
 
 
 def cumulative(histogram: Histogram) -> list[tuple[str, float]]:
-    """Return the bins as Prometheus has them: each has everything up to its bound."""
+    """Return the bins in Prometheus' form: each counts all values up to its bound."""
     bounds = [*map(str, histogram.bounds), "+Inf"]
     return list(zip(bounds, map(float, itertools.accumulate(histogram.counts)), strict=True))

@@ -507,7 +507,7 @@ class Caller:
             timeout: seconds.
 
         Raises:
-            SmartCamError: as :meth:`call`.
+            SmartCamError: like :meth:`call`.
 
         Cancellation: the agent is told.
         """

@@ -1,4 +1,4 @@
-"""Subscribe once for many cameras, in place of once for each.
+"""Subscribe once for many cameras, instead of once for each.
 
 A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.cover` declares
 one subscription for all, and the messages are distributed here by their keys; a dictionary costs

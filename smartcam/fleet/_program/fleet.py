@@ -1,4 +1,4 @@
-"""A fleet as a program uses it: its cameras, all of them or those of a pattern."""
+"""A fleet at a program: all its cameras, or those of a pattern."""
 
 from __future__ import annotations
 
@@ -58,30 +58,30 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Largest number of cameras of a fleet that are met when it is opened; of a larger one each when it
-is used."""
+"""Largest number of cameras of a fleet that are met when it is opened; in a larger fleet each
+camera is met when it is used."""
 
 AT_ONCE = 100
-"""Cameras that are met, or left, at a time."""
+"""Number of cameras that are met, or closed, at a time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
-"""Largest number of cameras whose results are heard one by one; of more, and most of the fleet, all
-together."""
+"""Largest number of cameras with a subscription each; for more, if they are most of the fleet,
+there is one subscription for all."""
 
 STATUS_TIMEOUT = 5.0
-"""Seconds for the answers of all agents."""
+"""Seconds of the timeout for the answers of all agents."""
 
 STORE_TIMEOUT = 30.0
-"""Seconds for the answers of all stores of results, which read a file."""
+"""Seconds of the timeout for the answers of all stores of results, which read a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetEvent:
-    """Something that happened to a fleet.
+    """An event of a fleet.
 
     Attributes:
         fleet: name of the fleet.
-        at: when this program learned of it, UTC.
+        at: time at which this program received it, UTC.
         agent: the agent's name.
     """
 
@@ -92,12 +92,12 @@ class FleetEvent:
 
 @dataclass(frozen=True, slots=True)
 class AgentJoined(FleetEvent):
-    """An agent is there."""
+    """An agent has come."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentLeft(FleetEvent):
-    """An agent is gone, or the way to it."""
+    """An agent is lost, or the connection to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class CameraJoined(FleetEvent):
 
 @dataclass(frozen=True, slots=True)
 class CameraLeft(FleetEvent):
-    """An agent shares a camera no more, or is gone.
+    """An agent no longer shares a camera, or is lost.
 
     Attributes:
         camera: the camera's name.
@@ -123,7 +123,7 @@ class CameraLeft(FleetEvent):
 
 
 class _QueueBell(asyncio.Event):
-    """Calls somebody where a queue has something, or ends."""
+    """Calls a function when a queue gets an item, or ends."""
 
     def __init__(self, ring: Callable[[], None]) -> None:
         super().__init__()
@@ -136,8 +136,8 @@ class _QueueBell(asyncio.Event):
 class FleetResults(Generic[ValueT]):
     """Results of several cameras as they come: ``async for result in results``.
 
-    Each camera has a bounded queue of its own, so that one that sends much takes nothing from the
-    others; they are read in turn. Cameras that join later are in it, too.
+    Each camera has its own bounded queue, so that a busy camera takes no room from the others; the
+    queues are read in turn. Cameras that join later are included.
 
     Cancellation: safe, nothing is lost.
     """
@@ -146,8 +146,8 @@ class FleetResults(Generic[ValueT]):
         self, subscribe: Callable[[FleetCamera[Any]], Subscription[Result[ValueT]]]
     ) -> None:
         self._subscribe = subscribe
-        # the subscription of each camera; earlier ones in the list ended with a camera that was
-        # given up
+        # subscriptions of each camera; earlier ones in a list ended with a camera that was given
+        # up
         self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
         # subscriptions that have results
         self._line: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
@@ -156,7 +156,7 @@ class FleetResults(Generic[ValueT]):
         self._ended = False
 
     def add(self, camera: FleetCamera[Any]) -> None:
-        """Have a camera's results in it."""
+        """Include a camera's results."""
         known = self._streams.setdefault(camera.name, [])
         if self._ended or (known and not known[-1].ended):
             return
@@ -171,7 +171,7 @@ class FleetResults(Generic[ValueT]):
         self._ready.set()
 
     def statistics(self) -> dict[str, SubscriberStatistics]:
-        """Return the account of each camera's queue."""
+        """Return the counters of each camera's queue."""
         return {
             name: _sum([stream.statistics() for stream in streams])
             for name, streams in self._streams.items()
@@ -184,7 +184,7 @@ class FleetResults(Generic[ValueT]):
         self._ready.set()
 
     def close(self) -> None:
-        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        """Unsubscribe; queued results count as dropped. Idempotent."""
         for streams in self._streams.values():
             for stream in streams:
                 stream.close()
@@ -197,11 +197,11 @@ class FleetResults(Generic[ValueT]):
         """Return the next result.
 
         Raises:
-            InterpretationError: what came cannot be read; the stream stays usable.
-            SubscriberOverflowError: more came of a camera than its queue holds, and that is an
-                error; it has no results here any more, the others go on.
+            InterpretationError: a result cannot be interpreted; the stream stays usable.
+            SubscriberOverflowError: a camera's queue overflowed, with ``overflow="error"``; the
+                stream has no further results of this camera, the others continue.
             LinkError: the same, for a camera that is lost for good.
-            StopAsyncIteration: closed, or the fleet is.
+            StopAsyncIteration: the stream or the fleet was closed.
         """
         while True:
             while self._line:
@@ -211,14 +211,14 @@ class FleetResults(Generic[ValueT]):
                     if not stream.ended:
                         continue
                     try:
-                        return await anext(stream)  # which says how it ended, once
+                        return await anext(stream)  # raises the stream's error, once
                     except StopAsyncIteration:
                         continue
                 try:
-                    return await anext(stream)  # something is there: it does not wait
+                    return await anext(stream)  # a result is queued, so there is no wait
                 finally:
                     if stream.waiting or stream.ended:
-                        self._queue(stream)  # behind the others
+                        self._queue(stream)  # after the others
             if self._ended:
                 raise StopAsyncIteration
             self._ready.clear()
@@ -234,7 +234,7 @@ class FleetResults(Generic[ValueT]):
 
 
 def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
-    """Return the account of queues that were one after the other."""
+    """Return the sum of the counters of consecutive queues."""
     *_, last = accounts
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
@@ -243,19 +243,19 @@ def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
 
 
 class Fleet:
-    """The cameras of a fleet, made by :func:`smartcam.fleet.open`.
+    """The cameras of a fleet, created by :func:`smartcam.fleet.open`.
 
-    ``fleet["line1/cam3"]`` is a :class:`~smartcam.Camera` like any other. Patterns mean several:
-    ``*`` is one part of a name, ``**`` any number of them.
+    ``fleet["line1/cam3"]`` is a :class:`~smartcam.Camera` like any other. In patterns ``*`` is one
+    part of a name, ``**`` any number of parts.
 
     Args:
         bus: end of the bus, for this fleet alone.
         address: address of the fleet; None if it is in this process.
-        fleet: name of the fleet; None for the only one that is there.
+        fleet: name of the fleet; None for the only one on the bus.
         around: context that is entered while the fleet is open.
-        timeout: seconds in which the fleet has to be reached.
-        options: options of the cameras, as :func:`smartcam.connect` takes them.
-        guest: whether the end of the bus is another's, which opens and closes it.
+        timeout: seconds of the timeout for connecting to the fleet.
+        options: options of the cameras, as for :func:`smartcam.connect`.
+        guest: whether another object opens and closes the end of the bus.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class Fleet:
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
-        self._present: set[str] = set()  # agents
+        self._present: set[str] = set()  # present agents
         self._agents: dict[str, set[str]] = {}  # agents that share each camera
         self._handles: list[Handle] = []
         self._opening: dict[str, asyncio.Task[None]] = {}
@@ -284,17 +284,17 @@ class Fleet:
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
-        self._meets = True  # every camera at once: there are not so many
+        self._meets = True  # whether every camera is met at once, since there are few
         self._turn = asyncio.Semaphore(AT_ONCE)
-        self._make("camera")  # wrong options are told at once
+        self._make("camera")  # raises for wrong options now
 
     # ------------------------------------------------------------------ life
 
     async def open(self) -> Self:
-        """Come to the fleet, and meet the cameras that are there.
+        """Connect to the fleet, and meet its cameras.
 
         Raises:
-            ConnectFailedError: no bus, or no agent with a camera, within the time.
+            ConnectFailedError: no bus, or no agent with a camera, is found in time.
             ConfigurationError: there are several fleets, and none was named.
 
         Cancellation: the fleet is closed again.
@@ -356,18 +356,18 @@ class Fleet:
         await self.close()
 
     def __del__(self) -> None:
-        # its bus refers to it until it is closed; so nobody has it when that is gone, too
+        # its bus refers to it until it is closed; so it is collected only after the bus
         if vars(self).get("_state") == "open":
             warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
 
     def __repr__(self) -> str:
         return f"<Fleet {self.url}, {len(self)} cameras>"
 
-    # ------------------------------------------------------------------ who is there
+    # ------------------------------------------------------------------ cameras and agents
 
     @property
     def url(self) -> str:
-        """Its URL; that of one in this process names no host."""
+        """The fleet's URL, without a host if the fleet is in this process."""
         return "fleet://" if self._address is None else self._address.url
 
     @property
@@ -377,57 +377,57 @@ class Fleet:
         return "" if identity is None else identity.warning
 
     def cameras(self, pattern: str = "**") -> list[FleetCamera[Any]]:
-        """Return the cameras that an agent shares now, by name.
+        """Return the cameras that agents share now, in the order of their names.
 
         Raises:
-            ConfigurationError: the pattern cannot be one.
+            ConfigurationError: the pattern is not valid.
         """
         return [self._known(name) for name in self.names(pattern)]
 
     def names(self, pattern: str = "**") -> list[str]:
-        """Return the names of the cameras that an agent shares now.
+        """Return the names of the cameras that agents share now.
 
         Raises:
-            ConfigurationError: the pattern cannot be one.
+            ConfigurationError: the pattern is not valid.
         """
         pattern = check_pattern(pattern)
         there = self._agents.items()
         return sorted(name for name, agents in there if agents and meets(pattern, name))
 
     def url_of(self, name: str) -> str:
-        """Return the URL of a camera, by which :func:`smartcam.connect` has it alone.
+        """Return the URL of a single camera, for :func:`smartcam.connect`.
 
         Raises:
-            ConfigurationError: the name cannot be one.
+            ConfigurationError: the name is not valid.
         """
         url: str = self._address_of(check_name(name)).url
         return url
 
     def _known(self, name: str) -> FleetCamera[Any]:
-        """Return a camera; of a large fleet it is met now, if it was not before."""
+        """Return a camera; in a large fleet it is met now, if it was not before."""
         camera = self._cameras.get(name)
         if camera is None:
             camera = self._meet(name)
         return camera
 
     def agents(self, pattern: str = "**") -> list[str]:
-        """Return the agents that share a camera of a pattern, by name.
+        """Return the names of the agents that share a camera of a pattern.
 
         Raises:
-            ConfigurationError: the pattern cannot be one.
+            ConfigurationError: the pattern is not valid.
         """
         pattern = check_pattern(pattern)
         sharing = (agents for name, agents in self._agents.items() if meets(pattern, name))
         return sorted({agent for agents in sharing for agent in agents})
 
     def __getitem__(self, name: str) -> FleetCamera[Any]:
-        """Return a camera, which an agent shares or has shared.
+        """Return a camera that an agent shares or has shared.
 
-        One that was given up (taken by another client, or lost with ``reconnect=None``) is another
-        object once an agent shares it again.
+        For a camera that was given up (taken by another client, or lost with ``reconnect=None``)
+        there is a new object once an agent shares it again.
 
         Raises:
-            ConfigurationError: no camera is called so.
+            ConfigurationError: there is no camera of this name.
         """
         name = check_text(name, "camera", self.url)
         if name not in self._agents:
@@ -448,16 +448,16 @@ class Fleet:
         return sum(map(bool, self._agents.values()))
 
     async def meet(self, pattern: str = "**") -> list[FleetCamera[Any]]:
-        """Return the cameras of a pattern once their agents have answered, or were silent.
+        """Return the cameras of a pattern after their agents have answered, or timed out.
 
         A fleet of up to 256 cameras is met when it is opened; in a larger one each camera is met
-        when it is first asked for. Its commands wait for that, what is known of it does not.
+        when it is first used. Its commands wait for that; its known state is returned at once.
 
         Raises:
-            ConfigurationError: the pattern cannot be one.
+            ConfigurationError: the pattern is not valid.
             ConnectionClosedError: the fleet is not open.
 
-        Cancellation: safe; they are met nevertheless.
+        Cancellation: safe; the cameras are still met.
         """
         cameras = self.cameras(pattern)
         self._require_open()
@@ -467,7 +467,7 @@ class Fleet:
         return cameras
 
     async def _met(self, meeting: Iterable[asyncio.Task[None]]) -> None:
-        """Wait until cameras were met; who is cancelled leaves that as it is."""
+        """Wait until cameras were met; a cancellation does not end that."""
         if left := {*meeting}:
             await asyncio.wait(left)
 
@@ -476,15 +476,15 @@ class Fleet:
     ) -> dict[str, CameraSummary]:
         """Return the summary of every camera of a pattern, by name.
 
-        Each agent is asked once and answers from what it knows; no camera is asked anything.
-        Cameras whose agent does not answer in time are left out.
+        Each agent is asked once, and answers without asking its cameras. Cameras whose agent does
+        not answer in time are left out.
 
         Args:
             pattern: pattern of the cameras' names.
             timeout: seconds for the answers of all agents.
 
         Raises:
-            ConfigurationError: the pattern, or the timeout, cannot work.
+            ConfigurationError: the pattern, or the timeout, is not valid.
             ConnectionClosedError: the fleet is not open.
 
         Cancellation: safe.
@@ -504,7 +504,7 @@ class Fleet:
             timeout: seconds for the answers of all agents; those that do not answer are left out.
 
         Raises:
-            ConfigurationError: the timeout cannot work.
+            ConfigurationError: the timeout is not valid.
             ConnectionClosedError: the fleet is not open.
 
         Cancellation: safe.
@@ -526,13 +526,13 @@ class Fleet:
 
         Args:
             pattern: pattern of the cameras' names.
-            since: time with its zone from which on; None: all that is there.
+            since: least time of the rows, with its zone; None: all rows.
             failed: whether rows are only errors, gaps, and results that did not pass.
-            most: rows of each store at most, the newest of all.
+            most: largest number of rows of each store, which are the newest.
             timeout: seconds for the answers of all agents; those that do not answer are left out.
 
         Raises:
-            ConfigurationError: an argument cannot work.
+            ConfigurationError: an argument is not valid.
             ConnectionClosedError: the fleet is not open.
 
         Cancellation: safe.
@@ -559,7 +559,7 @@ class Fleet:
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[FleetEvent]:
-        """Subscribe to agents and cameras that come and go; those that are there come first."""
+        """Subscribe to agents and cameras that come and go; present ones come first."""
         stream = Subscription[FleetEvent]("events", max_queue=max_queue, overflow=overflow)
         if self._state == "closed":
             stream.end(None)
@@ -604,7 +604,7 @@ class Fleet:
         if not present:
             self._leave(agent, name)
             return
-        self._on_agent(keys.agent(agent), True)  # it comes before its cameras
+        self._on_agent(keys.agent(agent), True)  # the agent's event is before its cameras'
         sharing.add(agent)
         known = self._cameras.get(name)
         wanted = self._meets or bool(self._subscribed(name))
@@ -616,7 +616,7 @@ class Fleet:
         self._agents[name].discard(agent)
         camera = self._cameras.get(name)
         if camera is not None:
-            camera.agent_left(agent)  # it knows before anybody reads the event
+            camera.agent_left(agent)  # before the event is read
         self._tell(CameraLeft, agent, name)
 
     # ------------------------------------------------------------------ cameras
@@ -653,48 +653,48 @@ class Fleet:
         async with self._turn:
             await camera.attend(self._timeout)
 
-    # ------------------------------------------------------------------ over many
+    # ------------------------------------------------------------------ several cameras
 
     async def trigger(
         self, pattern: str = "**", *, timeout: float = DEFAULT_TRIGGER_TIMEOUT, **options: Any
     ) -> dict[str, Result[Any] | SmartCamError]:
-        """Trigger every camera of a pattern at the same time; exactly one outcome for each.
+        """Trigger every camera of a pattern at the same time; return one outcome for each.
 
         Args:
             pattern: pattern of the cameras' names.
-            timeout: seconds for each.
-            **options: as :meth:`smartcam.Camera.trigger` takes them.
+            timeout: seconds of each trigger's timeout.
+            **options: as for :meth:`smartcam.Camera.trigger`.
 
         Returns:
-            The result (with ``results_per_trigger`` the list of them), or the error, by the
+            The result (with ``results_per_trigger`` the list of results), or the error, by the
             camera's name.
 
         Raises:
-            ConfigurationError: no camera is meant, or an argument cannot work for any of them.
+            ConfigurationError: the pattern has no camera, or an argument is not valid.
             ConnectionClosedError: the fleet is not open.
 
-        Cancellation: cancels each; which ones were triggered then is unknown.
+        Cancellation: cancels each; which cameras were triggered is unknown.
         """
         return await self._each(pattern, lambda one: one.trigger(timeout=timeout, **options))
 
     async def reload(
         self, agent: str | None = None, *, timeout: float = 30.0
     ) -> dict[str, FleetChanges | SmartCamError]:
-        """Have agents read their fleet files again: :meth:`smartcam.fleet.FleetServer.reload`.
+        """Make agents read their fleet files again: :meth:`smartcam.fleet.FleetServer.reload`.
 
         Args:
-            agent: name of the agent; None for all agents that are there.
+            agent: name of the agent; None for all present agents.
             timeout: seconds for the answers.
 
         Returns:
-            What has changed, or the error, by the agent's name. A ``ConfigurationError`` says that
-            all stayed as it was at this agent.
+            The changes, or the error, by the agent's name. After a ``ConfigurationError`` nothing
+            was changed at this agent.
 
         Raises:
             ConfigurationError: there is no such agent.
             ConnectionClosedError: the fleet is not open.
 
-        Cancellation: what the agents have begun goes on.
+        Cancellation: reloads that have begun continue.
         """
         timeout = check_seconds(timeout, "timeout", "reload")
         if agent is not None:
@@ -747,22 +747,22 @@ class Fleet:
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> FleetResults[Any]:
-        """Subscribe to the results of every camera of a pattern; subscribed when called.
+        """Subscribe to the results of every camera of a pattern, from the call on.
 
         Args:
             pattern: pattern of the cameras' names.
-            min_interval: as :meth:`smartcam.Camera.results` has it; for each camera.
-            max_queue: results of each camera that are kept for a slow reader.
-            max_queue_bytes: bytes of each camera's results that are kept for a slow reader.
+            min_interval: as for :meth:`smartcam.Camera.results`, for each camera.
+            max_queue: largest number of kept results of each camera, for a slow reader.
+            max_queue_bytes: largest number of bytes of each camera's kept results.
             overflow: action beyond either bound: drop the oldest result, or raise an error.
 
         Raises:
-            ConfigurationError: the pattern, or an argument, cannot work.
+            ConfigurationError: the pattern, or an argument, is not valid.
         """
         pattern = check_pattern(pattern)
         bounds: dict[str, Any] = {"min_interval": min_interval, "max_queue": max_queue}
         bounds |= {"max_queue_bytes": max_queue_bytes, "overflow": overflow}
-        Subscription[Any]("results", **bounds)  # what cannot work is told at once
+        Subscription[Any]("results", **bounds)  # raises for wrong arguments now
 
         def subscribe(camera: FleetCamera[Any]) -> Subscription[Result[Any]]:
             stream: Subscription[Result[Any]] = camera.results(**bounds)

@@ -31,10 +31,10 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 
 LOOK_AGAIN = 0.1
-"""Seconds between two looks whether an agent has come."""
+"""Seconds between two checks for an agent."""
 
 LAST_LOOK_TIMEOUT = 1.0
-"""Seconds for the look at which fleets are there instead of the wanted one."""
+"""Seconds of the timeout for finding other fleets than the wanted one."""
 
 
 Reply = BusMessage | TriggerReply
@@ -72,11 +72,11 @@ class Program:
         bus: the program's own end of the bus.
         fleet: name of the fleet; None for the only one that has the camera.
         camera: camera to look for: a name, or a pattern.
-        guest: whether the end is another's, which opens and closes it.
-        called: what people call the program; None: its script.
+        guest: whether another object opens and closes the end.
+        called: name of the program for people; None: its script's.
 
     Attributes:
-        keys: keys of the fleet, once it is open.
+        keys: keys of the fleet, once the program is open.
         frames: collector of the bytes of frames.
     """
 
@@ -104,11 +104,11 @@ class Program:
         self.frames: FrameCollector = FrameCollector(self)
 
     async def open(self, timeout: float) -> Self:
-        """Come to the bus.
+        """Connect to the bus.
 
         Raises:
-            ConnectFailedError: there is no bus within ``timeout`` seconds, or no fleet there.
-            ConfigurationError: there are several.
+            ConnectFailedError: no bus is found within ``timeout`` seconds, or no fleet on it.
+            ConfigurationError: there are several fleets.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
@@ -130,23 +130,23 @@ class Program:
 
     @property
     def name(self) -> str:
-        """The program's unique name: its role, and what a person would call it."""
+        """The program's unique name: its role, and its name for people."""
         return self._name.name
 
     @property
     def token(self) -> str:
-        """Its name and its secret, as it says them to agents."""
+        """The program's name and secret, in the form for agents."""
         return self._token
 
     @property
     def role(self) -> str:
-        """The role that its name begins with."""
+        """The role at the start of the program's name."""
         return self._name.role
 
     async def _find(self, deadline: float, timeout: float) -> str:
-        """Return the name of the only fleet that has what is looked for."""
+        """Return the name of the only fleet that has the camera."""
         loop = asyncio.get_running_loop()
-        # of all cameras there may be thousands, of agents a few
+        # there may be thousands of cameras, but only a few agents
         keys_of = Keys("*")
         pattern = keys_of.camera("*", self._camera)
         if self._camera == "**":
@@ -173,7 +173,7 @@ class Program:
         raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:
-        """Leave the bus; calls under way end. Idempotent."""
+        """Leave the bus, and end running calls. Idempotent."""
         for pending in [*self._pending.values()]:
             if not pending.reply.done():
                 pending.reply.set_exception(ConnectionClosedError("closed"))
@@ -186,16 +186,16 @@ class Program:
             await self.bus.close()
 
     def next_call(self) -> int:
-        """Return the number of the next call; each is given once."""
+        """Return a new number for a call."""
         self._calls += 1
         return self._calls
 
     def send(self, key: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
-        """Say something to an agent; return how many bytes."""
+        """Send a message to an agent; return its number of bytes."""
         return self.put(key, encode({"program": self.token, **fields}, blobs))
 
     def put(self, key: str, payload: bytes) -> int:
-        """Say something that is bytes already, as :meth:`send` does."""
+        """Send an encoded message, like :meth:`send`."""
         self.bus.put(key, payload)
         return len(payload)
 
@@ -212,7 +212,7 @@ class Program:
         return reply
 
     def forget(self, number: int) -> None:
-        """Drop a call for whose reply nobody waits any more."""
+        """Drop a call whose reply is not awaited any more."""
         self._pending.pop(number, None)
         if not self._pending:
             self._expires_at = math.inf

@@ -1,8 +1,8 @@
 """A program's name, and the secret by which an agent knows that it is that program.
 
-The name begins with the role of the program's certificate, which the engine's rules see to, and
-ends with a digest of the secret. Everybody may see the name; the secret goes to agents alone. So
-nobody can call, cancel or be present as another program, of whichever role that one is.
+The name begins with the role of the program's certificate, which the engine's rules check, and ends
+with a digest of the secret. The name is public; the secret is sent only to agents. So no program
+can call, cancel or be present as another program, of any role.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from smartcam.fleet._bus.keys import ANYONE
 from smartcam.fleet._security.certificates import ROLES
 
 ROLES_OF_NAMES = (*ROLES, ANYONE)
-"""The roles that a name may begin with."""
+"""The possible roles at the start of a name."""
 
 SECRET_BYTES = 8
-"""Bytes of a secret, and of its digest in the name."""
+"""Number of bytes of a secret, and of its digest in the name."""
 
 
 class ProgramName(NamedTuple):
     """The name of a program, and the secret that proves it.
 
     Attributes:
-        name: what everybody may see, such as ``operator-robot1@host7-31-0f...``.
-        secret: what only the program and its agents know.
+        name: the public name, such as ``operator-robot1@host7-31-0f...``.
+        secret: the secret, which only the program and its agents know.
     """
 
     name: str
@@ -39,22 +39,22 @@ class ProgramName(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Both, as the program says them to agents."""
+        """Name and secret in the form for agents."""
         return f"{self.name}.{self.secret}"
 
     @property
     def role(self) -> str:
-        """The role that the name begins with."""
+        """The role at the start of the name."""
         return role_of(self.name)
 
     @property
     def genuine(self) -> bool:
-        """True if the name belongs to whoever knows the secret, and begins with a role."""
+        """True if the name has the digest of the secret, and begins with a role."""
         return self.role in ROLES_OF_NAMES and self.name.rpartition("-")[2] == _digest(self.secret)
 
     @classmethod
     def of(cls, token: str) -> ProgramName:
-        """Return the name and secret that a program gives; they may not be genuine."""
+        """Return the name and secret from a program; they may not be genuine."""
         name, _, secret = token.partition(".")
         return cls(name, secret)
 
@@ -62,7 +62,7 @@ class ProgramName(NamedTuple):
     def new(cls, role: str, called: str | None = None) -> ProgramName:
         """Return a name for this process that no other program has.
 
-        ``called``: what people call the program; default: its script.
+        ``called``: name of the program for people; default: its script's.
         """
         secret = secrets.token_hex(SECRET_BYTES)
         role = role if role in ROLES else ANYONE
@@ -70,7 +70,7 @@ class ProgramName(NamedTuple):
 
 
 def role_of(name: str) -> str:
-    """Return the role that a program's name begins with."""
+    """Return the role at the start of a program's name."""
     return name.partition("-")[0]
 
 
@@ -85,7 +85,7 @@ _PARTS = re.compile(r"[^-]+-(?P<called>.+)@(?P<host>.+)-(?P<pid>\d+)-[0-9a-f]+")
 def in_words(name: str) -> str:
     """Return a program's name for people, such as ``robot1 on host7, pid 31``.
 
-    One that no program of smartcam has is returned as it is.
+    A name that is not one of a program of smartcam is returned unchanged.
     """
     parts = _PARTS.fullmatch(name)
     return name if parts is None else "{called} on {host}, pid {pid}".format(**parts.groupdict())
@@ -96,7 +96,7 @@ def _digest(secret: str) -> str:
 
 
 def _process(called: str | None) -> str:
-    """Return a name of this process: what it is called, its host and number."""
+    """Return a name of this process: its name for people, its host and number."""
     path = Path(sys.argv[0] if sys.argv else "")
     script = path.parent.name if path.stem == "__main__" else path.stem
     if script in {"", "-c", "-m"}:
@@ -106,5 +106,5 @@ def _process(called: str | None) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text in letters that a key of the bus may have."""
+    """Return a text with only characters that a key of the bus may have."""
     return re.sub(r"[^a-z0-9-]", "_", text.lower())

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def singles(run: ResultRun) -> Iterator[ResultRun]:
-    """Give each container of a run as a run of its own."""
+    """Yield each container of a run as its own run."""
     for place in range(len(run.payloads)):
         yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
 
@@ -75,28 +75,28 @@ def as_result(
 def result_fields(
     run: ResultRun, interpretation: Interpretation | None, camera: str
 ) -> dict[str, Any]:
-    """Return the JSON fields of the one container of ``run``, with ``error`` if it cannot be read.
+    """Return the JSON fields of the one container of ``run``, with its ``error`` if there is one.
 
-    The value is None then, and without an interpretation.
+    The value is None with an error, and without an interpretation.
     """
     value = sequence = None
     said: dict[str, Any] = {"error": ""}
     if interpretation is not None:
         try:
             value, sequence, _ = interpreted(run, interpretation, camera)
-            if localizations_of(value) is None:  # of which the text is made faster
+            if localizations_of(value) is None:  # there is a faster way for localizations
                 value = plain(value)
         except InterpretationError as error:
             value, said = None, failure(error)
         except ENDS_PROGRAM:
             raise
-        except BaseException as exc:  # noqa: BLE001 - a plug-in's value that is no JSON
+        except BaseException as exc:  # noqa: BLE001 - a plug-in's value cannot become JSON
             value, said = None, failure(InterpretationError(f"the value is no JSON: {exc!r:.200}"))
     return {**as_result(run, camera, value, sequence)._asdict(), **said}
 
 
 def failure(error: BaseException) -> dict[str, Any]:
-    """Return an error as answers and results in JSON have it: ``error`` is never empty."""
+    """Return an error for answers and results in JSON: ``error`` is never empty."""
     said = to_fields(error, 0)
     fields: dict[str, Any] = {"error": said["text"] or said["kind"], "kind": said["kind"]}
     if "attributes" in said:

@@ -1,4 +1,4 @@
-"""Receive a fleet camera's states and results, each once and in order, for those who listen."""
+"""Receive a fleet camera's states and results, each once and in order, for its listeners."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 FILL_TIMEOUT = 5.0
-"""Seconds for the answer to what is asked for because it was missing; then it is asked again."""
+"""Seconds for the answer to a request for missing messages; then it is sent again."""
 
 
 class ToldState(NamedTuple):
-    """Something that happened to the camera, and what it was then.
+    """An event of the camera, and its state after the event.
 
     Attributes:
         number: number of the event.
@@ -50,7 +50,7 @@ class ToldState(NamedTuple):
 
     @property
     def size(self) -> int:
-        """About the bytes that it keeps."""
+        """Approximate number of bytes."""
         return 500
 
     def since(self, number: int) -> ToldState:
@@ -59,10 +59,10 @@ class ToldState(NamedTuple):
 
 
 def state(data: bytes) -> ToldState:
-    """Return the event that an agent's bytes tell of.
+    """Return the event from an agent's bytes.
 
     Raises:
-        ValueError: the bytes tell of no event.
+        ValueError: the bytes are not an event.
     """
     said = decode_state(data)
     number: int = said["number"]
@@ -70,7 +70,7 @@ def state(data: bytes) -> ToldState:
 
 
 class FleetListeners(Listeners):
-    """Passes over listeners that came later than the results that are handed on."""
+    """Skips listeners that came later than the results that are passed on."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -79,11 +79,11 @@ class FleetListeners(Listeners):
         )
 
     def unmarked(self) -> list[asyncio.Future[Result]]:
-        """Return the waiters whose beginning is not known yet."""
+        """Return the waiters whose start is not known yet."""
         return [one for one in self._next_results if one not in self._since]
 
     def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
-        """Note that a waiter for the next result wants none that came before ``clock``."""
+        """Note that a waiter for the next result needs one from ``clock`` on."""
         self._since[future] = clock
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
@@ -96,9 +96,9 @@ class FleetListeners(Listeners):
         return taken
 
     def miss(self, count: int, then: ResultRun | None) -> None:
-        """Tell the streams of results that some cannot come any more, which came before ``then``.
+        """Report to the streams that results before ``then`` are missed.
 
-        One that subscribed in between cannot know how many it has missed: it counts all.
+        A stream that subscribed in between cannot know how many it has missed: it counts all.
         """
         self.results.horizon = math.inf if then is None else then.clock
         for stream in self.results:
@@ -107,11 +107,11 @@ class FleetListeners(Listeners):
 
 
 class Own:
-    """A trigger of this program's, as long as its caller waits.
+    """A trigger of this program, while its caller waits.
 
     Args:
         interpretation: interpretation of the trigger's results.
-        expected: application that the results are to be of; None for any.
+        expected: application whose results are expected; None for any.
     """
 
     def __init__(self, interpretation: Interpretation, expected: int | None) -> None:
@@ -120,17 +120,17 @@ class Own:
 
 
 class Receiver:
-    """Takes what the agent says, and makes results of runs.
+    """Receives the agent's messages, and makes results from runs.
 
     Args:
         name: name of the camera in results.
         camera: name of the camera in the fleet.
-        caller: caller that asks the agent for what is missing.
-        listeners: listeners that are told of results.
-        counters: counters of what became of results.
-        interpretation: function for the interpretation of results that no trigger reads otherwise.
-        on_state: callback for what happened to the camera.
-        expected: function for the application that results are to be of; None for any.
+        caller: caller that asks the agent for missing messages.
+        listeners: listeners for results.
+        counters: counters of results.
+        interpretation: function that returns the interpretation, unless a trigger has its own.
+        on_state: callback for the camera's events.
+        expected: function that returns the expected application; None for any.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Receiver:
         self._name, self._camera, self._caller = name, camera, caller
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
-        self._program = 0  # as the agent numbers this one
+        self._program = 0  # the agent's number for this program
         self._states: Feed[ToldState] = Feed(
             self._take_state, _ignore, lambda: self._lack("states")
         )
@@ -156,20 +156,20 @@ class Receiver:
             self._take_run, listeners.miss, lambda: self._lack("results"), returns=True
         )
         self._handles: dict[str, Handle] = {}
-        self._since = math.inf  # the agent's clock when results were first wanted
+        self._since = math.inf  # agent's time from which results are needed
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._reaching: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
 
     # ------------------------------------------------------------------ life
 
     def open(self) -> None:
-        """Hear what happens to the camera."""
+        """Subscribe to the camera's states."""
         program = self._caller.program
         key = program.keys.states(self._camera)
         self._handles["states"] = program.bus.subscribe(key, self._hear_states)
 
     async def close(self) -> None:
-        """Hear nothing more."""
+        """Unsubscribe."""
         for handle in self._handles.values():
             handle.close()
         self._handles.clear()
@@ -180,25 +180,25 @@ class Receiver:
         self._wake(everyone=True)
 
     def misses_states(self, met: Met) -> bool:
-        """Return True if an agent, met again, has told more of the camera than was taken."""
+        """Return True if an agent, met again, has sent states that were not received."""
         feed = self._states
         return feed.epoch == met.epoch and 0 < feed.expected < int(met.hello["states"])
 
     def meet(self, met: Met) -> None:
-        """Begin with an agent that is there and has said where its numbers stand."""
+        """Start with an agent that has answered with its next numbers."""
         hello = met.hello
         self._program = int(hello.get("program", 0))
         states, results = int(hello["states"]), int(hello["results"])
         self._states.begin(met.epoch, states, states)
         if "results" not in self._handles:
             return
-        if self._results.expected:  # of a new start, or another agent's turn, everything
+        if self._results.expected:  # after a new start, or a takeover, all results
             self._results.begin(met.epoch, int(hello.get("began", 1)), results)
         else:
             self._begin("find", self._find())
 
     def lose(self) -> None:
-        """Stop asking, since the agent is gone; what is missing is asked for when it is back."""
+        """Stop asking, since the agent is lost; missing messages are requested at its return."""
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()
@@ -209,13 +209,13 @@ class Receiver:
 
     @property
     def epoch(self) -> int:
-        """Epoch of the agent whose states were taken last; 0 before."""
+        """Epoch of the agent of the last received states; 0 before."""
         return self._states.epoch
 
     # ------------------------------------------------------------------ on demand
 
     def want_results(self, since: float) -> None:
-        """Note that somebody listens to results from ``since`` on (the agent's clock)."""
+        """Note that results from ``since`` on (the agent's clock) are needed."""
         if "results" in self._handles:
             return
         program = self._caller.program
@@ -231,7 +231,7 @@ class Receiver:
         self._wake(everyone=True)
 
     async def _find(self) -> None:
-        """Find where to begin: what came before anybody listened is for nobody."""
+        """Find the first needed result: earlier ones came before there was a listener."""
         while self._caller.met is not None:
             met = self._caller.met
             with contextlib.suppress(SmartCamError):
@@ -242,7 +242,7 @@ class Receiver:
                 return
 
     async def reach(self, kind: str, number: int, deadline: float) -> None:
-        """Wait until everything before ``number`` was taken; bounded, and never fails."""
+        """Wait until all messages before ``number`` were received; bounded, and never fails."""
         feed: Feed[Any] = self._states if kind == "states" else self._results
         if kind not in self._handles or feed.expected >= number:
             return
@@ -253,7 +253,7 @@ class Receiver:
                 await reached
 
     def has(self, states: int, results: int) -> bool:
-        """Return True if all states, and results where heard, before these numbers were taken."""
+        """Return True if all states, and subscribed results, before these numbers were received."""
         heard = "results" not in self._handles or self._results.expected >= results
         return heard and self._states.expected >= states
 
@@ -269,7 +269,7 @@ class Receiver:
                 left.append((feed, number, reached))
         self._reaching = left
 
-    # ------------------------------------------------------------------ what is missing
+    # ------------------------------------------------------------------ missing messages
 
     def _lack(self, kind: str) -> None:
         if kind not in self._tasks and self._caller.met is not None:
@@ -290,7 +290,7 @@ class Receiver:
         task.add_done_callback(done)
 
     async def _fill(self, kind: str) -> None:
-        """Ask for what is missing until nothing is."""
+        """Request missing messages until none is missing."""
         feed: Feed[Any] = self._states if kind == "states" else self._results
         while feed.lacking and feed.expected and self._caller.met is not None:
             epoch = feed.epoch
@@ -304,7 +304,7 @@ class Receiver:
                 things = _things(kind, reply)
             except (ProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
-                first = following = feed.expected + 1  # or it would be asked for forever
+                first = following = feed.expected + 1  # skip it, to not request it forever
                 things = []
             feed.fill(epoch, first, following, things)
             self._wake()
@@ -312,7 +312,7 @@ class Receiver:
     def _soon(self) -> float:
         return asyncio.get_running_loop().time() + FILL_TIMEOUT
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ messages
 
     def _hear_states(self, key: str, payload: bytes) -> None:
         what = f"what the agent says of {self._camera}"
@@ -320,7 +320,7 @@ class Receiver:
             message = decode(payload, what)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
             self._count(payload)
-            known = 0  # those that came with replies
+            known = 0  # states that came with replies
             if epoch == self.epoch:
                 known = max(0, self._states.expected - following + len(message.blobs))
             states = [state(one) for one in message.blobs[known:]]
@@ -332,7 +332,7 @@ class Receiver:
         self._wake()
 
     def take_told(self, reply: TriggerReply) -> None:
-        """Take the states in a reply, which are not said to all yet."""
+        """Take the states in a reply, which the agent has not published yet."""
         if not reply.told:
             return
         try:
@@ -359,7 +359,7 @@ class Receiver:
         self._wake()
 
     def _see(self, epoch: int) -> None:
-        """Look whether the agent was started anew: presence does not show a quick restart."""
+        """Check whether the agent was restarted: presence does not show a quick restart."""
         met = self._caller.met
         if met is not None and self._caller.restarted(epoch):
             self._caller.lose(f"the agent {met.agent} was restarted")
@@ -378,7 +378,7 @@ class Receiver:
         """Return a trigger's results.
 
         Raises:
-            InterpretationError: of the first that cannot be read.
+            InterpretationError: a result cannot be interpreted; the error of the first one.
         """
         found = [self._outcome(own, run) for run in batch.runs]
         if batch.runs and not math.isnan(batch.runs[-1].latency):
@@ -389,7 +389,7 @@ class Receiver:
         return [one for one in found if not isinstance(one, InterpretationError)]
 
     def _outcome(self, own: Own, run: ResultRun) -> Result | InterpretationError:
-        """Return a trigger's result; made and counted once, whichever way it comes first."""
+        """Return a trigger's result, made and counted once, though it comes in two ways."""
         known = own.outcomes.get(run.number)
         if known is not None:
             return known
@@ -410,7 +410,7 @@ class Receiver:
         return outcome
 
     def _take_run(self, run: ResultRun) -> None:
-        """Hand containers that came together to the listeners that were there before."""
+        """Pass containers that came together to listeners that came before them."""
         listeners = self._listeners
         listeners.results.horizon = run.clock
         try:
@@ -449,7 +449,7 @@ class Receiver:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 
     def _take_burst(self, run: ResultRun, now: float) -> bool:
-        """Hand on containers that are only streamed, all at once; False where that cannot be."""
+        """Pass containers to streams, all at once; return False if that is not possible."""
         if run.cells or not run.flags & CURRENT:
             return False
         done = self._interpretation().burst(
@@ -499,4 +499,4 @@ def _things(kind: str, reply: BusMessage) -> list[Any]:
 
 
 def _ignore(_count: int, _then: ToldState | None) -> None:
-    """Ignore states that are missed forever: the next one tells the camera's state."""
+    """Ignore missed states: the next one has the camera's state."""

@@ -1,7 +1,7 @@
-"""The rights of each role, and the rules that an engine makes of them.
+"""The rights of each role, and the engine's rules for them.
 
-A program's role is its certificate's common name. Nothing is allowed but what stands in
-:data:`RIGHTS`; ``docs/access.md`` is made from it.
+A program's role is its certificate's common name. Only :data:`RIGHTS` are allowed, from which
+``docs/access.md`` is generated.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
         ("liveliness_token", "egress"),
     ),
 }
-"""The engine's messages of each thing that an end does, and whether they come from it."""
+"""The engine's messages for each kind of use, and their direction as seen from the engine."""
 
 
 class Right(NamedTuple):
@@ -51,7 +51,7 @@ class Right(NamedTuple):
     roles: tuple[str, ...]
 
 
-_ANY = Keys("*")  # of whichever fleet: one authority is one plant
+_ANY = Keys("*")  # keys of any fleet, since an authority is for one plant
 _LOOKING = tuple(name for name, one in SERVICES.items() if not one.command)
 _LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 
@@ -118,7 +118,7 @@ RIGHTS: tuple[Right, ...] = (
 def ros_rights(domain: int) -> tuple[Right, ...]:
     """Return the rights of ROS 2 in a domain: everything, for roles that may command.
 
-    A topic's name does not tell looking from acting: a viewer's node could call any service.
+    Names do not show whether a node only reads: a viewer's node could call any service.
     """
     keys = (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**")
     return tuple(Right("ROS 2", does, keys, (OPERATOR, AGENT)) for does in MESSAGES)
@@ -129,10 +129,10 @@ _ALL = tuple(Right("pass on", does, _EVERYTHING, (ROUTER,)) for does in MESSAGES
 
 
 def access_control(domain: int | None = None) -> dict[str, Any]:
-    """Return the rules as the engine's ``access_control`` has them.
+    """Return the rules in the form of the engine's ``access_control``.
 
     Args:
-        domain: domain of ROS 2 that the bus carries, too; None for none.
+        domain: domain of ROS 2 on the same bus; None without ROS.
     """
     rights = RIGHTS + _ALL + (() if domain is None else ros_rights(domain))
     keys: dict[tuple[str, str, Flow], dict[str, None]] = collections.defaultdict(dict)

@@ -1,4 +1,4 @@
-"""A certificate authority of a plant's own, in a folder, and the certificates that it makes."""
+"""A plant's own certificate authority, in a folder, and its certificates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 AUTHORITY = "authority"
-"""Folder of the authority's own files, and so no name for a certificate."""
+"""Folder of the authority's own files, whose name no certificate can have."""
 
 CA_FILE, CERT_FILE, KEY_FILE = CERTIFICATE_FILES
 
@@ -40,7 +40,7 @@ BEFORE = timedelta(days=1)
 """Time before now at which certificates begin, since clocks in a plant differ."""
 
 HERE = ("localhost", "127.0.0.1", "::1")
-"""Hosts that every agent's certificate is for."""
+"""Hosts in every agent's certificate."""
 
 HOST = re.compile(r"[\w.:-]+", re.ASCII)
 
@@ -55,8 +55,8 @@ class MadeCertificate(NamedTuple):
         name: name in the certificate.
         folder: folder of the certificate.
         done: ``made``, ``renewed`` or ``kept``.
-        ends: when the certificate ends, UTC.
-        use: what to write into fleet.yaml, or which URL to use.
+        ends: end of the certificate, UTC.
+        use: lines for fleet.yaml, or the URL to use.
     """
 
     role: str
@@ -74,22 +74,22 @@ def make_certificates(
     hosts: Iterable[str] = (),
     lifetime: timedelta = LIFETIME,
 ) -> list[MadeCertificate]:
-    """Make the certificates that a plant lacks, and renew those that end soon; blocks.
+    """Make a plant's missing certificates, and renew those that end soon; blocks.
 
-    Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text how to use
-    it. The authority is made the first time, in ``authority``, and never again. A renewed one has
-    its key as before, so that one file is replaced, in one step.
+    Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text on its use.
+    The authority is made the first time, in ``authority``, and never again. A renewed certificate
+    keeps its key, so that one file is replaced, in one step.
 
     Args:
         folder: folder of the plant's certificates.
         wanted: names by role.
-        hosts: names and addresses by which agents and routers are reached, beside this computer's
-            own; an agent of ``wanted`` that lacks one gets a new certificate.
-        lifetime: lifetime of new certificates; none outlives the authority.
+        hosts: names and addresses of agents and routers, besides this computer's own; an agent of
+            ``wanted`` without one of them gets a new certificate.
+        lifetime: lifetime of new certificates, which ends with the authority's at the latest.
 
     Raises:
-        ConfigurationError: a name cannot be one, or is another role's; the authority is not
-            whole, or a file cannot be written.
+        ConfigurationError: a name is not valid, or is another role's; the authority is not
+            complete, or a file cannot be written.
     """
     x509_module()
     names: dict[str, str] = {}
@@ -119,7 +119,7 @@ def make_certificates(
 
 
 class _Authority:
-    """Signs.
+    """The authority, which signs certificates.
 
     Args:
         folder: folder of the plant's certificates.
@@ -130,7 +130,7 @@ class _Authority:
 
     @classmethod
     def of(cls, folder: Path) -> _Authority:
-        """Return the authority of a folder; make one where there is none."""
+        """Return the authority of a folder; make one if there is none."""
         from cryptography import x509
 
         place = folder / AUTHORITY
@@ -207,7 +207,7 @@ class _Authority:
         found = x509.load_pem_x509_certificate((place / CERT_FILE).read_bytes())
         try:
             found.verify_directly_issued_by(self._certificate)
-        except Exception as exc:  # InvalidSignature, ValueError, TypeError: it is another's
+        except Exception as exc:  # InvalidSignature, ValueError, TypeError: another authority's
             raise ConfigurationError(
                 f"certificates: {place / CERT_FILE} is of another authority than "
                 f"{self._folder / AUTHORITY}: expected one of it, or none"
@@ -224,7 +224,7 @@ class _Authority:
         key = _key_in(place)
         ends = min(datetime.now(UTC) + lifetime, self._certificate.not_valid_after_utc)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
-        if role in LISTENING:  # nobody else's certificate can pass for an agent's
+        if role in LISTENING:  # so that no other certificate can serve as an agent's
             uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
         subject, issuer = _subject(role, name), self._certificate.subject
@@ -245,7 +245,7 @@ class _Authority:
 
 
 def _key_in(place: Path) -> Any:
-    """Return the key of a folder; it is made where there is none."""
+    """Return the key of a folder; make one if there is none."""
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -340,7 +340,7 @@ def _write(path: Path, body: bytes) -> None:
 
 
 def _write_key(place: Path, key: Any) -> None:
-    """Write a new key, which its owner alone may read from its first byte on."""
+    """Write a new key, which only its owner may read from its first byte on."""
     from cryptography.hazmat.primitives import serialization
 
     body = key.private_bytes(
@@ -382,7 +382,7 @@ def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
 
 
 def _router(place: Path) -> bytes:
-    """Return a whole configuration of Zenoh's own router."""
+    """Return a complete configuration of Zenoh's own router."""
     link = BusLink((f"tls/0.0.0.0:{DEFAULT_PORT}",), (), str(place.absolute()))
     wanted = {"access_control": access_control()}
     for path, value in link.settings(10.0).items():

@@ -1,4 +1,4 @@
-"""Certificates: whose one is, its role, when it ends; why a handshake with it came to nothing."""
+"""Read certificates (owner, role, end), and find out why a handshake failed."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from cryptography import x509
 
 VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "router")
-"""Roles that a certificate's common name may be."""
+"""The possible common names of a certificate."""
 
 MAX_BYTES = 1 << 20
 """Largest number of bytes of a file with certificates or a key; each certificate has about 1 kB."""
 
 WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
-"""Times before its end at which a certificate is warned of."""
+"""Times before a certificate's end at which there is a warning."""
 
 DAY = timedelta(days=1)
 
 LOOK_TIMEOUT = 1.0
-"""Seconds for finding out why a handshake failed."""
+"""Seconds of the timeout for finding out why a handshake failed."""
 
 RENEW = "smartcam fleet certificates DIR makes a new one"
 
@@ -69,8 +69,8 @@ class Identity(NamedTuple):
         folder: folder of the certificate.
         role: common name in the certificate.
         name: organisational unit in the certificate; empty if there is none.
-        ends: when the certificate ends, UTC.
-        authority_ends: when the certificate of its authority ends, UTC.
+        ends: end of the certificate, UTC.
+        authority_ends: end of its authority's certificate, UTC.
         digest: digest of all three files.
     """
 
@@ -86,7 +86,7 @@ class Identity(NamedTuple):
 
     @property
     def expired(self) -> str:
-        """Say that it has expired; empty if it has not."""
+        """Text that the certificate has expired; empty if it has not."""
         now = datetime.now(UTC)
         for what, ends in self._endings:
             if now >= ends:
@@ -95,17 +95,17 @@ class Identity(NamedTuple):
 
     @property
     def warning(self) -> str:
-        """Say that it ends soon, or has; empty if it does not."""
+        """Text that the certificate ends soon, or has expired; empty otherwise."""
         return self.expired or ends_soon(*min(self._endings, key=lambda one: one[1]))
 
     @property
     def urgency(self) -> int:
-        """Number of warning times that are over; one more when the certificate has expired."""
+        """Number of past warning times; one more when the certificate has expired."""
         return sum(self._left <= one for one in (*WARN_BEFORE, timedelta()))
 
     @property
     def look_after(self) -> float:
-        """Seconds until the next time to warn, a day at most: it may be another one by then."""
+        """Seconds until the next warning, at most a day, since it may be renewed by then."""
         times = [self._left - one for one in (*WARN_BEFORE, timedelta()) if self._left > one]
         return min([DAY, *times]).total_seconds() + 0.1
 
@@ -121,7 +121,7 @@ class Identity(NamedTuple):
 
 
 def ends_soon(what: str, ends: datetime | None) -> str:
-    """Say that something ends soon; empty if it does not."""
+    """Return a text that a certificate ends soon; empty if it does not."""
     if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""
     return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
@@ -150,7 +150,7 @@ def x509_module() -> Any:
 
 
 def read_identity(folder: Path) -> Identity:
-    """Read whose the certificate of a folder is; blocks for some milliseconds.
+    """Read the identity in a folder's certificate; blocks for some milliseconds.
 
     Raises:
         ConfigurationError: the files are not valid, or do not belong together.
@@ -173,7 +173,7 @@ def read_identity(folder: Path) -> Identity:
         authorities = x509.load_pem_x509_certificates(bodies[0])
     except ValueError as exc:
         raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
-    try:  # whether certificate and key belong together
+    try:  # check that certificate and key belong together
         context(folder)
     except (ssl.SSLError, OSError) as exc:
         raise ConfigurationError(
@@ -199,12 +199,12 @@ def context(folder: Path) -> ssl.SSLContext:
     """Return the TLS context for a handshake with the certificates of a folder; blocks.
 
     Raises:
-        ssl.SSLError: the files are no certificates.
+        ssl.SSLError: the files are not certificates.
     """
     ca, cert, key = (folder / name for name in CERTIFICATE_FILES)
     made = ssl.create_default_context(cafile=str(ca))
-    made.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine asks for no more either
-    made.load_cert_chain(cert, key, password="")  # else one with a password asks the terminal
+    made.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine is not stricter
+    made.load_cert_chain(cert, key, password="")  # otherwise a password is asked for
     return made
 
 
@@ -212,8 +212,8 @@ class Handshake(NamedTuple):
     """The outcome of a handshake.
 
     Attributes:
-        trouble: why the last reading failed; empty if it did not.
-        ends: when the other side's certificate ends, UTC; None if it showed none.
+        trouble: reason why the handshake failed; empty if it succeeded.
+        ends: end of the other side's certificate, UTC; None if it sent none.
     """
 
     trouble: str
@@ -223,7 +223,7 @@ class Handshake(NamedTuple):
 async def shake_hands(
     host: str, port: int, folder: Path, within: float = LOOK_TIMEOUT
 ) -> Handshake:
-    """Try a handshake, and say what came of it ``within`` seconds."""
+    """Try a handshake, and return its outcome ``within`` seconds."""
     loop = asyncio.get_running_loop()
     writer: asyncio.StreamWriter | None = None
     ends: datetime | None = None
@@ -234,8 +234,8 @@ async def shake_hands(
             found: Any = writer.get_extra_info("peercert") or {}
             if "notAfter" in found:
                 ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(found["notAfter"]), UTC)
-            await reader.read(1)  # who does not take our certificate says so now
-    except TimeoutError:  # who waits for what we say next has taken it
+            await reader.read(1)  # an endpoint that refuses the certificate reports it now
+    except TimeoutError:  # an endpoint that waits for data has accepted it
         return Handshake(SILENT if writer is None else "", ends)
     except ssl.SSLCertVerificationError as exc:
         why = VERIFY.get(exc.verify_code, f"its certificate is not good: {exc.verify_message}")

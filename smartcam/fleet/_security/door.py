@@ -1,14 +1,14 @@
-"""The door of an agent's port: who may reach the engine, which takes every connection.
+"""Filter connections to an agent's port, since the engine accepts every connection.
 
-The engine bounds nothing: a connection that says nothing has its place for 10 s, and after each one
-whose handshake fails nobody is taken in for 0.1 s. So the system drops what asks for one more, by a
-filter on the listening socket:
+The engine has no bounds: a silent connection stays for 10 s, and after each failed handshake no
+connection is accepted for 0.1 s. So the system drops requests for a further connection, by a filter
+on the listening socket:
 
-- from an address that has many connections which have not come in;
-- from everybody while few file descriptors are left: cameras come back and health answers.
+- from an address that has many half-open connections, whose handshake has not ended;
+- from all addresses while few file descriptors are left, which cameras and health need.
 
-Who is connected notices nothing; who asks, asks again by itself, as TCP does. The filter cannot
-look at what is said: connections inherit it from the socket that they came by.
+Existing connections are not affected; TCP repeats a dropped request by itself. The filter cannot
+look at contents, since connections inherit it from the listening socket.
 """
 
 from __future__ import annotations
@@ -39,40 +39,40 @@ Place = tuple[str, int]
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
-"""Seconds between two looks at how many descriptors are left, and where there are hardly fewer than
-at the last one. When somebody connects there is a look at once."""
+"""Seconds between two checks of the free descriptors, and the same if there are hardly fewer than
+at the last check. A new connection causes a check at once."""
 
 LOOK_WHO_COMES_EVERY = 0.25
-"""Seconds between two looks at connections while some are on their way in and no other comes."""
+"""Seconds between two checks of connections while some are half-open and no other comes."""
 
 REST = 4.0
-"""Rest after a look at connections, in multiples of what it took, however many come: it looks at
-every descriptor, and an agent may have thousands of cameras."""
+"""Pause after a check of connections, in multiples of its duration: it reads every descriptor, and
+an agent may have thousands of cameras."""
 
 MAX_CALM_GROWTH = 8
-"""Descriptors more than at the last look that are taken for calm."""
+"""Largest growth of used descriptors since the last check that counts as calm."""
 
 CHECK_AFTER = 50
-"""Looks until the engine's sockets are looked at, which it opens anew with renewed certificates."""
+"""Number of checks between two searches for the engine's sockets, which change with renewed
+certificates."""
 
 RESERVED_DESCRIPTORS: Final = 256
-"""Descriptors that the port leaves to cameras and health; a quarter of all where those are few."""
+"""Descriptors that the port leaves to cameras and health; at most a quarter of all."""
 
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
-"""Largest number of connections of one address that may be on their way in; it gets no further one
-meanwhile."""
+"""Largest number of half-open connections of one address, which gets no further one then."""
 
 FEW_HALF_OPEN: Final = 4
-"""Half-open connections at which an address gets a further one again."""
+"""Number of half-open connections at which an address gets a further one again."""
 
 MAX_BLOCKED_ADDRESSES: Final = 256
-"""Addresses that a filter can name; those with most connections are."""
+"""Largest number of addresses in a filter, those with most connections."""
 
 BACKLOG: Final = 64
-"""Connections that the system keeps for the engine to take: these come in when the door is shut."""
+"""Connections that the system keeps for the engine; these are accepted even if it is shut."""
 
 MAX_WANTED: Final = 65_536
-"""Descriptors that an agent asks the system for, as far as it may."""
+"""Number of descriptors that an agent requests from the system, if it may."""
 
 ATTACH_FILTER, DETACH_FILTER = 26, 27
 """Linux' SO_ATTACH_FILTER and SO_DETACH_FILTER."""
@@ -90,7 +90,7 @@ class _Instruction(NamedTuple):
     Attributes:
         code: operation of the instruction.
         value: operand of the instruction.
-        yes, no: instructions skipped where a condition holds, and where it does not.
+        yes, no: numbers of instructions to skip if a condition is true, and if it is false.
     """
 
     code: int
@@ -106,8 +106,8 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
     """Return the filter of a listening socket.
 
     Args:
-        shut: whether nobody is taken in.
-        blocked: addresses that are not.
+        shut: whether all connections are refused.
+        blocked: addresses whose connections are refused.
     """
     if shut:
         return [_DROP]
@@ -131,7 +131,7 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
 
 
 def raise_descriptor_limit() -> None:
-    """Have as many file descriptors as the system lets this process have, up to a bound."""
+    """Raise this process' limit of file descriptors as far as the system allows, bounded."""
     if sys.platform == "win32":
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -142,15 +142,15 @@ def raise_descriptor_limit() -> None:
 
 
 class Door:
-    """Decides who reaches the ports of this process' engine; on Linux, elsewhere everybody does.
+    """Filters connections to the ports of this process' engine; only on Linux.
 
     Args:
         ports: ports at which the engine listens.
-        links: function for the addresses of links that have come in, such as ``("10.1.0.5",
-            40123)``; it gives None if they are not known.
+        links: function that returns the addresses of accepted links, such as ``("10.1.0.5",
+            40123)``; None if they are not known.
 
     Attributes:
-        shut: whether the door takes nobody in.
+        shut: whether all connections are refused.
         blocked: addresses that get no further connections.
     """
 
@@ -160,7 +160,7 @@ class Door:
         self._ports, self._links = ports, links
         self.shut = False
         self.blocked: frozenset[str] = frozenset()
-        self._listeners: list[int] = []  # descriptors, which may be others' by now
+        self._listeners: list[int] = []  # descriptors, which may have been reused meanwhile
         self._timer: asyncio.TimerHandle | None = None
         self._looks = self._lowest = 0
         self._coming: asyncio.TimerHandle | None = None
@@ -168,13 +168,13 @@ class Door:
         self._knocks: select.epoll | None = None
 
     def open(self) -> None:
-        """Look from now on."""
+        """Start to check."""
         if sys.platform == "linux" and self._ports:
             self._find_again()
             self._look()
 
     def close(self) -> None:
-        """Look no more, and leave the door open. Idempotent."""
+        """Stop checking, and remove the filter. Idempotent."""
         if self._timer is None:
             return
         self._timer.cancel()
@@ -194,7 +194,7 @@ class Door:
         self._timer = asyncio.get_running_loop().call_later(delay, self._look)
         self._looks += 1
         if self._looks % CHECK_AFTER == 0 and not self._all_ours():
-            self._find_again()  # the engine has listened anew
+            self._find_again()  # the engine has opened new sockets
         if most == resource.RLIM_INFINITY:
             return
         left = most - lowest
@@ -203,24 +203,24 @@ class Door:
             self.shut = True
             self._set()
             logger.warning(
-                "! the port of the fleet takes nobody in: %d file descriptors are left, and %d are "
-                "for cameras and health",
+                "! the port of the fleet accepts no connection: %d file descriptors are left, %d "
+                "of them for cameras and health",
                 left,
                 reserve,
             )
         elif self.shut and left > reserve + reserve // 4:
             self.shut = False
             self._set()
-            logger.warning("= the port of the fleet takes programs in again")
+            logger.warning("= the port of the fleet accepts connections again")
 
-    # ------------------------------------------------------------------ who comes
+    # ------------------------------------------------------------------ connections
 
     def _hear_knocks(self) -> None:
-        """Have a look whenever somebody connects; the engine takes them in its own threads."""
+        """Check at each new connection, which the engine accepts in its own threads."""
         self._forget_knocks()
         self._knocks = select.epoll()
         for number in self._listeners:
-            with contextlib.suppress(OSError):  # it is somebody else's, or closed
+            with contextlib.suppress(OSError):  # the descriptor was reused, or closed
                 self._knocks.register(number, select.EPOLLIN | select.EPOLLET)
         asyncio.get_running_loop().add_reader(self._knocks.fileno(), self._on_knock)
 
@@ -236,7 +236,7 @@ class Door:
         self._expect_look(max(0.0, self._rested - asyncio.get_running_loop().time()))
 
     def _expect_look(self, delay: float | None) -> None:
-        """Look at the port in ``delay`` seconds, or not at all; this replaces an earlier plan."""
+        """Check the port in ``delay`` seconds, or not at all; this replaces an earlier plan."""
         if self._coming is not None:
             self._coming.cancel()
             self._coming = None
@@ -245,7 +245,7 @@ class Door:
             self._coming = loop.call_later(delay, self._look_who_comes)
 
     def _look_who_comes(self) -> None:
-        """Block addresses that have too many connections on their way in."""
+        """Block addresses that have too many half-open connections."""
         loop, links = asyncio.get_running_loop(), self._links()
         self._expect_look(None)
         if links is None:
@@ -265,8 +265,8 @@ class Door:
             return
         for host in sorted({*many} - self.blocked):
             logger.warning(
-                "! the port of the fleet takes nobody more in from %s: %d connections from there "
-                "have not come in yet",
+                "! the port of the fleet accepts no further connection from %s: %d from there are "
+                "half-open",
                 host,
                 coming[host],
             )
@@ -277,7 +277,7 @@ class Door:
         """Return the other ends of all connections of the ports."""
         found: set[Place] = set()
         for one in _sockets():
-            with contextlib.suppress(OSError, IndexError):  # it is no such one, or has ended
+            with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
                 if one.getsockname()[1] in self._ports and not _listens(one):
                     host, port, *_ = one.getpeername()
                     found.add((plain_host(host), port))
@@ -291,7 +291,7 @@ class Door:
             self._find_again()
 
     def _find_again(self) -> None:
-        with contextlib.suppress(OSError):  # no descriptor is left to look with
+        with contextlib.suppress(OSError):  # no descriptor is left for the search
             self._listeners = self._find()
             self._hear_knocks()
         for number in self._listeners:
@@ -312,7 +312,7 @@ class Door:
         return bool(self._listeners)
 
     def _filter(self, number: int) -> bool:
-        """Give one listening socket its filter; return whether it is one of ours."""
+        """Set the filter of one listening socket; return False if it is not the engine's."""
         try:
             found = socket.socket(fileno=number)
         except OSError:
@@ -322,7 +322,7 @@ class Door:
                 return False
             steps = packet_filter(shut=self.shut, blocked=sorted(self.blocked))
             if steps == [_PASS]:
-                with contextlib.suppress(FileNotFoundError):  # it has none
+                with contextlib.suppress(FileNotFoundError):  # the socket has no filter
                     found.setsockopt(socket.SOL_SOCKET, DETACH_FILTER, 0)
             else:
                 attach(found, steps)
@@ -348,7 +348,7 @@ class Door:
 
 
 def attach(found: socket.socket, steps: list[_Instruction]) -> None:
-    """Have the system filter what comes for a socket.
+    """Set the filter of a socket in the system.
 
     Raises:
         OSError: the system refuses the filter.
@@ -360,7 +360,7 @@ def attach(found: socket.socket, steps: list[_Instruction]) -> None:
 
 
 def plain_host(text: str) -> str:
-    """Return an address as it is compared: without a scope, IPv4 within IPv6 as IPv4."""
+    """Return an address for comparisons: without a scope, IPv4 within IPv6 as IPv4."""
     address = ipaddress.ip_address(text.strip("[]").partition("%")[0])
     return str(getattr(address, "ipv4_mapped", None) or address)
 
@@ -371,7 +371,7 @@ def _listens(found: socket.socket) -> bool:
 
 
 def _sockets() -> Iterator[socket.socket]:
-    """Give this process' sockets in turn; whose they are, they stay."""
+    """Yield this process' sockets in turn, without taking ownership."""
     for name in os.listdir("/dev/fd"):  # noqa: PTH208 - names are enough
         try:
             found = socket.socket(fileno=int(name))
@@ -384,7 +384,7 @@ def _sockets() -> Iterator[socket.socket]:
 
 
 def _lowest_free(most: int) -> int:
-    """Return the lowest descriptor that is free: all below are in use."""
+    """Return the lowest free descriptor: all below are in use."""
     try:
         number = os.dup(0)
     except OSError as exc:

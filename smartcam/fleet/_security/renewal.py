@@ -1,4 +1,4 @@
-"""Renewed certificates: an agent takes them while it runs."""
+"""Use renewed certificates in a running agent."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 LOOK_EVERY = 10.0
-"""Seconds between two looks at the files."""
+"""Seconds between two checks of the files."""
 
 MAX_WAIT = 600.0
-"""Seconds that a moment is waited for in which nobody commands: a renewal is in no hurry."""
+"""Largest number of seconds to wait for a moment without a command, since a renewal can wait."""
 
 LOOK_AGAIN = 0.05
 
@@ -32,15 +32,15 @@ RETRY_AFTER = 1.0
 
 
 class CertificateWatch:
-    """Has an agent's end of the bus opened again when its certificates are others.
+    """Opens an agent's end of the bus again when its certificates have changed.
 
-    Those that only connect need nothing: the engine reads the files at each connection. Who listens
-    has read them when it began to.
+    Ends that only connect need nothing: the engine reads the files at each connection. An end that
+    listens reads them only at its start.
 
     Args:
         end: the agent's end of the bus, open.
         listens: whether the end listens.
-        busy: whether there is something that should not be cut off.
+        busy: function that returns whether a command runs.
         away: context around a new session: on entry all that cannot stay is closed.
     """
 
@@ -56,7 +56,7 @@ class CertificateWatch:
         self._trouble = ""
 
     async def run(self) -> None:
-        """Look at the files now and then, forever."""
+        """Check the files periodically, forever."""
         seen = self._end.identity
         while True:
             await asyncio.sleep(LOOK_EVERY)
@@ -66,7 +66,7 @@ class CertificateWatch:
                 logger.exception("certificates ! looking at them failed; it is tried again")
 
     async def _follow(self, seen: Identity | None) -> Identity | None:
-        """Take the certificates that are there now; return whose they are."""
+        """Use the current certificates; return their identity."""
         found = await self._look()
         if found is not None and seen is not None and found.digest != seen.digest:
             if self._listens:
@@ -75,7 +75,7 @@ class CertificateWatch:
         return found or seen
 
     async def _look(self) -> Identity | None:
-        """Return the identity in the certificates; None, logged once, where they cannot work."""
+        """Return the identity in the certificates; None, logged once, if they are not valid."""
         try:
             found = await self._end.look_at_certificates()
         except SmartCamError as exc:

@@ -1,4 +1,4 @@
-"""The last results of all cameras, which clients may ask for."""
+"""The last results of all cameras, which clients may request."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_BOOK_CHARACTERS = 1 << 28
 """Largest number of characters of the values that the results of a server keep, as JSON."""
 
 MAX_HANDLES = 10_000
-"""Handles that clients have not released; beyond it the oldest are forgotten."""
+"""Largest number of handles that clients have not released; beyond it the oldest are removed."""
 
 
 class KeptResult(NamedTuple):
@@ -22,9 +22,9 @@ class KeptResult(NamedTuple):
 
     Attributes:
         result: the result.
-        value: the nodeset's structure of it.
+        value: result as the nodeset's structure.
         recipe: name of its recipe.
-        text: values of the result as JSON; "" without.
+        text: values of the result as JSON; "" without values.
     """
 
     result: VisionResult
@@ -37,7 +37,7 @@ class ResultBook:
     """The last results, by their ids, and the handles that clients have on them.
 
     Args:
-        most: results at most; beyond it the oldest go.
+        most: largest number of results; beyond it the oldest are removed.
     """
 
     def __init__(self, most: int) -> None:
@@ -47,7 +47,7 @@ class ResultBook:
         self._last_handle = 0
 
     def add(self, kept: KeptResult) -> None:
-        """Keep a result; one that came before, with the same id, is replaced."""
+        """Add a result; an earlier one with the same id is replaced."""
         before = self._kept.pop(kept.result.id, None)
         self._characters += len(kept.text) - (0 if before is None else len(before.text))
         self._kept[kept.result.id] = kept
@@ -58,7 +58,7 @@ class ResultBook:
             self._characters -= len(gone.text)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
-        """Return a camera's result by its id; None if it is not there, or not any more."""
+        """Return a camera's result by its id; None if it is unknown, or no longer kept."""
         found = self._kept.get(key)
         return found if found is not None and found.result.camera == camera else None
 
@@ -79,7 +79,7 @@ class ResultBook:
         return self._last_handle
 
     def release(self, handle: int) -> bool:
-        """Forget a handle; return False if there was none."""
+        """Remove a handle; return False if there was none."""
         if handle not in self._handles:
             return False
         del self._handles[handle]

@@ -1,4 +1,4 @@
-"""Events of the nodeset, with each field of its right type."""
+"""Events of the nodeset, each field with its own type."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ class Events:
             kind: name of its type.
             source: node of the camera.
             name: name of the camera.
-            message: text for people.
-            fields: other fields of the event; those that are not given stay null.
+            message: text of the event.
+            fields: other fields of the event; missing ones stay null.
 
         Raises:
-            KeyError: its type has no such field.
+            KeyError: the event's type has no such field.
         """
         template = await self._template(kind)
         event = copy.copy(template)

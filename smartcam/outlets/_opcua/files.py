@@ -23,7 +23,7 @@ MAX_READ_BYTES = 1 << 20
 """Largest number of bytes of one answer to ``Read``."""
 
 FILE_SECONDS = 60.0
-"""Seconds after a client's last call after which its file is gone."""
+"""Seconds from a client's last call until its file is closed."""
 
 _TRANSFER = "ResultManagement.ResultTransfer"
 
@@ -164,7 +164,7 @@ class TransferFiles:
         await self._server.delete_nodes([node], recursive=True)
 
     def close(self) -> None:
-        """Forget all files."""
+        """Close all files."""
         for number in [*self._files]:
             self._forget(number)
 
@@ -190,7 +190,7 @@ def _read(path: Any) -> bytes:
     """Return the bytes of a picture.
 
     Raises:
-        OSError: the file does not exist any more, or too large.
+        OSError: the file no longer exists, or is too large.
     """
     with path.open("rb") as stream:
         data: bytes = stream.read(MAX_FILE_BYTES + 1)

@@ -1,4 +1,4 @@
-"""Jobs, what came of them, and the numbers by which methods tell errors."""
+"""Jobs, their results, and the error numbers of methods."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMPLETED, ABORTED, FAILED = 1, 3, 4
 
 
 class UnknownRecipeError(ConfigurationError):
-    """A client named a recipe that there is not."""
+    """A client named an unknown recipe."""
 
 
 class BusyError(SmartCamError):
@@ -51,11 +51,11 @@ ERRORS: tuple[tuple[type[BaseException], int], ...] = (
 """Numbers of errors in a method's argument ``Error``; the first class that fits decides."""
 
 NOT_FOUND = -7
-"""Number of the error for a result, handle or picture that is not there, or not any more."""
+"""Number of the error for a result, handle or picture that is unknown or no longer kept."""
 
 
 def code_of(error: BaseException) -> int:
-    """Return the number by which a method tells an error; -1 for one without its own."""
+    """Return the number of an error in a method's outputs; -1 for one without its own."""
     return next((code for kind, code in ERRORS if isinstance(error, kind)), -1)
 
 
@@ -66,15 +66,15 @@ class VisionJob:
     Attributes:
         id: id of the job.
         single: True for one trigger, False for continuous execution.
-        meas: id of the measurement, as the client gave it; None without.
-        part: id of the part, the same way.
-        product: id of the product, the same way.
+        meas: id of the measurement, as the client gave it; None without one.
+        part: id of the part, as the client gave it; None without one.
+        product: id of the product, as the client gave it; None without one.
         application: application that was ready when the job began.
         started: time of its start, UTC.
-        trigger: time of its trigger as the camera's client told it, which names its result.
+        trigger: time of its trigger, from the camera's client, by which its result is found.
         seen: event that is set when its result is published.
         ended_clock: clock of the event loop at its end; None while it is under way.
-        task: task that does it.
+        task: task that carries out the job.
     """
 
     id: str
@@ -92,18 +92,18 @@ class VisionJob:
 
 @dataclass(slots=True, frozen=True, eq=False)
 class VisionResult:
-    """A result as clients get it, or how a job ended that has none.
+    """A result as clients get it, or the end of a job without one.
 
     Attributes:
         id: id of the result.
         camera: name of the camera.
         state: number of its state, as the nodeset numbers them.
         application: application that made it; None if that is not known.
-        job: job that it is of; None for a result that no job has asked for.
+        job: job that the result belongs to; None for a result without a job.
         created: time at which it came, UTC.
         said: fields of its JSON object.
         error: text that says why there are no values; "" if there are.
-        picture: file of its picture; None without.
+        picture: file of its picture; None without one.
         simulated: True for an emulated camera, False for a real one, None if that is not known.
     """
 

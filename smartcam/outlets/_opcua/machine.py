@@ -1,4 +1,4 @@
-"""The states of a vision system; nothing moves but along a transition of the nodeset."""
+"""The states of a vision system, which change only by transitions of the nodeset."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class VisionStates:
 
         Args:
             target: name of the state.
-            cause: name of the method that causes it; "" if it moves by itself.
+            cause: name of the method that causes the transition; "" without a method.
 
         Raises:
             WrongStateError: there is no such transition.
@@ -52,14 +52,14 @@ class VisionStates:
         return found
 
     def _find(self, target: str, cause: str) -> Transition | None:
-        """Return the transition from here; of two with the same ends the one in its own machine."""
+        """Return the transition from the present state; of two the one within its machine."""
         here = {VISION: self.vision, AUTOMATIC: self.automatic}
         own = {(one.machine, one.source) for one in transitions()}
         for one in transitions():
             if here[one.machine] != one.source or one.cause != cause:
                 continue
             if (one.machine, one.target) not in own:
-                continue  # Preoperational to Initialized, into the other machine: by way of its own
+                continue  # Preoperational to Initialized crosses machines: it has another way
             if target in ("", one.target):
                 return one
         return None

@@ -1,4 +1,4 @@
-"""The methods of a camera: their arguments are checked, and each call ends."""
+"""The methods of a camera, with checked arguments and a timeout."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ MAX_TEXT_CHARACTERS = 1000
 """Largest number of characters of an id or a text that a client gives."""
 
 MAX_LISTED = 100
-"""Largest number of results or recipes of one answer; a client asks for the rest by
+"""Largest number of results or recipes of one answer; a client requests the rest by
 ``StartIndex``."""
 
 CALL_SECONDS = 700.0
-"""Seconds within which every call ends: beyond all that its camera may take."""
+"""Seconds within which every call ends: longer than the camera's own timeouts."""
 
 _NUMBERS = {1: bool, 6: int, 7: int}
-"""Types of Python for the types of OPC UA, by their numbers."""
+"""Python types of the types of OPC UA, by their numbers."""
 
 _DERIVED = {"Handle": 7, "ResultStateDataType": 6, "TriStateBooleanDataType": 6}
 """Numbers of the types that the nodeset derives from plain ones."""
@@ -51,8 +51,9 @@ class Method(NamedTuple):
     """A method that a client may call.
 
     Attributes:
-        do: does it with plain arguments, and returns its outputs but the error.
-        empty: these outputs where it failed.
+        do: function that carries out the method with plain arguments, and returns its outputs
+            without the error.
+        empty: outputs of a call that failed, without the error.
     """
 
     do: Callable[..., Awaitable[list[ua.Variant]]]
@@ -67,7 +68,7 @@ class Methods:
         nodes: nodes of the camera.
         values: values of the server.
         book: results that clients may ask for.
-        settled: function that returns when what was put before is published.
+        settled: function that returns when earlier events and values are published.
     """
 
     def __init__(
@@ -125,11 +126,11 @@ class Methods:
     async def call(
         self, method: Method, types: Sequence[int], arguments: Sequence[ua.Variant]
     ) -> ua.CallMethodResult | ua.StatusCode | list[ua.Variant]:
-        """Do a method, and return its outputs, with the error's number last.
+        """Carry out a method, and return its outputs, with the error's number last.
 
         Args:
             method: the method.
-            types: numbers of its arguments' types; 0 for those that are ids or lists.
+            types: numbers of its arguments' types; 0 for ids and lists.
             arguments: the client's arguments.
         """
         if len(arguments) != len(types):
@@ -199,7 +200,7 @@ class Methods:
         return start
 
     def _given(self, kind: str, value: Any) -> Any:
-        """Return an id that a client gave, which comes back with the result; None without."""
+        """Return the client's id, which the result will carry; None without one."""
         text, told = _text(value), getattr(value, "Description", None)
         if not text and told is None:
             return None
@@ -209,17 +210,17 @@ class Methods:
         return found
 
     async def _start_plain(self, meas: str, part: str, recipe: str) -> list[ua.Variant]:
-        """Start a single job for a client that knows no structures."""
+        """Start a single job for a client that does not support structures."""
         (job,) = await self._starts(single=True)(meas, part, recipe, None, None)
         return [ua.Variant(job.Value.Id, ua.VariantType.String)]
 
     async def _prepare_plain(self, recipe: str) -> list[ua.Variant]:
-        """Prepare a recipe for a client that knows no structures."""
+        """Prepare a recipe for a client that does not support structures."""
         _, completed = await self._prepare(recipe, None)
         return [completed]
 
     async def _result_plain(self, job: str) -> list[ua.Variant]:
-        """Return state, values and error of a job's result to a client that knows no structures."""
+        """Return state, values and error of a job's result as plain values."""
         found = next(
             self._book.newest(self._nodes.name, lambda one: one.result.job_id == job), None
         )
@@ -246,7 +247,7 @@ class Methods:
     async def _recipes(
         self, external: Any, product: Any, prepared: int, most: int, first: int, timeout: int
     ) -> list[ua.Variant]:
-        del timeout  # the list is complete in itself
+        del timeout  # the answer has the whole list
         ready, name = self._system.prepared, _text(external)
         known = dict.fromkeys(self._system.recipes.values())
         if self._system.application:
@@ -344,7 +345,7 @@ _COMPONENTS = (
 
 
 def kind_of(data_type: ua.NodeId, rank: int) -> int:
-    """Return the number of an argument's type; 0 for ids, lists and all that is no plain value."""
+    """Return the number of an argument's type; 0 for ids, lists and other structures."""
     if rank >= 0:
         return 0
     if data_type.NamespaceIndex == 0:
@@ -370,15 +371,15 @@ def _argument(given: ua.Variant, kind: int) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Return the text of an id: of a structure, a plain text, a number, or nothing.
+    """Return the text of an id, which is a structure, a plain text, a number, or None.
 
     Raises:
-        MethodArgumentError: the id is nothing of these, or too long.
+        MethodArgumentError: the id is of another type, or too long.
     """
     if isinstance(value, int) and not isinstance(value, bool):
-        return str(value)  # of a recipe; no id would be any recipe
+        return str(value)  # a recipe's number; "" would mean any recipe
     text = value if isinstance(value, str) else getattr(value, "Id", None)
-    while text is not None and not isinstance(text, str):  # an id of an id
+    while text is not None and not isinstance(text, str):  # an id within an id
         text = getattr(text, "Id", None)
     empty = value is None or (isinstance(value, ua.ExtensionObject) and not value.Body)
     if text is None and not empty and not hasattr(value, "Id"):
@@ -390,7 +391,7 @@ def _text(value: Any) -> str:
 
 
 def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> ua.CallMethodResult:
-    """Return the answer to a call whose arguments are of wrong types: which ones."""
+    """Return the answer to a call with wrong types of arguments, with a status for each."""
     result = ua.CallMethodResult()
     result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
     for one, of in zip(arguments, types, strict=True):

@@ -1,4 +1,4 @@
-"""The nodes of a camera: what clients browse, read and hear events of."""
+"""The nodes of a camera, which clients browse, read and get events from."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _PLAIN: Mapping[str, tuple[ua.VariantType, Any]] = {
     "Value": (ua.VariantType.String, ""),
     "Count": (ua.VariantType.UInt32, 0),
 }
-"""Plain variables of a camera, with what they are at first; ``Count`` changes last of all."""
+"""Plain variables of a camera, with their first values; ``Count`` changes last."""
 
 
 _TEXT = ua.VariantType.String
@@ -70,17 +70,17 @@ _PLAIN_METHODS: Mapping[str, tuple[Sequence[tuple[str, ua.VariantType]], ...]] =
         (("ResultState", ua.VariantType.Int32), ("Value", _TEXT), ("ErrorText", _TEXT)),
     ),
 }
-"""Methods for clients that know no structures: arguments and outputs, without the error."""
+"""Methods for clients without structures: arguments and outputs, without the error."""
 
 
 class CameraNodes:
-    """The nodes of one camera; its calls return at once, and what they say is published in order.
+    """The nodes of one camera; calls return at once, and changes are published in order.
 
     Args:
         server: server of asyncua, with the nodeset.
-        spaces: indexes of the nodeset's namespace and of that of cameras.
+        spaces: indexes of the namespaces of the nodeset and of cameras.
         name: name of the camera.
-        parts: events, values and the queue of what is published.
+        parts: events, values and the queue for publishing.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class CameraNodes:
         self._columns: dict[str, tuple[Column, ...]] = {}
 
     def id(self, path: str) -> ua.NodeId:
-        """Return the id of the node below the camera's that a path of names leads to."""
+        """Return the id of a node by its path of names below the camera's node."""
         return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own)
 
     async def make(self, states: VisionStates) -> None:
@@ -148,7 +148,7 @@ class CameraNodes:
         )
 
     async def _copy_method(self, path: str, kind: str, method: str) -> None:
-        """Add an optional method to an instance: its type has a node to copy from."""
+        """Add an optional method to an instance, as a copy of its type's node."""
         of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         pattern = await of.get_child(f"{self._vision}:{method}")
         found: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
@@ -176,7 +176,7 @@ class CameraNodes:
             message = f"{transition.name}{': ' * bool(why)}{why}"
             kinds = [*transition.effects]
             if transition.target == "Error" and "ErrorEventType" not in kinds:
-                kinds.append("ErrorEventType")  # as the text of OPC 40100-1 has it
+                kinds.append("ErrorEventType")  # according to the text of OPC 40100-1
             for kind in kinds:
                 changes = kind in _CHANGES
                 told = fields if changes else self._job_fields(kind, job, prepared)
@@ -203,7 +203,7 @@ class CameraNodes:
             result: the result.
             recipe: name of its recipe.
             columns: names, types and units of its values.
-            keep: function that is called with what is to be kept of it, before the event.
+            keep: function that stores the result for later requests; called before the event.
         """
 
         async def publish() -> None:
@@ -297,7 +297,7 @@ class CameraNodes:
     def _job_fields(
         self, kind: str, job: VisionJob | None, prepared: tuple[str, int]
     ) -> dict[str, Any]:
-        """Return the fields of an event beside a change of state: of a job, or of a recipe."""
+        """Return the fields of an event about a job or a recipe."""
         identity = self._values.identity
         if kind != "RecipePreparedEventType":
             return {"JobId": identity("JobIdDataType", "" if job is None else job.id)}
@@ -337,7 +337,7 @@ class CameraNodes:
     async def _show_columns(
         self, folder: str, columns: Sequence[Column], record: Mapping[str, Any]
     ) -> None:
-        """Write the values of the first record; those that are not there get a bad status."""
+        """Write the values of the first record; missing ones get a bad status."""
         if self._columns.get(folder) != tuple(columns):
             await self._make_columns(folder, columns)
         for name, kind, _ in columns:
@@ -350,7 +350,7 @@ class CameraNodes:
                 await self._write(path, value)
 
     async def _make_columns(self, folder: str, columns: Sequence[Column]) -> None:
-        """Make a variable for each value; those of a layout before are replaced."""
+        """Make a variable for each value, in place of those of an earlier layout."""
         node = self._node(f"Plain.{folder}")
         if folder in self._columns:
             await self._server.delete_nodes([node], recursive=True)

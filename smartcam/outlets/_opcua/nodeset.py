@@ -32,7 +32,7 @@ class Transition(NamedTuple):
         node: numeric id of its node.
         source: name of the state before it.
         target: name of the state after it.
-        cause: name of the method that causes it; "" for one by itself.
+        cause: name of the method that causes the transition; "" without a method.
         effects: names of the types of the events that it raises.
     """
 
@@ -82,7 +82,7 @@ def state_ids() -> Mapping[tuple[str, str], int]:
 
 @functools.cache
 def transitions() -> tuple[Transition, ...]:
-    """Return the transitions of both machines that the XML says."""
+    """Return the transitions of both machines, from the XML."""
     found: list[Transition] = []
     for key, node in _nodes().items():
         ends = [name for name, _ in _ends(node)]

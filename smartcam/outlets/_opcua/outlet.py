@@ -1,4 +1,4 @@
-"""The outlet: a server of OPC UA in a thread of its own, and what it is given."""
+"""The outlet: a server of OPC UA in a thread of its own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_STATES = 1_000
 class OpcUaOutlet(Outlet[OpcUaSettings]):
     """Serves cameras as vision systems; each result is delivered when the server has it.
 
-    The server has a thread, so that neither its nodeset nor its clients hold up the cameras.
+    The server has a thread, so that neither its nodeset nor its clients block the cameras.
     """
 
     settings_class = OpcUaSettings
@@ -44,8 +44,8 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
 
         Raises:
             MissingExtraError: asyncua is not installed.
-            ConfigurationError: a secret, a certificate or a key is not there.
-            OSError: the port is taken.
+            ConfigurationError: a secret, a certificate or a key does not exist.
+            OSError: the port is in use.
         """
         load("asyncua")
         from smartcam.outlets._opcua.server import VisionServer
@@ -60,13 +60,13 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
             self._tell(server, camera, state)
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Have entries published."""
+        """Publish entries in the server's thread."""
         if self._server is None:
             raise OutletError("the server does not listen")
         await self._there(self._server.publish(entries))
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Have the camera's state published soon."""
+        """Schedule the camera's state to be published."""
         if camera in self._states or len(self._states) < MAX_STATES:
             self._states[camera] = state
             if self._open and self._server is not None:
@@ -94,7 +94,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         await asyncio.wrap_future(self._thread.submit(work))
 
     async def _command(self, camera: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a command in the cameras' thread; called in the server's."""
+        """Carry out a command in the cameras' thread; called in the server's thread."""
         if self.desk.command is None or self._loop is None:
             raise ConfigurationError("commands are not allowed here")
         work: Any = self.desk.command(camera, verb, given)

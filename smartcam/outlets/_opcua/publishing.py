@@ -1,4 +1,4 @@
-"""Things that are published, in order, by one task."""
+"""A queue of values and events that one task publishes in order."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_FAILURES = 100
-"""Failures to publish in a row behind which the server is opened again."""
+"""Consecutive failures to publish after which the server is opened again."""
 
 
 class PublishQueue:
-    """A queue of calls that publish something; nothing that is cancelled leaves one half done.
+    """A queue of calls that publish something; a cancelled user does not interrupt a call.
 
-    It is bounded by its users: methods and batches wait in :meth:`settled` for what they have put.
+    Its users bound it: methods and batches wait in :meth:`settled` for their own calls.
     """
 
     def __init__(self) -> None:
@@ -29,22 +29,22 @@ class PublishQueue:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start the task that publishes."""
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     async def stop(self) -> None:
-        """End; what is not published yet is dropped."""
+        """End the task, and drop calls that have not run yet."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait({self._task})
 
     def put(self, call: Callable[[], Awaitable[None]]) -> None:
-        """Have a call done behind all before it."""
+        """Append a call to the queue."""
         self._calls.append(call)
         self._wake.set()
 
     async def settled(self) -> None:
-        """Return when all calls that were put before are done."""
+        """Return when all earlier calls are done."""
         done = asyncio.Event()
 
         async def tell() -> None:
@@ -61,7 +61,7 @@ class PublishQueue:
                 await waiting
 
     async def failed(self) -> None:
-        """Wait until nothing can be published any more, and raise the reason."""
+        """Wait until publishing has failed for good, and raise the reason."""
         if self._task is not None:
             await asyncio.shield(self._task)
 

@@ -1,4 +1,4 @@
-"""Access to the server: users, certificates, and what anonymous clients may do."""
+"""Access to the server: users, certificates, and rights of anonymous clients."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.settings import OpcUaSettings
 
 CERTIFICATE_DAYS = 3650
-"""Days for which a certificate is good that the server makes for itself."""
+"""Days for which the server's own certificate is valid."""
 
 MAX_FAILED_LOGINS = 10
-"""Failed logins from one address in LOGIN_SECONDS, behind which none from there is looked at."""
+"""Failed logins from one address within LOGIN_SECONDS after which further ones are refused."""
 
 LOGIN_SECONDS = 60.0
 """Seconds in which failed logins are counted."""
 
 MAX_ADDRESSES = 1000
-"""Addresses whose failed logins are counted; the one that failed longest ago goes first."""
+"""Largest number of addresses whose failed logins are counted; the oldest is dropped first."""
 
 _SHA1 = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
 
@@ -72,14 +72,14 @@ _READING = (
 
 
 class Users:
-    """The users of a server, as asyncua asks for them.
+    """The users of a server, with asyncua's interface.
 
     Args:
         settings: settings of the server.
         folder: folder of relative paths.
 
     Raises:
-        ConfigurationError: a password is not where it is said to be.
+        ConfigurationError: a password is not at the place that the settings name.
     """
 
     def __init__(self, settings: OpcUaSettings, folder: Path) -> None:
@@ -102,7 +102,7 @@ class Users:
         password: str | None = None,
         certificate: Any = None,
     ) -> User | None:
-        """Return a user with rights, or None for one who may not come in."""
+        """Return a user with rights, or None if access is refused."""
         del iserver
         if isinstance(certificate, ProvenCertificate):
             made = x509.load_der_x509_certificate(certificate)
@@ -120,11 +120,11 @@ class Users:
 
 
 class ProvenCertificate(bytes):
-    """The certificate of a user who has shown to have its key, not only that of the channel."""
+    """The certificate of a user who has proved to have its key, not only the channel's."""
 
 
 class FailedLogins:
-    """Counts failed logins by their address, so that nobody tries passwords without end.
+    """Counts failed logins by address, against guessing of passwords.
 
     Args:
         clock: seconds from any origin.
@@ -136,10 +136,10 @@ class FailedLogins:
 
     @contextlib.contextmanager
     def attempt(self, address: str) -> Iterator[None]:
-        """Let somebody try to log in; an exception counts as a failure.
+        """Run an attempt to log in; an exception counts as a failure.
 
         Raises:
-            ServiceError: too many have failed from there; the login is not looked at.
+            ServiceError: too many logins from this address have failed.
         """
         now = self._clock()
         failed = [one for one in self._failed.get(address, ()) if now - one < LOGIN_SECONDS]
@@ -156,7 +156,7 @@ class FailedLogins:
 
 
 class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are not followed
-    """The inside of a server, with a bound on failed logins.
+    """asyncua's internal server, with a bound on failed logins.
 
     Args:
         users: the users.
@@ -186,7 +186,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
 
 
 def _address(isession: Any) -> str:
-    """Return the address that a session comes from, without its port."""
+    """Return the address of a session's client, without its port."""
     name = isession.name
     return str(name[0] if isinstance(name, tuple) else name)
 
@@ -231,10 +231,10 @@ def policies(settings: OpcUaSettings) -> list[ua.SecurityPolicyType]:
 
 
 async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) -> None:
-    """Give a server its certificate, its policies and its rule of whom it trusts.
+    """Configure a server's certificate, its policies and its trusted clients.
 
     Raises:
-        ConfigurationError: a certificate or a key is not there, or is of no use.
+        ConfigurationError: a certificate or a key does not exist, or cannot be used.
     """
     try:
         if settings.certificate is None or settings.key is None:
@@ -266,7 +266,7 @@ def _application_uri(certificate: x509.Certificate) -> str:
 
 
 def _make(certificate: Path, key: Path, uri: str) -> None:
-    """Make a certificate that signs itself, and its key, which nobody else may read."""
+    """Make a self-signed certificate, and its key, which only this user may read."""
     made = cert_gen.generate_private_key()
     host = socket.gethostname()
     signed = cert_gen.generate_self_signed_app_certificate(

@@ -1,4 +1,4 @@
-"""The server: cameras as vision systems, what they bring, and what clients ask."""
+"""The server: cameras as vision systems, their results, and the calls of clients."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class VisionServer:
         name: name of the outlet.
         settings: settings of the server.
         folder: folder of relative paths.
-        desk: what it may ask of the process that has the cameras.
+        desk: functions of the process that has the cameras.
     """
 
     def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
@@ -77,8 +77,8 @@ class VisionServer:
         """Listen.
 
         Raises:
-            ConfigurationError: a secret, a certificate or a key is not there.
-            OSError: the port is taken.
+            ConfigurationError: a secret, a certificate or a key does not exist.
+            OSError: the port is in use.
         """
         users = Users(self.settings, self.folder)
         self.server = server = Server(iserver=GuardedServer(users))
@@ -131,11 +131,11 @@ class VisionServer:
                 stack.push_async_callback(camera.system.close)
 
     async def failed(self) -> None:
-        """Wait until nothing can be published any more, and raise the reason."""
+        """Wait until publishing has failed for good, and raise the reason."""
         await self.outbox.failed()
 
     def new_job(self) -> str:
-        """Return an id for a job, unlike all before, also those of earlier runs."""
+        """Return a new id for a job, different from all earlier ones, also of earlier runs."""
         return f"{self._run_id}-{next(self._jobs)}"
 
     # ------------------------------------------------------------------ what cameras bring
@@ -163,7 +163,7 @@ class VisionServer:
             if entry.camera and entry.camera not in self.cameras:
                 await self._make(entry.camera)
             faces = [self.cameras[entry.camera]] if entry.camera else [*self.cameras.values()]
-            for face in faces:  # a gap may be one of all cameras
+            for face in faces:  # a gap may concern all cameras
                 face.system.take(entry)
         await self.outbox.settled()
 
@@ -188,7 +188,7 @@ class CameraFace:
     """One camera: its states and jobs, and the nodes that show them.
 
     Args:
-        server: server that has it.
+        server: server of the camera.
         name: name of the camera.
     """
 
@@ -259,7 +259,7 @@ class CameraFace:
         self.nodes.result(result, recipe, self._columns(result), self._server.book.add)
 
     def _columns(self, result: VisionResult) -> Sequence[Column]:
-        """Return the columns of a result's layout; none where it cannot be read."""
+        """Return the columns of a result's layout; none if it cannot be determined."""
         if result.application is None:
             return ()
         try:

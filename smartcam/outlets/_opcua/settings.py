@@ -32,7 +32,7 @@ class OpcUaSettings(OutletSettings):
     """The settings of a server of OPC UA."""
 
     timeout: float = Field(
-        120.0, gt=0, le=3600, description="seconds within which the server listens"
+        120.0, gt=0, le=3600, description="seconds of the timeout for the server's start"
     )
     listen: Annotated[str, AfterValidator(_endpoint)] = Field(
         description="opc.tcp://HOST:PORT; 0.0.0.0 for all of this computer's addresses"
@@ -40,53 +40,51 @@ class OpcUaSettings(OutletSettings):
     users: dict[str, Secret] = Field(
         {},
         max_length=MAX_USERS,
-        description="who may log in, and where the password is: {plc: {file: PATH}}",
+        description="users and the sources of their passwords: {plc: {file: PATH}}",
     )
     user_certificates: dict[str, Annotated[str, Field(min_length=1)]] = Field(
         {},
         max_length=MAX_USERS,
-        description="who may log in with a certificate of their own, and its file: {plc: plc.der}",
+        description="users and the files of their certificates: {plc: plc.der}",
     )
     anonymous: Literal["no", "read", "control"] = Field(
         "no",
-        description="what everybody may do who can reach the server: read sees values and events, "
-        "control calls methods, too",
+        description="rights without login: read, to see values and events; or control, to call "
+        "methods, too",
     )
     unencrypted: bool = Field(
-        False, description="also without encryption, which passwords are then sent without, too"
+        False, description="also accept unencrypted sessions, in which passwords are readable"
     )
     certificate: str | None = Field(
         None,
         min_length=1,
-        description="file of the server's own; made beside the spool if not said",
+        description="file of the server's certificate; default: one made beside the spool",
     )
     key: str | None = Field(
         None, min_length=1, description="file of the certificate's private key, in PEM"
     )
     clients: str | None = Field(
-        None, min_length=1, description="folder of certificates; no other clients come in encrypted"
+        None, min_length=1, description="folder of the certificates of all clients with encryption"
     )
     recipes: dict[str, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(
         {}, max_length=MAX_RECIPES, description="names for applications: {housing: 7}"
     )
     automatic: bool = Field(
         True,
-        description="become ready without a client: when the camera is there, and again when it "
-        "is back",
+        description="become ready without a client when the camera is connected, and after each "
+        "reconnect",
     )
-    trigger_timeout: float = Field(
-        5.0, gt=0, le=300, description="seconds within which a job has its result"
-    )
+    trigger_timeout: float = Field(5.0, gt=0, le=300, description="seconds of a job's timeout")
     switch_timeout: float = Field(
-        10.0, gt=0, le=300, description="seconds within which another application is ready"
+        10.0, gt=0, le=300, description="seconds of the timeout for preparing an application"
     )
     kept_results: int = Field(
-        1000, ge=1, le=100_000, description="results of all cameras that clients may ask for"
+        1000, ge=1, le=100_000, description="number of kept results of all cameras, for clients"
     )
     pictures: str | None = Field(
         None,
         min_length=1,
-        description="place of a result's picture, beside this file, with {camera}, {application}, "
+        description="path of a result's picture, beside this file, with {camera}, {application}, "
         "{number} and {sequence} in it; clients get it by ResultTransfer",
     )
 

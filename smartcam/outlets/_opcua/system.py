@@ -1,4 +1,4 @@
-"""A camera as a vision system: what methods, results and the camera's state do to its states."""
+"""A camera as a vision system, whose states follow methods, results and the camera's state."""
 
 from __future__ import annotations
 
@@ -34,26 +34,25 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_REMEMBERED_JOBS = 1000
-"""Largest number of jobs whose results are still known as theirs when they come late from the
-spool."""
+"""Largest number of ended jobs that are remembered for results that come late from the spool."""
 
 MAX_PENDING = 1000
-"""Largest number of results that wait until it is known whether they are of the job under way."""
+"""Largest number of results that wait until it is known whether they belong to the running job."""
 
 RESULT_WAIT = 5.0
-"""Seconds between the end of a trigger and its result from the spool."""
+"""Seconds to wait after a trigger for its result from the spool."""
 
 COMMAND_GRACE = 30.0
 """Seconds that a command may have beyond its own timeout, to reach the camera."""
 
 PREPARE_WAIT = 0.3
-"""Seconds that PrepareRecipe waits before it tells that it is not completed yet."""
+"""Seconds that PrepareRecipe waits before it returns that it is not completed yet."""
 
 CONTINUOUS_GRACE = 5.0
-"""Seconds behind continuous execution in which its last results may come from the spool."""
+"""Seconds after continuous execution in which its last results may come from the spool."""
 
 OWED_SECONDS = 60.0
-"""Seconds in which a result may still come of a job that was given up."""
+"""Seconds in which a job that was given up may still have a result."""
 
 
 class Face(Protocol):
@@ -81,7 +80,7 @@ class VisionSystem:
     Args:
         name: name of the camera.
         settings: settings of the server.
-        command: does a command by the camera's name, a verb and its fields.
+        command: function that carries out a command, by the camera's name, a verb and its fields.
         face: the side that clients see.
         picture: function that returns the file of a result's picture.
         new_job: function that returns an id for a job.
@@ -108,21 +107,21 @@ class VisionSystem:
         self._command, self._picture, self._new_job = command, picture, new_job
         self._names = names
         self._simulated = simulated
-        # whether the camera is connected; None if not known yet
+        # whether the camera is connected; None if it is not known yet
         self._connected: bool | None = None
         self._by_client = False  # clients prepare recipes: no other becomes ready by itself
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
         self._preparing = False
-        self._stopped = False  # by this server: the camera has to run before the next trigger
-        self._owed_until = -1.0  # until then a result may be one of a job that was given up
+        self._stopped = False  # this server stopped the camera: start it before the next trigger
+        self._owed_until = -1.0  # until then a result may belong to a job that was given up
         self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
         self._last_continuous: VisionJob | None = None
         self._pending: collections.deque[OutletEntry] = collections.deque()
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
-        """End the job under way, and everything that is done for it."""
+        """End the job under way, and its tasks."""
         self._end_job(ABORTED, "the server ends")
         for task in self._tasks:
             task.cancel()
@@ -132,7 +131,7 @@ class VisionSystem:
     # ------------------------------------------------------------------ the camera's state
 
     def camera_changed(self, state: Mapping[str, Any]) -> None:
-        """Follow the camera: whether it is connected, and which application it has."""
+        """Follow the camera's connection and active application."""
         connected, before = bool(state.get("connected")), self._connected
         self._connected, self.application = connected, state.get("application")
         if connected:
@@ -148,7 +147,7 @@ class VisionSystem:
                 self._move("Error", why=why)
 
     def _follow(self) -> None:
-        """Go where the system goes by itself."""
+        """Make the transitions that need no method."""
         states = self.states
         if not self._connected:
             if self._connected is False and states.vision == "Preoperational":
@@ -185,7 +184,7 @@ class VisionSystem:
         return self._ready_application if ready else None
 
     def change(self, method: str, target: str, why: str = "") -> None:
-        """Do one of the methods that only change the state of the whole system.
+        """Carry out a method that only changes the state of the whole system.
 
         Args:
             method: ``Halt``, ``Reset`` or ``SelectModeAutomatic``.
@@ -207,7 +206,7 @@ class VisionSystem:
 
     @property
     def recipes(self) -> Mapping[str, int]:
-        """Names of applications: those of the settings first, which win, then the camera's own."""
+        """Names of applications: those of the settings, which win, and the camera's own."""
         named = self.settings.recipes
         own = {name: number for name, number in self._names().items() if name not in named}
         return {**named, **own}
@@ -220,7 +219,7 @@ class VisionSystem:
             internal: number as a text; "" if only the name is given.
 
         Raises:
-            UnknownRecipeError: there is no such recipe, or both ids are of different ones.
+            UnknownRecipeError: there is no such recipe, or the two ids name different ones.
         """
         found: set[int] = set()
         recipes = self.recipes
@@ -242,15 +241,15 @@ class VisionSystem:
         return next(names, "" if application is None else str(application))
 
     async def prepare(self, application: int) -> bool:
-        """Begin to have an application ready, and return whether it is, after a moment.
+        """Begin to prepare an application, wait a moment, and return True if it is ready.
 
-        A camera may take seconds, and a client's other requests wait while this one does.
+        A camera may take seconds, and a client's other requests wait during this one.
 
         Raises:
             WrongStateError: the method is not allowed in this state, or the state changed
                 meanwhile.
             BusyError: another recipe is being prepared.
-            SmartCamError: the camera did not do it.
+            SmartCamError: the camera failed or refused.
         """
         if self._preparing:
             raise BusyError("another recipe is being prepared")
@@ -270,14 +269,14 @@ class VisionSystem:
         return True
 
     def _prepared_later(self, application: int, done: asyncio.Future[None]) -> None:
-        """Tell clients that a recipe was not prepared, whose caller was told that it will be."""
+        """Report the failure of a recipe whose caller got no error any more."""
         error = None if done.cancelled() else done.exception()
         if error is not None:
             text = f"recipe {application} is not prepared: {str(error) or type(error).__name__}"
             self.face.message(text, type(error).__name__, None)
 
     async def _prepare(self, application: int, told: asyncio.Future[None]) -> None:
-        """Have an application ready, and tell how it ended."""
+        """Prepare an application, and set the outcome."""
         try:
             if self.states.automatic == "Ready":
                 self._move("Initialized", why="another recipe is prepared")
@@ -292,7 +291,7 @@ class VisionSystem:
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
             told.set_exception(exc)
-            told.exception()  # a caller may have gone
+            told.exception()  # the caller may no longer wait
         else:
             told.set_result(None)
         finally:
@@ -301,7 +300,7 @@ class VisionSystem:
                 told.cancel()
 
     def unprepare(self) -> None:
-        """Have no recipe ready.
+        """Remove the prepared recipe.
 
         Raises:
             WrongStateError: the method is not allowed in this state.
@@ -371,7 +370,7 @@ class VisionSystem:
             return await self._command(self.name, verb, given)
 
     async def _start(self) -> None:
-        """Have the camera run; one that always runs cannot be told to."""
+        """Start the camera, unless it always runs."""
         with contextlib.suppress(UnsupportedError):
             await self._do("start", timeout=self.settings.switch_timeout)
         self._stopped = False
@@ -422,7 +421,7 @@ class VisionSystem:
     def _end_job(
         self, state: int, why: str, *, kind: str = "Aborted", owed: bool = True
     ) -> VisionJob | None:
-        """End the job under way, if there is one, and publish how it ended."""
+        """End the job under way, if there is one, and publish its end."""
         job, self.job = self.job, None
         if job is None:
             return None
@@ -433,7 +432,7 @@ class VisionSystem:
         if job.single and job.trigger is None and owed:
             self._owed_until = loop.time() + OWED_SECONDS
         if job.trigger is not None:
-            self._by_trigger.pop(job.trigger, None)  # it has its one result: how it ended
+            self._by_trigger.pop(job.trigger, None)  # its end counts as its one result
         if not job.single:
             self._last_continuous = job
             self._stopped = True
@@ -460,7 +459,7 @@ class VisionSystem:
     # ------------------------------------------------------------------ results
 
     def take(self, entry: OutletEntry) -> None:
-        """Publish an entry, or keep it until it is known whether it is of the job under way."""
+        """Publish an entry, or keep it until it is known whether the job under way made it."""
         job = self.job
         if self._pending or (job is not None and job.single and job.trigger is None):
             said = json.loads(entry.body) if entry.body else {}
@@ -502,7 +501,7 @@ class VisionSystem:
             job.seen.set()
 
     def _job_of(self, said: Mapping[str, Any], at: datetime) -> VisionJob | None:
-        """Return the job of a result; None if it is not sure."""
+        """Return the job of a result; None if it is uncertain."""
         trigger = _time(said.get("triggered_at"))
         if trigger is not None:
             found = self._by_trigger.pop(trigger, None)
@@ -513,7 +512,7 @@ class VisionSystem:
         if job is None or job.single or at < job.started or (trigger and trigger < job.started):
             return None
         if clock < self._owed_until:
-            self._owed_until = -1.0  # it may be the one of a job that was given up
+            self._owed_until = -1.0  # it may be the result of a job that was given up
             return None
         if job.ended_clock is not None and clock > job.ended_clock + CONTINUOUS_GRACE:
             return None

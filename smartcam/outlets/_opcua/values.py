@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Largest number of fields of a structure made from a layout; what is beyond stands in the JSON
-alone."""
+"""Largest number of fields of a structure made from a layout; further ones are only in the
+JSON."""
 
 MAX_RECORDS = 1000
-"""Largest number of records of a result that become structures; what is beyond stands in the JSON
-alone."""
+"""Largest number of records of a result that become structures; further ones are only in the
+JSON."""
 
 MAX_STRUCTURES = 2000
 """Structures of one server: one for each layout of a camera's application."""
@@ -54,8 +54,8 @@ _BINARY_IDS = {
     "RecipeIdInternalDataType": 5268,
     "ConfigurationIdDataType": 5090,
 }
-"""Types of ids that add nothing to the abstract one, and the ids of their encodings: asyncua sends
-the abstract type in their place unless they have classes of their own."""
+"""Types of ids without fields of their own, and the ids of their encodings: asyncua would send the
+abstract type in their place if they had no classes."""
 
 
 def type_of(kind: str) -> ua.VariantType:
@@ -64,10 +64,10 @@ def type_of(kind: str) -> ua.VariantType:
 
 
 def plain(value: Any, kind: str) -> Any:
-    """Return a value as its type in OPC UA wants it.
+    """Return a value as its type in OPC UA requires it.
 
     Raises:
-        TypeError: the value is no value of the type.
+        TypeError: the value does not have the type.
     """
     of = type_of(kind)
     if of is ua.VariantType.String and (value is None or isinstance(value, str)):
@@ -93,7 +93,7 @@ class Structure(NamedTuple):
     columns: tuple[Column, ...]
 
     def pack_all(self, records: Sequence[Mapping[str, Any]]) -> list[ua.Variant] | None:
-        """Return records as structures; None if one does not fit, as before a layout changed."""
+        """Return records as structures; None if one has an earlier layout's fields."""
         try:
             packed = [self._pack(record) for record in records]
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):
@@ -145,7 +145,7 @@ class VisionValues:
         Args:
             result: the result.
             recipe: name of its recipe.
-            content: values of the result; None for none.
+            content: values of the result; None without values.
         """
         job = result.job
         application = "" if result.application is None else str(result.application)
@@ -205,9 +205,9 @@ class VisionValues:
     async def _make_structure(
         self, camera: str, application: int, columns: tuple[Column, ...]
     ) -> Structure:
-        """Make the nodes of a structure; their ids say which fields it has.
+        """Make the nodes of a structure, with ids that follow from its fields.
 
-        A client that knows a structure from before never reads another one by it.
+        So a client never decodes a new structure by an earlier one.
         """
         versions = sum(one[:2] == (camera, application) for one in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)

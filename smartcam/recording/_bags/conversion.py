@@ -1,4 +1,4 @@
-"""A bag of a recording: its results as they were, or read again."""
+"""Convert a recording to a bag: its results with the recorded values, or interpreted again."""
 
 from __future__ import annotations
 
@@ -43,30 +43,31 @@ def write_bag(
     calibration: Any = None,
     overwrite: bool = False,
 ) -> BagCounts:
-    """Make a rosbag2 of a recording, in its order and with its times.
+    """Convert a recording to a rosbag2, in its order and with its times.
 
     Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
-    each result's bytes are read again; those that do not fit go in with why, and are counted.
+    each result's bytes are interpreted again; those that do not fit are written with the error, and
+    counted.
 
     Args:
         recording: recording to read.
         path: the bag's folder.
         camera: name of the camera to write; default all cameras.
-        interpret_as: how to read results, as :func:`smartcam.connect` takes it; default what was
-            recorded of it, or localizations where there is a calibration.
+        interpret_as: interpreter of results, as for :func:`smartcam.connect`; default the recorded
+            one, or localizations with a calibration.
         y_down: the camera's y axis points down; default as recorded.
-        calibration: brings localizations into the robot's frame, as :func:`smartcam.connect` has
-            it.
-        overwrite: take the place of a bag that is there.
+        calibration: calibration that transforms localizations into the robot's frame, as for
+            :func:`smartcam.connect`.
+        overwrite: replace an existing bag.
 
     Returns:
-        What is in the bag.
+        Counts of the bag.
 
     Raises:
-        ConfigurationError: there is no such camera, an option that cannot work, or the folder is
-            there already or cannot be created.
-        UnsupportedError: a camera whose results cannot be read again from their bytes.
-        RecordingError: the bag cannot be written to its end; nothing is left of it.
+        ConfigurationError: there is no such camera, an option is wrong, or the folder exists
+            already or cannot be created.
+        UnsupportedError: the results of a camera cannot be interpreted again from their bytes.
+        RecordingError: the bag cannot be written to its end; it is removed.
         MissingExtraError: a library is not installed.
     """
     conversion = BagConversion(
@@ -85,7 +86,7 @@ def write_bag(
 
 @dataclass(eq=False)
 class BagConversion:
-    """Makes a bag of a recording in steps of one item; the fields are :func:`write_bag`'s."""
+    """Converts a recording to a bag in steps of one item; the fields are those of `write_bag`."""
 
     recording: Recording
     folder: Path
@@ -110,11 +111,11 @@ class BagConversion:
 
     @property
     def counts(self) -> BagCounts:
-        """Counts of what is in the bag."""
+        """Counts of the bag so far."""
         return self._items.counts
 
     def steps(self) -> Generator[None, None, None]:
-        """Write the bag, an item a step; when this is closed early, nothing is left of it.
+        """Write the bag, an item a step; if the generator is closed early, remove the bag.
 
         Raises as :func:`write_bag`.
         """
@@ -141,7 +142,7 @@ class BagConversion:
             raise
 
     def _spec(self, camera: RecordedCamera) -> Any:
-        """Return the interpreter, as given or recorded, that reads a camera's results again."""
+        """Return the interpreter of a camera's results, as given or recorded."""
         if self.interpret_as is not None:
             return self.interpret_as
         return camera.interpret_as or "localizations"
@@ -172,7 +173,7 @@ class BagConversion:
             self._readers[item.camera].see_status(item)
 
     def _read(self, result: Result) -> ReadResult:
-        """Return a result as it goes into the bag."""
+        """Return a result as it is written to the bag."""
         if self._readers:
             return self._readers[result.camera].read(result)
         if result.value == result.raw.hex():  # as bytes stand in a recording
@@ -183,19 +184,19 @@ class BagConversion:
 
 @dataclass(eq=False)
 class _ResultReader:
-    """Reads one camera's results again."""
+    """Interprets one camera's results again."""
 
     _interpretation: Interpretation
     _endian: int
 
     def see_status(self, entry: TraceEntry) -> None:
-        """Keep the byte order that a status tells."""
+        """Keep the byte order of a status."""
         endian = (entry.fields or {}).get("endian")
         if isinstance(endian, int):
             self._endian = endian
 
     def read(self, result: Result) -> ReadResult:
-        """Return the result with what its bytes hold, or why that cannot be told."""
+        """Return the result with the value of its bytes, or the error."""
         container = ResultContainer(application=result.application, data=result.raw)
         try:
             value, sequence, _ = self._interpretation(

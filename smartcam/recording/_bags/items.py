@@ -1,4 +1,4 @@
-"""Make a bag's items of each thing that a client saw, or that a recording holds."""
+"""Make a bag's messages from the items that a client received, or of a recording."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ if TYPE_CHECKING:
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
 _CONTAINERS = 64
-"""Containers that are kept until what became of them is told: many came in one burst."""
+"""Largest number of containers that are kept until their results come: many come in one burst."""
 
 UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
-"""Errors that say why a container could not be read."""
+"""Errors of containers that could not be interpreted."""
 
 
 class BagCounts(NamedTuple):
@@ -70,9 +70,9 @@ class BagCounts(NamedTuple):
 
     Attributes:
         messages: all messages.
-        results: results, each on the topic ``results``; those that could not be read, too.
-        unread: results that could not be read; their messages say why.
-        localizations: results that are localizations, which two more topics have.
+        results: results, each on the topic ``results``, also those that could not be interpreted.
+        unread: results that could not be interpreted; their messages have the error.
+        localizations: results that are localizations, which are on two more topics.
         errors: other errors, on ``/diagnostics``.
     """
 
@@ -84,7 +84,7 @@ class BagCounts(NamedTuple):
 
 
 class BagMessage(NamedTuple):
-    """A message for a bag: where, when (nanoseconds since 1970, UTC), and the message or fields."""
+    """A message for a bag: topic, time (nanoseconds since 1970, UTC), and the message or fields."""
 
     topic: Topic
     at: int
@@ -92,9 +92,9 @@ class BagMessage(NamedTuple):
 
 
 class ReadResult(NamedTuple):
-    """A result as it goes into the bag; ``error``: why it could not be read, else "".
+    """A result as it is written to the bag; ``error``: why it could not be interpreted, or "".
 
-    ``again``: it was read anew, so that an earlier error says nothing any more.
+    ``again``: it was interpreted again, so an earlier error does not count.
     """
 
     result: Result
@@ -104,7 +104,7 @@ class ReadResult(NamedTuple):
 
 @dataclass(eq=False)
 class BagItems:
-    """Makes messages of items, in order; knows the state of each camera.
+    """Makes messages of items, in order, and keeps the state of each camera.
 
     Args:
         types: types of the messages.
@@ -120,7 +120,7 @@ class BagItems:
         self._titles: set[str] = set()
 
     def describe(self, facts: Mapping[str, Any]) -> None:
-        """Take facts about a camera, as a recorder is told them."""
+        """Keep facts about a camera, as from ``Recorder.describe``."""
         if {"interpret_as", "pixels"} & facts.keys():
             camera = self._of(facts["camera"])
             camera.facts.update(facts)
@@ -128,7 +128,7 @@ class BagItems:
             camera.specs = Specs(camera.facts.get("interpret_as", ""), pixels=pixels)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
-        """Yield the messages of an item; none of a frame, which ROS has no message for."""
+        """Yield the messages of an item; none for a frame, since ROS has no message for it."""
         for message in self._messages(item):
             self._count(messages=1)
             yield message
@@ -165,7 +165,7 @@ class BagItems:
 
     def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
         at, made = nanoseconds(result.received_at), camera.make
-        if result.application < 0:  # it does not say whose it is
+        if result.application < 0:  # its application is unknown
             result = result._replace(application=0)
         parts = None if error else camera.specs.parts(result)
         frames = {one.pose.header.frame_id for one in parts or ()}
@@ -176,7 +176,7 @@ class BagItems:
         else:
             message = made.result(result, parts)
         yield BagMessage(camera.results, at, message)
-        if len(frames) > 1:  # each of its own; an array has one
+        if len(frames) > 1:  # a PoseArray has only one frame
             text = f"result {result.number}: poses in several frames: {', '.join(sorted(frames))}"
             yield camera.warning(result.received_at, text)
         elif parts is not None:
@@ -201,7 +201,7 @@ class BagItems:
 
 @dataclass(eq=False)
 class _BagCamera:
-    """One camera: its topics, its state as far as it was told, and containers on their way."""
+    """One camera: its topics, its last known state, and containers whose results have not come."""
 
     name: str
     title: str  # name in topics
@@ -221,7 +221,7 @@ class _BagCamera:
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
-        """Keep what an event tells."""
+        """Keep the state that an event reports."""
         match event:
             case Connected() | Reconnected():
                 self.url = event.url
@@ -236,7 +236,7 @@ class _BagCamera:
                 pass
 
     def state(self, at: datetime) -> Iterator[BagMessage]:
-        """Yield the state for its topic, and for the diagnostics what is new to them."""
+        """Yield the messages of the state for its topic and, if they changed, the diagnostics."""
         known = self.known
         how = health(known, heard=bool(known.why))
         fields = {"header": header_fields(at, self.name), **status_fields(known)}
@@ -248,7 +248,7 @@ class _BagCamera:
             yield self._diagnostics(at, how.level, how.text, application)
 
     def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
-        """Return a message of the diagnostics about something that went wrong once."""
+        """Return a message of the diagnostics about a single error."""
         said = [(key, value) for key, value in values.items() if value is not None]
         return self._diagnostics(at, WARN, text, said)
 
@@ -262,7 +262,7 @@ class _BagCamera:
     # ------------------------------------------------------------------ containers
 
     def see_frame(self, entry: TraceEntry) -> None:
-        """Keep a container until it is told what became of it."""
+        """Keep a container until its result or error comes."""
         if entry.direction == "<" and entry.message == "ResultContainer" and entry.fields:
             data, application = entry.fields.get("data"), entry.fields.get("application", -1)
             if isinstance(data, str) and isinstance(application, int):
@@ -270,7 +270,7 @@ class _BagCamera:
                     self._containers.append((application, bytes.fromhex(data), entry.at))
 
     def settle(self, raw: bytes) -> None:
-        """Forget a container that was read, and those before it."""
+        """Remove a container that was interpreted, and earlier ones."""
         for place, (_, data, _) in enumerate(self._containers):
             if data == raw:
                 for _ in range(place + 1):
@@ -278,9 +278,9 @@ class _BagCamera:
                 return
 
     def unread(self) -> tuple[int, bytes, datetime] | None:
-        """Return application, bytes and time of the container that an error means.
+        """Return application, bytes and time of the container that an error is about.
 
-        Where several came of which nothing was told, it is not known which: None.
+        If several containers wait, it is not known which one: None.
         """
         known = self._containers.pop() if len(self._containers) == 1 else None
         self._containers.clear()
@@ -288,7 +288,7 @@ class _BagCamera:
 
 
 def _hardware(url: str) -> str:
-    """Return a camera's hardware id; the URL itself where it is none of this version's."""
+    """Return a camera's hardware id; the URL itself if this version cannot parse it."""
     try:
         return hardware_id(parse_address(url)) if url else ""
     except SmartCamError:
@@ -296,12 +296,12 @@ def _hardware(url: str) -> str:
 
 
 def topic_of_camera(name: str) -> str:
-    """Return a camera's name as its topics have it, which is its node's name, too."""
+    """Return a camera's name in topics, which is also its node's name."""
     return "/".join(part for part in as_name(name).split("/") if part) or "camera"
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
-    """Return the localizations that recorded JSON holds; None if it holds anything else."""
+    """Return the localizations of recorded JSON; None if it has other values."""
     if not isinstance(value, list):
         return None
     said: list[Any] = value
@@ -312,7 +312,7 @@ def parts_from_json(value: object) -> list[Localization] | None:
 
 
 def _part(said: Mapping[str, Any]) -> Localization:
-    """Return a localization of JSON; raises where it is not valid."""
+    """Return a localization from JSON; raise if it is not valid."""
     if set(said) != set(Localization._fields):
         raise ValueError("these are not its fields")
     pose, feature, photo = said["pose"], said["feature_id"], said["photo_index"]

@@ -1,4 +1,4 @@
-"""A recorder of bags: as :class:`~smartcam.recording.Recorder`, but what it writes is a rosbag2."""
+"""A recorder of bags: like :class:`~smartcam.recording.Recorder`, but it writes a rosbag2."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 
 DISTRIBUTION = "jazzy"
-"""ROS distribution whose message definitions a bag has; those used are the same in later ones."""
+"""ROS distribution of a bag's message definitions, which are the same in later ones."""
 
 
 def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
-    """Make a bag's folder, and what writes it.
+    """Create a bag's folder, and return its writer.
 
     Raises:
         ConfigurationError: the folder cannot be created.
@@ -39,7 +39,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
 
 
 class BagRecorder(Recorder):
-    """Writes what clients see to a rosbag2, as :class:`Recorder` does to a file of its own.
+    """Writes results, states and errors of clients to a rosbag2, like :class:`Recorder` to MCAP.
 
     ::
 
@@ -48,7 +48,7 @@ class BagRecorder(Recorder):
                 ...
 
     Each camera has its topics, ``/CAMERA/results``, ``localizations``, ``detections`` and
-    ``status``; ``/diagnostics`` has the errors. Of frames there is nothing in a bag.
+    ``status``; ``/diagnostics`` has the errors. A bag does not contain frames.
 
     Args:
         path: the bag's folder.
@@ -59,20 +59,20 @@ class BagRecorder(Recorder):
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """Keep a container for the case that it cannot be read."""
+        """Keep a container in case that it cannot be interpreted."""
         if entry.message == "ResultContainer":
             self._put(entry, len(entry.hex))
 
     def on_picture(self, result: Result, frame: Frame) -> None:
-        """Keep none: a bag has no pictures."""
+        """Ignore the picture: a bag has none."""
 
     @property
     def bag_counts(self) -> BagCounts:
-        """Counts of what was written so far."""
+        """Counts of the bag so far."""
         return self._file.items.counts if isinstance(self._file, _BagFile) else BagCounts()
 
     def remove(self) -> None:
-        """Remove what was written; call it when it is closed."""
+        """Remove the bag; call this after closing."""
         if self._file is not None:
             remove_folder(self.path)
 
@@ -92,7 +92,7 @@ class _BagFile:
         self.finish, self.close = self._writer.finish, self._writer.close
 
     def add(self, item: Given, /) -> None:
-        """Write one thing; raises ValueError: no message can be made of it."""
+        """Write one item; raise ValueError if no message can be made from it."""
         if isinstance(item, Description):
             self.items.describe(item.facts)
             return

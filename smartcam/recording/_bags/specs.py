@@ -1,4 +1,4 @@
-"""Tell from a recorder's notes how results were read: whether they are poses in metres."""
+"""Find out from recorded facts how results were interpreted: whether they are poses in metres."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Specs:
     """The interpreters that ``interpret_as`` names, for all applications or for each.
 
     Args:
-        said: value of ``interpret_as``, or its text; "" if it was not told.
-        pixels: whether places are in pixels, whatever ``said`` is.
+        said: value of ``interpret_as``, or its text; "" if it is not known.
+        pixels: whether positions are in pixels, whatever ``said`` is.
     """
 
     def __init__(self, said: Any = "", *, pixels: bool = False) -> None:
@@ -31,12 +31,12 @@ class Specs:
         specs: Any = said if hasattr(said, "items") else {None: said}
         self._known = {key: _resolved(one) for key, one in specs.items()}
         self._pixels = pixels
-        self._with_parts: set[int] = set()  # applications that gave some
+        self._with_parts: set[int] = set()  # applications that had localizations
 
     def parts(self, result: Result) -> list[Localization] | None:
         """Return a result's localizations in metres; None if it has none, or in pixels.
 
-        An empty list is taken for localizations where its application gives these.
+        An empty list counts as localizations if its application had some.
         """
         parts, application = localizations_of(result.value), result.application
         reader = self._known.get(application, self._known.get(None))
@@ -52,5 +52,5 @@ class Specs:
 def _resolved(spec: Any) -> Interpreter | None:
     try:
         return resolve(spec) if spec else None
-    except SmartCamError:  # of a plug-in that is not here
+    except SmartCamError:  # a plug-in that is not installed
         return None

@@ -1,10 +1,10 @@
 """A rosbag2: a folder with an MCAP file of ROS 2 messages and a ``metadata.yaml`` about it.
 
-What stands in both is what rosbag2 writes and reads: ``mcap_storage.cpp`` of rosbag2_storage_mcap
+The contents of both are those of rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
 (profile ``ros2``, schemas ``ros2msg``, ``offered_qos_profiles`` and ``topic_type_hash`` with each
 channel, a metadata record ``rosbag2``), ``yaml.hpp`` and ``qos.cpp`` of rosbag2_storage (the rest).
-The form is version 8 of the latter, with the policies as numbers in a text: version 9 writes their
-names in a list, which ROS 2 Humble does not read.
+The format is version 8, with the policies as numbers in a text: version 9 has their names in a
+list, which ROS 2 Humble does not read.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from smartcam.ros2 import QoS, RosTypes
 
 VERSION = 8
-"""Version of the form in which ``metadata.yaml`` is written."""
+"""Version of the format of ``metadata.yaml``."""
 
 METADATA = "metadata.yaml"
 
@@ -56,7 +56,7 @@ class Topic(NamedTuple):
 
 @dataclass(slots=True)
 class _BagChannel:
-    """A topic as it stands in the file, and how many messages it has."""
+    """A topic in the file, and the number of its messages."""
 
     id: int
     metadata: dict[str, str]  # metadata of its topic, for ``metadata.yaml``
@@ -64,14 +64,14 @@ class _BagChannel:
 
 
 def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
-    """Make a bag's folder and return its MCAP file, open and ours.
+    """Create a bag's folder and return its MCAP file, open and locked.
 
     Args:
-        folder: folder of the bag, whose parent must be there.
-        overwrite: take the place of a bag that is there.
+        folder: folder of the bag, whose parent must exist.
+        overwrite: replace an existing bag.
 
     Raises:
-        ConfigurationError: the folder is there already, holds something else than a bag, another
+        ConfigurationError: the folder exists already, contains something else than a bag, another
             recorder writes it, or it cannot be created.
     """
     what = f"bag {folder}"
@@ -95,7 +95,7 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
 
 
 def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
-    """Make the folder where it does not exist; return whether it was made."""
+    """Create the folder if it does not exist; return whether it was created."""
     try:
         folder.mkdir()
     except FileExistsError as exc:
@@ -116,27 +116,27 @@ def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
 
 
 def mcap_of(folder: Path) -> Path:
-    """Return the place of a bag's MCAP file: rosbag2 names it after the folder."""
+    """Return the path of a bag's MCAP file, which rosbag2 names after the folder."""
     return folder / f"{folder.resolve().name}_0.mcap"
 
 
 def _is_of_bag(folder: Path, path: Path) -> bool:
-    """Return True if a file may be the bag's own; other recordings are not taken for one."""
+    """Return True if a file may be the bag's own; other recordings are not."""
     own = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
     return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a bag of smartcam that is no longer written."""
+    """Remove a bag of smartcam that is no longer being written."""
     for path in (folder / METADATA, folder / _HALF, mcap_of(folder)):
         path.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # somebody has put something there
+    with contextlib.suppress(OSError):  # another program has put a file there
         folder.rmdir()
 
 
 @dataclass(eq=False)
 class BagWriter:
-    """Writes a bag; not for several threads.
+    """Writes a bag, in one thread.
 
     Args:
         folder: folder of the bag.
@@ -164,13 +164,13 @@ class BagWriter:
 
     @property
     def count(self) -> int:
-        """Messages so far."""
+        """Number of messages so far."""
         return sum(channel.count for channel in self._channels.values())
 
     def start(self) -> None:
-        """Write what stands first; from here on it can be read, whatever happens."""
+        """Write the beginning of the file, after which it can be read even if it is cut off."""
         self._writer.start("ros2", f"smartcam {smartcam.__version__}")
-        # a file that is cut off has only this one, which says how to read the policies
+        # a file that is cut off has only this record, which has the format of the policies
         self._write_metadata_record()
         self.flush()
 
@@ -183,7 +183,7 @@ class BagWriter:
             message: message of the type, or a mapping of the fields.
 
         Raises:
-            RosMessageError: the fields make no message of the topic's type.
+            RosMessageError: the fields do not fit the topic's type.
             OSError: the disk fails.
         """
         data = self.types.message(topic.type).encode(message)
@@ -195,13 +195,13 @@ class BagWriter:
         self._writer.add_message(channel.id, at, data, channel.count & 0xFFFFFFFF)
 
     def flush(self) -> None:
-        """End the chunk and have it put on the disk."""
+        """End the chunk and sync it to the disk."""
         self._writer.flush()
         if self._on_disk:
             os.fsync(self.stream.fileno())
 
     def finish(self) -> None:
-        """Write the index, what stands last, and ``metadata.yaml``."""
+        """Write the index, the end of the file, and ``metadata.yaml``."""
         self._write_metadata_record()
         self._writer.finish()
         self.stream.flush()
@@ -216,7 +216,7 @@ class BagWriter:
         half.replace(self.folder / METADATA)
 
     def close(self) -> None:
-        """Close the file; what it does not take any more is dropped."""
+        """Close the file, and drop bytes that cannot be written."""
         with contextlib.suppress(OSError):
             self.stream.close()
 
@@ -246,7 +246,7 @@ class BagWriter:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})
 
     def _text(self, value: object) -> str:
-        """Return a value as YAML; by libyaml where PyYAML has it."""
+        """Return a value as YAML; by libyaml if PyYAML has it."""
         dumper = getattr(self._yaml, "CSafeDumper", self._yaml.SafeDumper)
         text: str = self._yaml.dump(value, Dumper=dumper, sort_keys=False, allow_unicode=True)
         return text

@@ -1,1 +1,1 @@
-"""Record beside an agent into a folder of files, and play that folder as a fleet."""
+"""Record an agent's cameras into a folder of files, and replay that folder as a fleet."""

@@ -1,4 +1,4 @@
-"""The files of a folder of recordings: begun, filled, ended, deleted; in one thread."""
+"""Begin, fill, end and delete the files of a folder of recordings, in one thread."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 LOOK_INTERVAL = 10.0
-"""Seconds after which it is looked again what is in the folder, where files are begun."""
+"""Seconds after which the folder is listed again when a file is begun."""
 
 ITEMS_PER_LOOK = 64
-"""Items after which a file's size is looked at."""
+"""Number of items after which a file's size is checked."""
 
 
 class Limits(NamedTuple):
-    """The limits at which a file is ended, and of how much is kept.
+    """The limits of a file, and of all files.
 
     Attributes:
-        size: bytes of a file.
-        age: seconds that a file is written.
-        keep: bytes of all files.
+        size: bytes of a file at which it ends.
+        age: seconds of a file at which it ends.
+        keep: largest number of bytes of all files.
     """
 
     size: float
@@ -45,13 +45,13 @@ class Limits(NamedTuple):
 
 
 class FolderFiles:
-    """Writes what came of each camera to its files.
+    """Writes the records of each camera to its files.
 
     Args:
         folder: folder that holds the files.
         limits: bounds on the files.
-        compress: function that packs a chunk.
-        clock: function that returns seconds, for the files' age.
+        compress: function that compresses a chunk.
+        clock: function that returns the time in seconds, for the files' age.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class FolderFiles:
         clock: Callable[[], float],
     ) -> None:
         self._folder, self._limits, self._compress, self._clock = folder, limits, compress, clock
-        self._looked = -math.inf  # when it was looked what is in the folder
+        self._looked = -math.inf  # time of the last listing of the folder
         self._stuck: set[str] = set()  # files that could not be deleted
 
     def enter(self) -> None:
@@ -71,10 +71,10 @@ class FolderFiles:
         self._looked = self._clock()
 
     def write(self, track: CameraTrack, given: list[Any]) -> None:
-        """Write what came of a camera; what is on the disk is taken out of ``given``.
+        """Write records of a camera, and remove those on the disk from ``given``.
 
         Raises:
-            OSError: the disk did not take the rest.
+            OSError: the remaining records could not be written.
         """
         done = written = 0
         try:
@@ -97,9 +97,9 @@ class FolderFiles:
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
     def _add(self, track: CameraTrack, one: Any) -> int:
-        """Add what was put in to the file; return how many records that were."""
+        """Add an object's records to the file; return their number."""
         file = track.file
-        if file is None:  # not so: it was begun
+        if file is None:  # cannot happen: the file was begun
             return 0
         if track.gap is not None and not track.gap_told:
             self._add_gap(track, file, track.gap)
@@ -118,18 +118,18 @@ class FolderFiles:
             items = [*track.read(one)]
         except ENDS_PROGRAM:
             raise
-        except BaseException as exc:  # noqa: BLE001 - an interpreter's, of whatever kind
+        except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything
             track.lose_one(f"unexpected {exc!r}")
             return 0
-        track.more += len(items) - 1  # a result that cannot be read is an error, too
+        track.more += len(items) - 1  # an uninterpretable result makes an error, too
         for item in items:
             try:
                 file.add(item)
-            except FrameFormatError as exc:  # which is an OSError, and not the disk's
+            except FrameFormatError as exc:  # an OSError, but not the disk's
                 track.lose_one(str(exc))
             except OSError:
                 raise
-            except Exception as exc:  # noqa: BLE001 - nobody could read it back
+            except Exception as exc:  # noqa: BLE001 - the record could not be read again
                 track.lose_one(str(exc))
             else:
                 written += 1
@@ -141,7 +141,7 @@ class FolderFiles:
         file.note(STATE_METADATA, track.state.facts(track.endian, gap.until))
 
     def _begin(self, track: CameraTrack, first: Any) -> None:
-        """Begin a camera's next file, and end the one before, if any; ``first``: what it is for.
+        """End a camera's file, if any, and begin the next one, whose first record is ``first``.
 
         Raises:
             OSError: the file cannot be created.
@@ -168,7 +168,7 @@ class FolderFiles:
         track.file, track.begun, track.good = file, now, file.size
 
     def _flush(self, track: CameraTrack, written: int) -> None:
-        """Have what was added put on the disk, and count it."""
+        """Sync the added records to the disk, and count them."""
         file = track.file
         if file is None:
             return
@@ -181,7 +181,7 @@ class FolderFiles:
         self._folder.grown(file.path, file.size)
 
     def _cut(self, track: CameraTrack) -> None:
-        """Leave a file with what is on the disk: its last chunk may be half of one."""
+        """Close a file, cut to the last whole chunk."""
         file, track.file = track.file, None
         track.gap_told = False
         if file is not None:
@@ -189,7 +189,7 @@ class FolderFiles:
             self._folder.grown(file.path, track.good)
 
     def finish(self, track: CameraTrack) -> None:
-        """End a camera's file, if any; where the disk does not take its index it has none."""
+        """End a camera's file, if any; without an index if that cannot be written."""
         file, track.file = track.file, None
         if file is None:
             return
@@ -202,7 +202,7 @@ class FolderFiles:
         self._folder.grown(file.path, file.size)
 
     def end_old(self, tracks: Iterable[CameraTrack]) -> None:
-        """End files that are old enough, of cameras that say nothing."""
+        """End files that are old enough, also of silent cameras."""
         for track in tracks:
             if self._is_over(track) and self._clock() - track.begun >= self._limits.age:
                 self.finish(track)
@@ -210,7 +210,7 @@ class FolderFiles:
     # ------------------------------------------------------------------ the bound on the disk
 
     def delete_old(self, tracks: Sequence[CameraTrack]) -> None:
-        """Delete the oldest files until what is left is within the bound."""
+        """Delete the oldest files until the rest is within the bound."""
         folder = self._folder
         while folder.bytes > self._limits.keep:
             found = [one for one in folder.files.values() if one.name not in self._stuck]
@@ -219,7 +219,7 @@ class FolderFiles:
             oldest = min(found)
             for track in tracks:
                 if track.file is not None and track.file.path.name == oldest.name:
-                    self.finish(track)  # it goes on in a new one
+                    self.finish(track)  # the camera's next record begins a new one
             try:
                 folder.delete(oldest.name)
             except OSError as exc:
@@ -228,7 +228,7 @@ class FolderFiles:
 
 
 def _time_of(given: Any) -> datetime:
-    """Return when what was put in came; now where it does not say."""
+    """Return the time of an object; the present time if it has none."""
     item = getattr(given, "result", given)
     at = getattr(item, "received_at", None) or getattr(item, "at", None)
     return at if isinstance(at, datetime) else datetime.now(UTC)

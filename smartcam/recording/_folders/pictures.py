@@ -1,4 +1,4 @@
-"""Record the pictures of an agent's cameras beside their results."""
+"""Record the pictures of an agent's cameras with their results."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 MAX_BYTES_WITH_PICTURES: Final = 3 * MAX_WAITING_BYTES // 4
-"""Largest number of bytes that may wait for the disk behind a picture: the rest of the room is for
-results."""
+"""Largest number of bytes that may wait for the disk for a picture to be added; the rest of the
+room is for results."""
 
 RETRY: Final = Backoff(initial=1.0, maximum=30.0)
-"""Delays before pictures that do not come are tried again."""
+"""Delays before a lost source of pictures is opened again."""
 
 
 class FleetPictures:
-    """Puts the pictures of cameras into their recordings, for as long as the cameras are there.
+    """Adds the pictures of cameras to their recordings, as long as the agent has the cameras.
 
     Args:
-        server: agent that has the cameras.
+        server: agent of the cameras.
         writer: writer of the recordings.
-        all_of_them: whether every picture is recorded, or of each result the one it was made of.
+        all_of_them: whether every picture is recorded, or only those of results.
     """
 
     def __init__(self, server: FleetServer, writer: FolderWriter, *, all_of_them: bool) -> None:
@@ -54,7 +54,7 @@ class FleetPictures:
         self._matchers: dict[str, PictureMatcher] = {}
 
     def follow(self, track: CameraTrack) -> None:
-        """Record the pictures of a camera from now on; nothing is done where they are already."""
+        """Record the pictures of a camera from now on; do nothing if they already are."""
         task = self._tasks.get(track.camera)
         if task is None or task.done():
             name = f"smartcam.recordings.pictures[{track.camera}]"
@@ -62,14 +62,14 @@ class FleetPictures:
             self._tasks[track.camera] = loop.create_task(self._record(track), name=name)
 
     def result(self, track: CameraTrack, result: Result[Any]) -> None:
-        """Record the picture that a result was made of."""
+        """Record the picture of a result, found by its time."""
         matcher = self._matchers.get(track.camera)
         if matcher is not None:
             matcher.results.append(result)
             self._settle(track, matcher)
 
     def told(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
-        """Record the picture of which the camera says that a result was made of it."""
+        """Record the picture of a result, as the camera names it."""
         made = 0, result.number, result.received_at
         self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *made))
 
@@ -86,7 +86,7 @@ class FleetPictures:
             await asyncio.wait(tasks)
 
     async def _record(self, track: CameraTrack) -> None:
-        """Record until the agent has the camera, or pictures of it, no longer."""
+        """Record while the agent has the camera and pictures of it."""
         delays, told = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
@@ -98,7 +98,7 @@ class FleetPictures:
                     delays, told = RETRY.delays(), ""
             except (SmartCamError, OSError) as exc:
                 why = str(exc)
-            except Exception as exc:  # a driver may be anybody's
+            except Exception as exc:  # a driver may be a plug-in's
                 logger.exception("%s ! its pictures are not recorded", track.camera)
                 why = repr(exc)
             if why != told and not host.frames.closed:
@@ -107,7 +107,7 @@ class FleetPictures:
             await asyncio.sleep(next(delays))
 
     async def _take_all(self, track: CameraTrack, source: FrameSource) -> bool:
-        """Take pictures until the source ends; return whether any came."""
+        """Receive pictures until the source ends; return whether any came."""
         came = False
         matcher = PictureMatcher(MAX_MATCHED_BYTES)
 
@@ -137,7 +137,7 @@ class FleetPictures:
                 self._put(track, RecordedPicture(track.camera, captured_at(picture), picture))
 
     def _put(self, track: CameraTrack, picture: RecordedPicture) -> bool:
-        """Have a picture written, or left out and counted where results might find no room."""
+        """Write a picture, or leave it out and count it if results need the room."""
         size = memoryview(picture.frame.data).nbytes
         fits = self._writer.waiting + size <= MAX_BYTES_WITH_PICTURES
         return self._writer.put(
@@ -145,7 +145,7 @@ class FleetPictures:
         )
 
     def _tell(self, track: CameraTrack, why: str) -> None:
-        """Tell the log and the recording that a camera's pictures do not come."""
+        """Report in the log and in the recording that a camera's pictures do not come."""
         logger.warning("%s ! its pictures are not recorded: %s", track.camera, why)
         text = f"its pictures are not recorded: {why}"
         error = RecordedError(track.camera, datetime.now(UTC), "FrameSourceError", text, None)

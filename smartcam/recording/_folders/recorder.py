@@ -1,4 +1,4 @@
-"""Recording beside an agent: what its sessions see goes into a folder."""
+"""Record the sessions of an agent into a folder."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 
 class _SeenResult(NamedTuple):
-    """A result as an agent has it."""
+    """A result of an agent, with its byte order."""
 
-    result: Result[Any]  # result, whose value says which camera it is from
+    result: Result[Any]  # result, whose value is its container
     endian: int | None  # byte order; None if it is not known
 
 
 class FleetRecorder(Server):
-    """Records the cameras of an agent into a folder, as ``record:`` in a fleet file says.
+    """Records the cameras of an agent into a folder, like ``record:`` in a fleet file.
 
     ::
 
@@ -51,21 +51,21 @@ class FleetRecorder(Server):
         async with FleetRecorder(server), server:
             ...
 
-    It is started before the server, and stopped behind it. What a disk does never holds up the
-    agent: where it is full, gone or too slow, records are left out and counted, which
-    :attr:`accounts` and the files tell; it is tried again until it is better.
+    Start it before the server, and stop it after the server. The disk never delays the agent: if it
+    is full, missing or too slow, records are left out and counted in :attr:`accounts` and in the
+    files; it is tried again until it works.
 
     Args:
         server: server whose cameras are recorded; not started yet.
-        section: what is recorded, and where; default: what the server's file says.
-        on_trouble: function that is called in the event loop with why nothing is written any more,
-            and with None when it is again.
+        section: settings of the recording; default: ``record`` of the server's file.
+        on_trouble: function that is called in the event loop with the error when nothing can be
+            written, and with None when it can again.
 
     Attributes:
         path: the folder.
 
     Raises:
-        ConfigurationError: the file says nothing of recording, and ``section`` is not given.
+        ConfigurationError: neither the file has ``record`` nor is ``section`` given.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class FleetRecorder(Server):
         on_trouble: Callable[[RecordingError | None], None] = lambda _: None,
         _clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        # an agent's module, with its libraries, is there where somebody made an agent
+        # a program with an agent has already imported the agent's libraries
         from smartcam.fleet import FleetServer
         from smartcam.fleet._inside import RecordSection
 
@@ -97,7 +97,7 @@ class FleetRecorder(Server):
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def start(self) -> None:
-        """Begin to write the folder.
+        """Start the thread that writes the folder.
 
         A folder that cannot be created, or written, is no error: it is tried again.
 
@@ -142,9 +142,9 @@ class FleetRecorder(Server):
         return FleetPictures(self._server, writer, all_of_them=self.section.pictures == "all")
 
     async def stop(self) -> None:
-        """Write what waits and end the files; 30 s at most, usually some milliseconds.
+        """Write waiting records and end the files; 30 s at most, usually some milliseconds.
 
-        Cancellation: the thread goes on to the end of it.
+        Cancellation: the thread still finishes.
         """
         writer, observer, pictures = self._writer, self._observer, self._pictures
         self._observer = self._pictures = None
@@ -159,12 +159,12 @@ class FleetRecorder(Server):
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
-        """Accounts of the records of each camera that had any."""
+        """Account of each camera with records."""
         return {} if self._writer is None else self._writer.accounts
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None if all is well."""
+        """Error because of which nothing is written now; None without one."""
         return None if self._writer is None else self._writer.trouble
 
     def _tell(self, trouble: RecordingError | None) -> None:
@@ -174,7 +174,7 @@ class FleetRecorder(Server):
 
 
 async def _whole(work: Callable[[], None]) -> None:
-    """Have something done in a thread, to its end even where the caller is cancelled."""
+    """Run work in a thread, to its end even if the caller is cancelled."""
     running = asyncio.ensure_future(asyncio.to_thread(work))
     try:
         await asyncio.shield(running)
@@ -184,7 +184,7 @@ async def _whole(work: Callable[[], None]) -> None:
 
 
 class _Hooks(Observer):
-    """Hands what an agent's sessions see to the writer."""
+    """Passes frames, results, events and errors of an agent's sessions to the writer."""
 
     def __init__(
         self,
@@ -195,7 +195,7 @@ class _Hooks(Observer):
     ) -> None:
         self._server, self._section, self._writer = server, section, writer
         self._pictures = pictures
-        # track of each camera; None for one that is not recorded
+        # track of each camera; None for a camera that is not recorded
         self._tracks: dict[str, CameraTrack | None] = {}
 
     def on_state(self, event: CameraEvent) -> None:
@@ -221,7 +221,7 @@ class _Hooks(Observer):
                 self._pictures.result(track, result)
 
     def on_picture(self, result: Result, frame: Frame) -> None:
-        """Keep the picture of a result, which software cameras tell."""
+        """Keep the picture of a software camera's result."""
         track = self._track(result.camera)
         if track is not None and self._pictures is not None:
             self._pictures.told(track, result, frame)
@@ -264,7 +264,7 @@ class _Hooks(Observer):
 
 
 class _Frames(_Hooks):
-    """Hands on frames, too."""
+    """Passes frames on, too."""
 
     def on_raw_frame(self, frame: RawFrame) -> None:
         """Keep a frame; the writer's thread decodes it."""
@@ -274,13 +274,13 @@ class _Frames(_Hooks):
 
 
 class _SeenReading:
-    """Makes records of what came, in the writer's thread: a result's value is what it holds.
+    """Makes records in the writer's thread, where it interprets results.
 
     Args:
         camera: name of the camera.
-        spec: interpreter of the results; None: results are not read.
-        y_down: as the camera's settings say.
-        lenient: as the camera's settings say.
+        spec: interpreter of the results; None: results are not interpreted.
+        y_down: ``y_down`` of the camera's settings.
+        lenient: ``lenient`` of the camera's settings.
     """
 
     def __init__(self, camera: str, spec: Any, y_down: bool, lenient: bool) -> None:
@@ -290,7 +290,7 @@ class _SeenReading:
             self._interpret = Interpretation(spec, lenient=lenient, y_down=y_down)
 
     def items(self, given: Any) -> Iterator[Item]:
-        """Give the records."""
+        """Yield the records of an object."""
         if not isinstance(given, _SeenResult):
             yield given
             return

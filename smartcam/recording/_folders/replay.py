@@ -1,4 +1,4 @@
-"""A recording played as a fleet: its cameras under their names, through an agent."""
+"""Replay a recording as a fleet: its cameras under their names, through an agent."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ if TYPE_CHECKING:
 
 
 class FleetReplay(Server):
-    """Plays the cameras of a recording, each as an emulated one that an agent shares.
+    """Replays the cameras of a recording, each as an emulated one that an agent shares.
 
     ::
 
         async with FleetReplay(load_recording("recordings")) as played:
             print(played.server.urls)
 
-    Each camera begins when its session does, all of them at about the same time; what a fleet's
-    programs trigger gets what was recorded for a trigger, what came by itself comes again. The
-    frames of a BVS camera are the recorded pictures of the results, each with its result.
+    Each camera begins with its session, all of them at about the same time. Triggers get the
+    recorded results of triggers; results without a trigger come again at their times. The frames of
+    a BVS camera are the recorded pictures of its results, each shown with its result.
 
     Args:
-        recording: recording to play; usually a folder of a :class:`FleetRecorder`.
-        cameras: names of the cameras to play; default: all.
-        speed: factor by which to play faster than recorded, 0.001 to 1000.
-        loop: begin again where something is over.
-        listen: endpoint of the agent; port 0 takes a free one.
-        on_over: function that is called once for each camera, with its name, when nothing of it is
-            left.
+        recording: recording to replay; usually a folder of a :class:`FleetRecorder`.
+        cameras: names of the cameras to replay; default: all.
+        speed: factor by which to replay faster than recorded, 0.001 to 1000.
+        loop: begin again at the end.
+        listen: endpoint of the agent; port 0 chooses a free one.
+        on_over: function that is called once for each camera, with its name, at the end of its
+            recording.
 
     Attributes:
-        skipped: reasons why cameras are not played, by name: there was no session, or no camera of
-            the make can be emulated.
+        skipped: reasons why cameras are not replayed, by name: there was no session, or the make
+            has no emulated camera.
 
     Raises:
-        ConfigurationError: something given is wrong, or none of the cameras can be played.
+        ConfigurationError: an argument is wrong, or none of the cameras can be replayed.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
 
@@ -86,7 +86,7 @@ class FleetReplay(Server):
                 if cameras is not None:
                     raise
                 self.skipped[name] = str(exc)
-        # of these nothing will ever be left
+        # cameras that are already over
         self._silent = {name for name, one in self._played.items() if not one.remaining}
         if not self._played:
             why = "; ".join(self.skipped.values()) or "no camera is in it"
@@ -108,7 +108,7 @@ class FleetReplay(Server):
         return self._server
 
     async def start(self) -> None:
-        """Start the cameras and the agent, and begin to have sessions.
+        """Start the cameras and the agent, which connects to them.
 
         Raises:
             ConnectFailedError: a port cannot be listened on.
@@ -143,13 +143,13 @@ class FleetReplay(Server):
             self._server, self._stack = server, stack.pop_all()
 
     async def stop(self) -> None:
-        """Stop the agent and the cameras. Harmless when called twice."""
+        """Stop the agent and the cameras. A second call does nothing."""
         self._server = None
         await self._stack.aclose()
 
 
 def _said(camera: RecordedCamera) -> dict[str, Any]:
-    """Return the settings that an agent needs of a camera, besides the address."""
+    """Return a camera's settings for the agent, without the address."""
     found: dict[str, Any] = {}
     spec = camera.interpret_as
     if spec is not None:

@@ -1,4 +1,4 @@
-"""Record one camera beside an agent: its account, its file, and the gaps in it."""
+"""The recording of one camera of an agent: its account, its file, and its gaps."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 class RecordingAccount(NamedTuple):
-    """The account of a camera's records: frames, results, events and errors, all counted alike.
+    """The account of a camera's records: frames, results, events and errors together.
 
     Attributes:
         written: records on the disk.
         waiting: records that wait for the disk.
-        lost: records not written: the disk was full, gone or too slow, or it could not be read.
+        lost: records not written: the disk was full, missing or too slow, or a record was invalid.
     """
 
     written: int = 0
@@ -37,8 +37,8 @@ class Gap:
     """Records that were not written.
 
     Attributes:
-        since: time at which the first record came.
-        until: time at which the last record came.
+        since: time of the first record.
+        until: time of the last record.
         count: number of records.
         reason: cause of the gap, as text.
         events: last event of each kind among the records, in order.
@@ -51,7 +51,7 @@ class Gap:
     events: dict[type, CameraEvent] = field(default_factory=dict[type, CameraEvent])
 
     def error(self, camera: str) -> RecordedError:
-        """Return the record by which a file tells of the gap."""
+        """Return the record of the gap for the file."""
         text = (
             f"{self.count} records from {self.since.isoformat()} to {self.until.isoformat()} were "
             f"not written: {self.reason}"
@@ -64,30 +64,30 @@ class CameraTrack:
 
     Args:
         camera: name of the camera.
-        read: function that makes items of what was put in; called in the writer's thread.
+        read: function that makes items of an object; called in the writer's thread.
 
     Attributes:
-        endian: byte order that the last status told.
-        offered: records that came.
-        left_out: offered records that found no room to wait.
+        endian: byte order of the last status.
+        offered: records so far.
+        left_out: offered records for which there was no room to wait.
         written: records on the disk.
-        lost: records that waited, but are not on the disk and will not be.
-        overflow: the gap that grows where too much waits; None if nothing is left out.
+        lost: waiting records that could not be written.
+        overflow: the growing gap of records that are left out; None if none are.
     """
 
     def __init__(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> None:
         self.camera = camera
         self.read = read
-        self.offered = self.left_out = 0  # whoever puts something in counts these
-        self.written = self.lost = self.more = 0  # and the writer these
+        self.offered = self.left_out = 0  # counted in the threads that offer records
+        self.written = self.lost = self.more = 0  # counted in the writer's thread
         self.overflow: Gap | None = None
         self.state = RecordedState(camera)
         self.endian = 0
         self.facts: dict[str, str] = {"camera": camera}
-        self.gap: Gap | None = None  # not told in a file that is on the disk
-        self.gap_told = False  # it is in the file's next chunk
+        self.gap: Gap | None = None  # gap that is not on the disk yet
+        self.gap_told = False  # whether the gap is in the file's next chunk
         self.file: RecordingFile | None = None
-        self.begun = 0.0  # when the file was, on the steady clock
+        self.begun = 0.0  # time of the file's beginning, on the monotonic clock
         self.good = 0  # bytes of the file that are on the disk
 
     @property
@@ -97,12 +97,12 @@ class CameraTrack:
         return RecordingAccount(written, self.offered + self.more - written - lost, lost)
 
     def lose(self, given: list[Any], reason: str) -> None:
-        """Count what was put in and is not written; what it says of the camera is kept."""
+        """Count objects that are not written; keep the camera's state that they report."""
         for one in given:
             if isinstance(one, Description):
                 self.facts |= one.facts
             elif isinstance(one, Gap):
-                self._widen(one)  # it is counted
+                self._widen(one)  # a gap is already counted
                 self.follow_all(one)
             else:
                 self.follow(one)
@@ -115,14 +115,14 @@ class CameraTrack:
         self._widen(Gap(at, at, 1, reason))
 
     def follow(self, item: object) -> None:
-        """Keep what an item says of the camera."""
+        """Keep the camera's state that an item reports."""
         if isinstance(item, CameraEvent):
             self.state = self.state.after(item)
         if isinstance(item, (Connected, Reconnected)):
             self.facts |= address_facts(item.url)
 
     def follow_all(self, gap: Gap) -> None:
-        """Keep what the events of a gap say of the camera."""
+        """Keep the camera's state that the events of a gap report."""
         for event in gap.events.values():
             self.follow(event)
 

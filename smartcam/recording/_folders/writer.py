@@ -1,8 +1,8 @@
-"""The thread that writes a folder of recordings: of each camera files that follow each other.
+"""The thread that writes a folder of recordings, with consecutive files for each camera.
 
-What comes is put into one list, in bounds; the thread takes the list twice a second and has each
-camera's part of it put on the disk. What a disk does not take is counted, camera by camera, and
-told in the files as soon as there is one that takes it.
+Records are put into one bounded list; the thread takes the list twice a second and writes each
+camera's records to the disk. Records that cannot be written are counted for each camera, and
+reported in its files as soon as one can be written.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ MIN_FREE_BYTES = 4 * CHUNK
 """Least number of bytes that must be free on a disk that was full before it is tried again."""
 
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
-"""Seconds until a disk that did not take something is tried again; the last forever."""
+"""Seconds until a disk that failed is tried again; the last delay is repeated."""
 
 EVENT_ROOM = 2
-"""Factor by which more may wait before events are left out, too: they tell the camera's state."""
+"""Factor by which more may wait before events are left out, since these have the camera's state."""
 
 
 @dataclass(eq=False)
 class _Trouble:
-    """The reason for which nothing is written at the time."""
+    """The reason why nothing is written now."""
 
     error: RecordingError
-    reason: str  # without the folder
-    full: bool  # there was no room
+    reason: str  # text without the folder
+    full: bool  # whether the disk was full
     again: float  # time of the next try, on the monotonic clock
     tries: int = 0
 
@@ -70,18 +70,18 @@ class _DiskQueue:
 
 
 class FolderWriter:
-    """Writes what is put in.
+    """Writes records in a thread.
 
     Args:
         folder: folder that holds the files.
         limits: bounds on the files.
-        compress: function that packs a chunk.
-        tell: function that is called in the thread with why nothing is written, and with None when
-            it is again.
-        clock: function that returns seconds, for the files' age and delays.
+        compress: function that compresses a chunk.
+        tell: function that is called in the thread with the error when nothing can be written, and
+            with None when it can again.
+        clock: function that returns the time in seconds, for the files' age and delays.
 
     Attributes:
-        trouble: why nothing is written at the time; None if all is well.
+        trouble: error because of which nothing is written now; None without one.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class FolderWriter:
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Write nothing in a fork of the process that has the folder; what comes is left out."""
+        """Write nothing in a fork of the process that has the folder; leave out all records."""
         self._more, self._waiting = threading.Condition(), _DiskQueue()
         self._thread, self._closing = None, True
 
@@ -127,7 +127,7 @@ class FolderWriter:
         return track
 
     def describe(self, track: CameraTrack, facts: dict[str, str]) -> None:
-        """Keep facts about a camera in each of its files."""
+        """Write facts about a camera to each of its files."""
         with self._more:
             self._waiting.items.append((track, Description({"camera": track.camera, **facts})))
 
@@ -137,9 +137,9 @@ class FolderWriter:
         return self._waiting.bytes
 
     def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> bool:
-        """Have something written, or leave it out and count it where too much waits. Never waits.
+        """Put an object into the list, or leave it out and count it if too much waits. Never wait.
 
-        Returns whether it is kept.
+        Return whether the object is in the list.
 
         Args:
             track: track of the camera that ``given`` is about.
@@ -174,7 +174,7 @@ class FolderWriter:
             gap.events[type(given)] = given
 
     def start(self) -> None:
-        """Enter the folder and start the thread. It blocks for as long as the disk wants.
+        """Enter the folder and start the thread; blocks while the disk does.
 
         Raises:
             ConfigurationError: another recorder writes in the folder.
@@ -189,7 +189,7 @@ class FolderWriter:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what waits and end the files; bounded. It blocks. Idempotent."""
+        """Write waiting records and end the files; blocks, with a bound. Idempotent."""
         with self._more:
             self._closing = True
             self._more.notify()
@@ -217,7 +217,7 @@ class FolderWriter:
             self._folder.leave()
 
     def _take(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
-        """Wait for something; return it by its camera, and whether that was the last."""
+        """Wait for records; return them by camera, and whether they were the last."""
         with self._more:
             self._more.wait_for(lambda: self._waiting.items or self._closing, INTERVAL)
             if self._waiting.items:
@@ -232,7 +232,7 @@ class FolderWriter:
         return found, over
 
     def _write(self, found: dict[CameraTrack, list[Any]]) -> None:
-        """Write what came, or count it; never raises."""
+        """Write records, or count them as lost; never raises."""
         try:
             if self._ready(found):
                 for track, given in found.items():
@@ -253,7 +253,7 @@ class FolderWriter:
                 track.lose(given, trouble.reason)
 
     def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
-        """Return True if the disk is to be tried; after a failure, check the room on it first.
+        """Return True if the disk should be tried; after a failure, check its free room first.
 
         Raises:
             ConfigurationError: another recorder has the folder now.
@@ -290,7 +290,7 @@ class FolderWriter:
             self._tell(told)
 
     def _heal(self) -> None:
-        """Note that the disk took something."""
+        """Note that the disk works again."""
         if self._trouble is not None:
             self._trouble = None
             logger.warning("recordings %s: recorded again", self._folder.path)

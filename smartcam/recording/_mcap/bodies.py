@@ -1,4 +1,4 @@
-"""The data of the frames that came last: a result's bytes are in one of them, and written once."""
+"""The data of the last frames, one of which has a result's bytes, which are so written once."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from collections import deque
 from typing import Generic, TypeVar
 
 MAX_FRAMES = 4096
-"""Largest number of frames that are kept: a delivery has been traced whole before its first result
-is told."""
+"""Largest number of kept frames: all frames of a delivery come before its first
+result."""
 
 MAX_CHARACTERS = 1 << 23
-"""Largest number of characters of hex that they may have together; the last one is kept whatever it
-has."""
+"""Largest number of hex characters of the kept frames together; the last one is kept
+in any case."""
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 
 class LastBodies(Generic[Key, Value]):
-    """The values that a file said of its last frames with data.
+    """The numbers and data of a file's last frames with data.
 
-    A writer asks for the number of a frame by its data, a reader for the data by the number.
-    Both forget alike, so what one finds is there for the other.
+    A writer looks up the number of a frame by its data, a reader the data by the number. Both keep
+    the same frames, so the reader finds each frame that the writer found.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class LastBodies(Generic[Key, Value]):
         self._characters = 0
 
     def add(self, key: Key, value: Value, characters: int) -> None:
-        """Keep a frame's, whose data has so many characters; forget what is beyond the bounds."""
+        """Keep the value of a frame whose data has so many characters; drop the oldest beyond."""
         self._order.append((key, value, characters))
         self._known[key] = value
         self._characters += characters
@@ -39,9 +39,9 @@ class LastBodies(Generic[Key, Value]):
                 break
             key, value, characters = self._order.popleft()
             self._characters -= characters
-            if self._known.get(key) is value:  # else a later frame has the same key
+            if self._known.get(key) is value:  # otherwise a later frame has the same key
                 del self._known[key]
 
     def get(self, key: Key) -> Value | None:
-        """Return the value added for a key; None if it is not kept."""
+        """Return the value of a key; None if it is not kept."""
         return self._known.get(key)

@@ -1,13 +1,12 @@
-"""The form of a recording: which topics there are, what their messages hold, and both ways to JSON.
+"""The format of a recording: topics, contents of messages, and conversion to and from JSON.
 
 Each camera has four topics, ``/CAMERA/frames``, ``results``, ``events`` and ``errors``. A message
 is a JSON object with the field names of the public models; a field that is None is left out, since
-viewers such as Foxglove take a field's type from the schema and know no "or null". The schemas
-keep to the types that Foxglove reads (``type`` is one word everywhere).
+viewers such as Foxglove take a field's type from the schema and do not support null. The schemas
+use only types that Foxglove supports (``type`` is always one word).
 
-Where pictures are recorded there is a fifth topic, ``/CAMERA/pictures``, and for the marks on them
-``/CAMERA/annotations``, whose messages are no JSON but Foxglove's of Protocol Buffers: see
-``_pictures``.
+With pictures there is a fifth topic, ``/CAMERA/pictures``, and for the marks on them
+``/CAMERA/annotations``, both with Foxglove's messages of Protocol Buffers: see ``_pictures``.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 FORMAT = "3"
-"""Version of the form that is written."""
+"""Version of the format that is written."""
 
 FORMATS = ("1", "2", FORMAT)
-"""Versions of the form that are read; another one is refused. In 1 a frame's body repeats the
+"""Versions of the format that are read; others are refused. In 1 a frame's body repeats the
 frame's end; in 1 and 2 a result repeats the bytes of its frame."""
 
 PROFILE = "x-smartcam"
@@ -53,29 +52,29 @@ FILE_METADATA = "smartcam"
 """Name of the metadata record about the file: ``format``, ``version`` (of smartcam), ``began``."""
 
 CAMERA_METADATA = "smartcam.camera"
-"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
-told; a later one goes before an earlier one."""
+"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and other facts; a
+later one overrides an earlier one."""
 
 GAP = "RecordingGap"
-"""Class that a :class:`RecordedError` names where records were not written."""
+"""Name of a :class:`RecordedError` for records that were not written."""
 
 MAX_MESSAGE_BYTES = 1 << 26
-"""Largest number of bytes of a message, written or read. A frame stands in one as bytes and as
-fields, so this has room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
+"""Largest number of bytes of a message, written or read. A frame's message has its bytes and its
+fields, so this is enough for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
 
 MAX_PICTURE_SIZE_BYTES = 1 << 27
 """Largest number of bytes of a picture that is written: half of the largest record that is read."""
 
 MAX_VALUES = 3_000_000
-"""Commas and opening brackets of a message, written or read: each may become an object that takes
-a hundred times its room. A container of 1 MiB with a field a byte has two million."""
+"""Largest number of commas and opening brackets of a message, written or read: each may become an
+object of a hundred times its size. A container of 1 MiB with one field a byte has two million."""
 
 MAX_CAMERAS = 10_000
 """Largest number of cameras in a file: their facts are kept while it is read."""
 
 MAX_NAME_CHARACTERS = 1000
-"""Largest number of characters of a camera's name: a client takes 200, and HOST:PORT has fewer than
-300."""
+"""Largest number of characters of a camera's name: a client allows 200, and HOST:PORT has fewer
+than 300."""
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 
@@ -84,15 +83,15 @@ MAX_CAPTURE_TIME = 18_446_744_073.0
 
 
 class RecordedError(NamedTuple):
-    """Something went wrong while it was recorded: what ``Observer.on_error`` is told.
+    """An error during the recording, from ``Observer.on_error``.
 
     Attributes:
         camera: name of the camera.
-        at: time at which the recorder was told, UTC.
+        at: time of the error, UTC.
         error: name of the exception's class.
         text: text of the error.
-        triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended so.
-        since: time of the first record that was not written, UTC, where ``error`` is
+        triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended with it.
+        since: time of the first record that was not written, UTC, if ``error`` is
             ``RecordingGap``; ``at`` is that of the last one. None for other errors.
         records: number of records in a gap that were not written. None for other errors.
     """
@@ -107,16 +106,16 @@ class RecordedError(NamedTuple):
 
 
 class RecordedPicture(NamedTuple):
-    """A picture, as a source of frames gave it.
+    """A picture from a source of frames.
 
     Attributes:
         camera: name of the camera.
         at: time of the capture, UTC.
         frame: the :class:`~smartcam.frames.Frame`.
-        left_out: pictures before it that were not written, since too much waited for the disk.
-        result_number: :attr:`~smartcam.Result.number` of the result that was made of the picture;
-            None if the recorder was not told.
-        result_received_at: when that result came, UTC: each client begins its numbers anew.
+        left_out: earlier pictures that were not written, since too much waited for the disk.
+        result_number: :attr:`~smartcam.Result.number` of the picture's result; None if it is not
+            known.
+        result_received_at: time of that result, UTC, since each client counts its results from 1.
     """
 
     camera: str
@@ -132,7 +131,7 @@ Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError | RecordedPi
 
 
 def captured_at(frame: Frame) -> datetime:
-    """Return when a picture was captured, as near as a recording can say it."""
+    """Return the time of a picture's capture, with the resolution of a recording."""
     return datetime.fromtimestamp(min(max(0.0, frame.utc), MAX_CAPTURE_TIME), UTC)
 
 
@@ -150,7 +149,7 @@ class Kind(NamedTuple):
 
     @property
     def json_schema(self) -> dict[str, Any]:
-        """The JSON Schema of its messages."""
+        """The JSON Schema of the messages."""
         return {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             "title": self.schema,
@@ -171,23 +170,23 @@ def load_extra(name: str) -> Any:
 
 
 def load_compress() -> Callable[[bytes], bytes]:
-    """Return the function that packs a chunk; raises as :func:`load_extra`."""
+    """Return the function that compresses a chunk; raises as :func:`load_extra`."""
     compress: Callable[[bytes], bytes] = load_extra("zstandard").compress
     return compress
 
 
 def nanoseconds(at: datetime) -> int:
-    """Return a time as MCAP has it: nanoseconds since 1970, UTC; never negative."""
+    """Return a time in MCAP's form: nanoseconds since 1970, UTC; never negative."""
     since = at - EPOCH
     seconds = since.days * 86_400 + since.seconds
     return max(0, seconds * 1_000_000_000 + since.microseconds * 1000)
 
 
 def count_values(data: bytes) -> int:
-    """Return the number of values of a message, roughly, and hold it against the bounds.
+    """Return the approximate number of values of a message, and check its bounds.
 
     Raises:
-        ValueError: the message goes beyond one.
+        ValueError: the message exceeds a bound.
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE_BYTES} at most")
@@ -203,11 +202,11 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
     Args:
         kind: name of the kind of item, a key of ``KINDS``.
         item: item to write.
-        raw_from: number, for a result, of the frame that has its ``raw``, which is not written
-            then.
+        raw_from: number of the frame with the ``raw`` of a result, which is then not written
+            again.
 
     Raises:
-        ValueError: nobody could read it back.
+        ValueError: the message could not be read again.
     """
     to_text = KINDS[kind].to_text
     return bounded(to_text(item) if raw_from is None else to_text(item, raw_from))
@@ -217,16 +216,16 @@ def bounded(text: str) -> bytes:
     """Return a message's text as bytes.
 
     Raises:
-        ValueError: nobody could read it back.
+        ValueError: the message could not be read again.
     """
     data = text.encode()
-    if len(data) > min(MAX_MESSAGE_BYTES, MAX_VALUES):  # a shorter one has fewer values
+    if len(data) > min(MAX_MESSAGE_BYTES, MAX_VALUES):  # a shorter message has fewer values
         count_values(data)
     return data
 
 
 def message_fields(data: bytes) -> dict[str, Any]:
-    """Return the object that a message is.
+    """Return the object of a message.
 
     Raises:
         ValueError: the message is not valid.
@@ -271,10 +270,10 @@ T = TypeVar("T")
 
 
 def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
-    """Return a field that must be there.
+    """Return a required field.
 
     Raises:
-        ValueError: the field is not there, or something else.
+        ValueError: the field is missing, or of another type.
     """
     value = optional(fields, name, kind)
     if value is None:
@@ -283,10 +282,10 @@ def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
 
 
 def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
-    """Return a field that may be missing.
+    """Return an optional field.
 
     Raises:
-        ValueError: the field is something else.
+        ValueError: the field is of another type.
     """
     value: object = fields.get(name)
     if value is None:
@@ -307,7 +306,7 @@ def camera_name(fields: Mapping[str, Any]) -> str:
 
 
 def time_of(text: str) -> datetime:
-    """Return the time that a text says, UTC.
+    """Return the time of a text, UTC.
 
     Raises:
         ValueError: the text is not valid, or has no time zone.
@@ -328,10 +327,10 @@ def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
 
 
 def status_of(names: object) -> Status:
-    """Return the status of its bits' names; a bit without a name stands there as ``0x40``.
+    """Return the status from its bits' names; a bit without a name is written as ``0x40``.
 
     Raises:
-        ValueError: the words are no names of bits.
+        ValueError: a word is not the name of a bit.
     """
     bits = 0
     for name in cast("list[object]", names) if isinstance(names, list) else [names]:
@@ -346,7 +345,7 @@ def status_of(names: object) -> Status:
     return Status(bits)
 
 
-_BIT_DIGITS = len("0x") + 16  # 64 bits: the vendor's 32 and 32 of ours
+_BIT_DIGITS = len("0x") + 16  # 64 bits: the vendor's 32 and 32 of smartcam
 
 
 def _frame(fields: dict[str, Any]) -> TraceEntry:
@@ -556,7 +555,7 @@ PICTURES = "pictures"
 """Last part of the topic of pictures."""
 
 PICTURE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo")
-"""Schemas of pictures, which are read by another distribution of smartcam."""
+"""Schemas of pictures, which another distribution of smartcam reads."""
 
 ANNOTATIONS = "annotations"
 """Last part of the topic of marks on pictures."""

@@ -1,8 +1,8 @@
-"""Frames and results as JSON, put together: they are nearly all that is in a recording.
+"""Frames and results as JSON, with fast code, since a recording consists mostly of them.
 
-The text is that of ``json.dumps(jsonable(item))`` without white space and without what is None,
-character for character, but that bytes are in it once (:func:`frame_text`, :func:`result_text`).
-What is not of the types that a client makes goes that way itself.
+The text is that of ``json.dumps(jsonable(item))`` without white space and without fields that are
+None, but bytes are in it only once (:func:`frame_text`, :func:`result_text`). Values of types that
+a client does not make are converted by that call itself.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.observers import RawFrame
 
 MAX_FRAMES_ALIKE = 256
-"""Kinds of frames whose text is kept, apart from their time and data."""
+"""Largest number of kinds of frames whose text is kept, without their time and data."""
 
 VALUE_IS_RAW = '"raw"'
 
@@ -26,8 +26,8 @@ VALUE_IS_RAW = '"raw"'
 def frame_text(entry: TraceEntry) -> str:
     """Return a frame's text.
 
-    A body's ``data`` that is the end of the frame is not written a second time: ``data_from`` says
-    at which of the frame's bytes it begins (:func:`with_data`).
+    If a body's ``data`` is the end of the frame, it is not written a second time: ``data_from`` is
+    the byte of the frame at which it begins (:func:`with_data`).
     """
     at, camera, direction, message_id, message, fields, data = entry
     data_from = None
@@ -47,17 +47,17 @@ def frame_text(entry: TraceEntry) -> str:
 
 
 class FrameTexts:
-    """Makes the texts of frames; of those that are alike but for their data, most of it once."""
+    """Makes the texts of frames, with cached parts for frames that differ only in their data."""
 
     def __init__(self) -> None:
-        # by all that tells a kind: what stands in front of the data and behind it. The dialect is
-        # kept with them, as its place in memory would be another one's afterwards
+        # text before and after the data, by the kind of frame. The dialect is kept as well, since
+        # its id in memory could otherwise be reused
         self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
 
     def text(self, raw: RawFrame) -> tuple[str, str]:
-        """Return a frame's text as :func:`frame_text` makes it, and its data as hex.
+        """Return a frame's text, as from :func:`frame_text`, and its data as hex.
 
-        The data is "" where there is none, and where the frame is no camera's.
+        The data is "" without data, and for frames of the client.
         """
         frame, dialect = raw.frame, raw.dialect
         if isinstance(frame, TraceEntry):
@@ -83,13 +83,13 @@ class FrameTexts:
 
 
 def body_of(entry: TraceEntry) -> str:
-    """Return the data that a frame of the camera has, as hex; "" where it has none."""
+    """Return the data of a camera's frame as hex; "" without data."""
     data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
     return data if type(data) is str else ""
 
 
 def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[str, Any]:
-    """Return a body with its ``data`` again, which begins at that byte of the frame.
+    """Return a body with its ``data``, which begins at byte ``data_from`` of the frame.
 
     Raises:
         ValueError: the frame has no such byte.
@@ -101,7 +101,7 @@ def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[
 
 
 def result_text(result: Result[Any], raw_from: int | None = None) -> str:
-    """Return a result's text, without what stands elsewhere in the file.
+    """Return a result's text, without bytes that are elsewhere in the file.
 
     Args:
         result: result to write.

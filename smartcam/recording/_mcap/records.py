@@ -1,8 +1,8 @@
-"""The records of an MCAP file, within bounds: a file may lie about everything in it.
+"""Read the records of an MCAP file within bounds, since any length in a file may be wrong.
 
-What is compressed is inflated piece by piece and never beyond a bound, lengths are held against
-what is there, and what nobody needs (indexes, attachments) is skipped unread. A file that says how
-many messages it has must have as many: damage can make a chunk look like what is skipped.
+Chunks are inflated piece by piece within a bound, lengths are compared with the available bytes,
+and indexes and attachments are skipped. If a file has the number of its messages, the number must
+be right: damage can make a chunk look like a record that is skipped.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_RECORD_BYTES = 1 << 28
-"""Largest number of bytes of one record of a file: ours have about 1 MiB, a damaged length says
-anything."""
+"""Largest number of bytes of one record of a file: smartcam's have about 1 MiB, a damaged length
+may be anything."""
 
 MAX_CHUNK_BYTES = MAX_MESSAGE_BYTES + (1 << 21)
-"""Largest number of bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so
+"""Largest number of bytes to which a chunk may unpack. A recorder ends its chunk after 1 MiB, so
 the largest has one message more; 2 kB of zstd can claim as much as this."""
 
 MAX_FACTS_BYTES = 1 << 20
-"""Largest number of bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
+"""Largest number of bytes of a schema, a channel or a metadata record: smartcam's have 2 kB."""
 
 MIN_RECORDS = 10_000
-"""Least number of records that every file may have; a larger file as many as it has bytes. A
-recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer than
-these."""
+"""Number of records that every file may have; a larger file may have as many as it has bytes. A
+recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer
+records."""
 
 MIN_UNPACKED_BYTES = 1 << 29
-"""Least number of bytes that the chunks of every file may unpack to together: seconds of work."""
+"""Number of bytes to which the chunks of every file may unpack together: seconds of work."""
 
 UNPACKED_PER_BYTE = 10_000
-"""Bytes that a larger file may unpack to for each of its own. Containers of nothing but zeros come
-to 6,000; a bomb to 30,000."""
+"""Number of bytes to which a larger file may unpack for each of its own. Containers of zeros reach
+6,000; a decompression bomb 30,000."""
 
 PIECE_BYTES = 1 << 18
-"""Bytes that are read or inflated at once."""
+"""Number of bytes that are read or inflated at once."""
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -56,25 +56,25 @@ _CHUNK_HEAD = struct.Struct("<QQQI")
 
 
 class CutOffError(Exception):
-    """The file ends before it is over."""
+    """The file ends before its last record."""
 
 
 class Schema(NamedTuple):
-    """A schema: what messages of a channel are."""
+    """A schema of messages."""
 
     id: int
     name: str
 
 
 class Channel(NamedTuple):
-    """A channel, and which schema its messages have."""
+    """A channel, with the id of its messages' schema."""
 
     id: int
     schema_id: int
 
 
 class McapMessage(NamedTuple):
-    """A message, its channel and its number there; ``data`` is of the chunk."""
+    """A message, its channel and its number there; ``data`` is a view of the chunk."""
 
     channel_id: int
     sequence: int
@@ -93,7 +93,7 @@ Record: TypeAlias = Schema | Channel | McapMessage | Metadata
 
 @dataclass(eq=False)
 class RecordReader:
-    """Reads a file from its begin to its end, once."""
+    """Reads a file from its beginning to its end, once."""
 
     _stream: IO[bytes]  # stream at the beginning of the file
     _name: object  # name of the file, for errors
@@ -101,17 +101,17 @@ class RecordReader:
     def __post_init__(self) -> None:
         self.place: int = 0  # bytes read so far
         self._count = 0  # records read
-        self._messages = 0  # of these
-        self._unpacked = 0  # bytes that chunks unpacked to, and that results have of frames
+        self._messages = 0  # messages read
+        self._unpacked = 0  # unpacked bytes of chunks, and bytes of results from frames
         self._crc = 0
 
     def records(self) -> Iterator[Record]:
-        """Yield the records that a recording is read from, in the order of the file.
+        """Yield the records that a recording needs, in the order of the file.
 
         Raises:
             CutOffError: the file ends before its last record.
-            RecordingError: the file goes beyond a bound.
-            ValueError: the file is damaged here.
+            RecordingError: the file exceeds a bound.
+            ValueError: the file is damaged at this place.
         """
         self._check_magic()
         while True:
@@ -145,10 +145,10 @@ class RecordReader:
                 self._skip(length)
 
     def count_unpacked(self, size: int) -> None:
-        """Count bytes that something in the file stands for.
+        """Count unpacked bytes.
 
         Raises:
-            RecordingError: with them it goes beyond the bound.
+            RecordingError: their sum exceeds the bound.
         """
         self._unpacked += size
         if self._unpacked > max(MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE * self.place):
@@ -159,7 +159,7 @@ class RecordReader:
             )
 
     def _unpack(self, body: memoryview) -> Iterator[Record]:
-        """Yield the records of a chunk; its bytes are kept until the last was taken."""
+        """Yield the records of a chunk, whose bytes are kept until the last record."""
         data = self._inflated(body)
         place = 0
         while place < len(data):
@@ -194,7 +194,7 @@ class RecordReader:
         return data
 
     def _pieces(self, inflate: Callable[[int], bytes]) -> bytearray:
-        """Join what comes, up to the bound."""
+        """Join inflated pieces, up to the bound."""
         data = bytearray()
         while piece := inflate(PIECE_BYTES):
             data += piece
@@ -222,7 +222,7 @@ class RecordReader:
             raise ValueError(f"{came.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
 
     def _read(self, size: int) -> bytes:
-        """Return the next bytes; what a length says is reserved as it comes, not before."""
+        """Return the next bytes; allocate memory only as they come, not by the length."""
         if size <= PIECE_BYTES:
             return self._piece(size)
         data = bytearray()
@@ -245,14 +245,14 @@ class RecordReader:
 
 @dataclass(slots=True, eq=False)
 class _Body:
-    """A record's fields, one after the other."""
+    """A reader of a record's fields, one after the other."""
 
     _data: memoryview
     _place: int = 0
 
     @property
     def left(self) -> int:
-        """Bytes that follow."""
+        """Number of remaining bytes."""
         return len(self._data) - self._place
 
     def take(self, size: int) -> memoryview:
@@ -279,7 +279,7 @@ def _small(length: int) -> int:
 
 def _schema(data: memoryview) -> Schema:
     fields = _Body(data)
-    return Schema(fields.number(2), fields.text()[:200])  # another program's may be long
+    return Schema(fields.number(2), fields.text()[:200])  # another program's name may be long
 
 
 def _channel(data: memoryview) -> Channel:
@@ -343,7 +343,7 @@ def _lz4(packed: memoryview) -> Callable[[int], bytes]:
             data: bytes = inflater.decompress(rest, max_length=size)
         except RuntimeError as exc:
             raise ValueError(f"a chunk is no lz4: {exc}") from exc
-        rest = b""  # it keeps what it has not used
+        rest = b""  # the decompressor keeps unused bytes
         return data
 
     return inflate

@@ -1,6 +1,6 @@
-"""Write MCAP: chunks of messages packed by zstd, their indexes, and the summary at the end.
+"""Write MCAP: chunks of messages compressed by zstd, their indexes, and the summary at the end.
 
-The bytes are those of the mcap library's ``Writer`` with the same calls, in a fifth of its time per
+The bytes are those of the mcap library's ``Writer`` for the same calls, in a fifth of its time per
 message, which is most of the cost of a small message.
 """
 
@@ -19,7 +19,7 @@ _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX = range(0x
 _CHUNK_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX = 0x08, 0x0B, 0x0C, 0x0D
 _ATTACHMENT_INDEX, _SUMMARY_OFFSET, _DATA_END = 0x0A, 0x0E, 0x0F
 
-_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+_HEAD = struct.Struct("<BQ")  # opcode, length of the record's content
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS = _MESSAGE_HEAD.size - _HEAD.size
 _CHUNK_FIELDS = struct.Struct("<QQQI")
@@ -36,7 +36,7 @@ class McapWriter:
 
     Args:
         stream: the file, open.
-        compress: function that packs a chunk, such as ``zstandard.compress``.
+        compress: function that compresses a chunk, such as ``zstandard.compress``.
         chunk_size: number of bytes at which a chunk is ended.
     """
 
@@ -47,8 +47,8 @@ class McapWriter:
         self._compress = compress
         self._chunk_size = chunk_size
         self._parts: list[bytes] = []  # parts of the chunk that is being filled
-        self._packs = True  # the chunk when it is ended
-        self._size = 0  # number of bytes in these
+        self._packs = True  # whether the chunk will be compressed
+        self._size = 0  # number of bytes of the parts
         # times and offsets in the chunk by channel, alternating
         self._places: dict[int, list[int]] = {}
         self._first = self._last = 0  # first and last time of its messages
@@ -95,8 +95,8 @@ class McapWriter:
             at: time of the message, nanoseconds since 1970, UTC.
             data: bytes of the message.
             sequence: the channel's own count.
-            packs: whether the message is worth packing; a chunk with a message that is not stays as
-                it is.
+            packs: whether the message should be compressed; a chunk with a message that should not
+                be is written uncompressed.
         """
         self._packs = self._packs and packs
         places = self._places.get(channel)
@@ -161,7 +161,7 @@ class McapWriter:
             self.end_chunk()
 
     def end_chunk(self) -> None:
-        """Write the chunk; one without messages is not ended."""
+        """Write the chunk, unless it has no messages."""
         if not self._places:
             return
         data = b"".join(self._parts)

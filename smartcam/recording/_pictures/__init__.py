@@ -1,1 +1,1 @@
-"""Pictures in recordings: their messages, their recorder, and their replay as a source."""
+"""Pictures in recordings: their messages, their recorders, and a driver that replays them."""

@@ -1,4 +1,4 @@
-"""A recording as a source of frames: its pictures come again, with their times and gaps."""
+"""A source of frames that replays a recording's pictures, with their times and gaps."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_DELAY: Final = 0.5
-"""Seconds that a picture may be late before the ones behind it are late as well."""
+"""Seconds by which a picture may be late before later ones are delayed as well."""
 
 MAX_LOOKAHEAD: Final = 100
-"""Items behind the first picture among which one of another camera is looked for."""
+"""Number of items after the first picture that are searched for pictures of other cameras."""
 
 STOP_TIMEOUT: Final = 5.0
-"""Seconds that the disk may take for a picture that nobody wants any more."""
+"""Seconds to wait for the disk to read a picture after the replay has stopped."""
 
 MAX_SPEED: Final = 1000.0
 
@@ -43,9 +43,9 @@ _KNOWN: Final = ("camera", "name", "pace", "speed")
 
 
 class RecordedDriver(TaskDriver):
-    """The pictures in a recording: ``run.mcap``, or a folder of recordings that follow each other.
+    """Replays the pictures of a recording: ``run.mcap``, or a folder of consecutive recordings.
 
-    Parameters stand behind ``#``: ``run.mcap#camera=left&pace=none``.
+    Parameters follow after ``#``: ``run.mcap#camera=left&pace=none``.
 
     ========== ====================================================================================
     ``camera`` name of the camera in the recording; needed where several have pictures
@@ -55,10 +55,10 @@ class RecordedDriver(TaskDriver):
     ``name``   of the source; usual that of the camera
     ========== ====================================================================================
 
-    A frame is the one that was recorded: its bytes, number, ``utc``, ``device_time``, ``moment``
-    and ``duration``; ``lost`` are those that were lost or not recorded before it. Only ``captured``
-    is of the replay: on ``time.monotonic()``, as far apart as then. A recording may be silent for
-    longer than a source allows: ``stall=None`` lets it.
+    A frame has the recorded bytes, number, ``utc``, ``device_time``, ``moment`` and ``duration``;
+    ``lost`` counts frames that were lost or not recorded before it. Only ``captured`` is a time of
+    the replay, on ``time.monotonic()``, with the recorded intervals. If a recording is silent for
+    longer than a source allows, use ``stall=None``.
     """
 
     times_frames: ClassVar[bool] = True
@@ -82,15 +82,15 @@ class RecordedDriver(TaskDriver):
 
     @property
     def name(self) -> str:
-        """The name of the camera, or as the URL says; before it is opened, the path."""
+        """The name in the URL, or of the camera; the path before the driver is opened."""
         return self._said_name or self._camera or str(self._path)
 
     async def open(self) -> StreamFormat:
-        """Look for the first picture.
+        """Find the first picture.
 
         Raises:
-            FrameFormatError: there is no picture in it, or there are those of several cameras.
-            FrameSourceError: the path does not exist, or no recording of smartcam.
+            FrameFormatError: the recording has no pictures, or those of several cameras.
+            FrameSourceError: the path does not exist, or is no recording of smartcam.
         """
         first = await asyncio.to_thread(self._first)
         self._camera = first.camera
@@ -131,7 +131,7 @@ class RecordedDriver(TaskDriver):
         )
 
     async def stop(self) -> None:
-        """Play no longer."""
+        """Stop the replay."""
         await super().stop()
         reading, self._reading = self._reading, None
         if reading is not None:
@@ -140,7 +140,7 @@ class RecordedDriver(TaskDriver):
     # ------------------------------------------------------------------ playing
 
     def _pictures(self) -> Iterator[RecordedPicture]:
-        """Yield the camera's pictures; those that a gap has count as left out."""
+        """Yield the camera's pictures; those of a gap count as left out."""
         gap = 0
         for item in each_item(self._path, lambda text: _log.warning("%s", text)):
             if item.camera != self._camera:
@@ -152,14 +152,14 @@ class RecordedDriver(TaskDriver):
                 gap = 0
 
     async def _next(self, pictures: Iterator[RecordedPicture]) -> RecordedPicture | None:
-        """Have a thread read the next picture; None at the end."""
+        """Return the next picture, read in a thread; None at the end."""
         reading = asyncio.get_running_loop().run_in_executor(None, next, pictures, None)
         self._reading = reading
         reading.add_done_callback(_looked_at)
         return await asyncio.shield(reading)
 
     async def deliver(self, sink: FrameSink) -> None:
-        """Play the recording from its beginning."""
+        """Replay the recording from its beginning."""
         pictures = self._pictures()
         loop = asyncio.get_running_loop()
         last: Frame | None = None
@@ -179,7 +179,7 @@ class RecordedDriver(TaskDriver):
                 last = frame
         except (ConfigurationError, RecordingError) as exc:
             sink.ended(FrameSourceError(str(exc), source=self.name))
-        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+        except Exception as exc:  # noqa: BLE001 - readers get every error
             failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
             failed.__cause__ = exc
             sink.ended(failed)
@@ -188,7 +188,7 @@ class RecordedDriver(TaskDriver):
 
 
 def _between(last: Frame, frame: Frame) -> float:
-    """Return the seconds between two captures: by the steady clock, if both are of one run."""
+    """Return the seconds between two captures, by the monotonic clock if both are from one run."""
     by_clock, by_utc = frame.captured - last.captured, frame.utc - last.utc
     same_run = by_clock >= 0 and abs(by_clock - by_utc) < 1 + 0.01 * by_clock
     return by_clock if same_run else max(0.0, by_utc)
@@ -196,4 +196,4 @@ def _between(last: Frame, frame: Frame) -> float:
 
 def _looked_at(done: asyncio.Future[RecordedPicture | None]) -> None:
     if not done.cancelled():
-        done.exception()  # nobody may be there for it any longer
+        done.exception()  # the caller may no longer wait

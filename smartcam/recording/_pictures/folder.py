@@ -1,4 +1,4 @@
-"""Pictures in files that follow each other, the oldest of which are deleted."""
+"""Record pictures into consecutive files, of which the oldest are deleted."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 MIN_FILE_BYTES: Final = 1e5
 MAX_FILE_BYTES: Final = 1e15
 MAX_AGE: Final = 86_400.0 * 366
-"""Seconds after which a file ends at the latest."""
+"""Largest age of a file, seconds."""
 
 
 class RotatingRecorder:
-    """Records pictures into a folder, as an agent records its cameras.
+    """Records pictures into a folder, like an agent that records its cameras.
 
     ::
 
@@ -47,17 +47,17 @@ class RotatingRecorder:
             async with smartcam.frames.open(url) as source:
                 await folder.record(source)
 
-    Each camera has files of its own, such as ``left_20260102T030405.678Z.mcap``. A full, slow or
-    missing disk costs pictures, which are counted and told in the files; when it is better, the
+    Each camera has files of its own, such as ``left_20260102T030405.678Z.mcap``. If the disk is
+    full, slow or missing, pictures are lost, and counted in the files; when it works again, the
     recording goes on.
 
     Args:
-        path: the folder; made if new.
-        size: bytes of a file, behind which the next one begins.
-        age: seconds of a file, behind which the next one begins.
-        keep: bytes of all files together; beyond them the oldest recordings are deleted.
-        on_trouble: function that is called in the writer's thread with why nothing is written, and
-            with None when it is again.
+        path: the folder; created if it does not exist.
+        size: bytes of a file, after which the next one begins.
+        age: seconds of a file, after which the next one begins.
+        keep: bytes of all files together, beyond which the oldest recordings are deleted.
+        on_trouble: function that is called in the writer's thread with the error when nothing can
+            be written, and with None when it can again.
 
     Attributes:
         path: path that was given.
@@ -90,7 +90,7 @@ class RotatingRecorder:
 
         Raises:
             ConfigurationError: another recorder writes in the folder.
-            MissingExtraError: what packs the chunks is not installed.
+            MissingExtraError: the library that compresses the chunks is not installed.
         """
         if self._writer is not None:
             raise ConfigurationError(f"recordings {self.path}: opened before; make a new recorder")
@@ -101,7 +101,7 @@ class RotatingRecorder:
         return self
 
     def close(self) -> None:
-        """Write what waits and end the files; idempotent. It waits for the disk, 30 s at most."""
+        """Write waiting pictures and end the files; wait for the disk, 30 s at most. Idempotent."""
         if self._writer is not None:
             self._writer.stop()
 
@@ -118,23 +118,23 @@ class RotatingRecorder:
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None if all is well."""
+        """Error because of which nothing is written now; None without one."""
         return None if self._writer is None else self._writer.trouble
 
     @property
     def has_room(self) -> bool:
-        """True if less than half of the pictures wait that may wait for the disk."""
+        """True if less than half of the room for waiting pictures is used."""
         return self._writer is None or self._writer.waiting < MAX_WAITING_PICTURE_BYTES // 2
 
     def add_picture(self, frame: Frame, *, camera: str = "") -> bool:
-        """Keep a picture, or leave it out and count it where too much waits. Never waits.
+        """Add a picture, or leave it out and count it if too much waits. Never waits.
 
         Args:
             frame: picture of a source of frames; its bytes are kept until they are written.
             camera: name of the camera; default made of the frame's source by :func:`file_name`.
 
         Returns:
-            True if the picture is kept.
+            True if the picture was added.
 
         Raises:
             ConfigurationError: an argument is wrong.
@@ -168,11 +168,11 @@ class RotatingRecorder:
         count: int | None = None,
         on_start: Callable[[], None] = lambda: None,
     ) -> ReaderStatistics:
-        """Record every picture of a source, as :meth:`Recorder.record` does."""
+        """Record every picture of a source, like :meth:`Recorder.record`."""
         return await record_frames(source, self, camera, count, on_start)
 
     async def wait_failed(self) -> RecordingError:
-        """Wait without end: what a disk does ends no such recording.
+        """Wait forever: errors of the disk do not end such a recording.
 
         Cancellation: safe.
         """
@@ -181,7 +181,7 @@ class RotatingRecorder:
 
 
 def file_name(name: str) -> str:
-    """Return the name that a source has in a recording: lower case letters, digits and hyphens."""
+    """Return the name of a source in a recording: lower case letters, digits and hyphens."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
 
 

@@ -1,4 +1,4 @@
-"""Pictures that a camera was asked for, as frames."""
+"""Pictures from ``read_image()`` as frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def frame_of_image(camera: str, image: bytes, result: Result[Any] | None) -> Frame:
-    """Return the frame of a bitmap: it was taken before now, and behind its result's trigger.
+    """Return the frame of a bitmap, which was captured before now, and after its result's trigger.
 
     Raises:
         FrameFormatError: the file is no bitmap.

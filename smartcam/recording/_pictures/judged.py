@@ -1,4 +1,4 @@
-"""Record of a shared camera the pictures that its results were made of."""
+"""Record the pictures of a shared camera's results."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from smartcam.recording._recorder import Recorder
 
 MAX_MATCHED_BYTES: Final = 1 << 26
-"""Largest number of bytes of a camera's last pictures that are kept until the result that was made
-of one comes."""
+"""Largest number of bytes of a camera's last pictures that are kept until their results
+come."""
 
 FIRST_PICTURE_TIMEOUT: Final = 2.0
-"""Seconds until the first picture is there, at most, before the first trigger is sent."""
+"""Seconds to wait for the first picture before the first trigger is sent."""
 
 LAST_PICTURE_TIMEOUT: Final = 2.0
-"""Seconds that the picture of a result may come behind it, at most, where the recording ends."""
+"""Seconds to wait for the last result's picture at the end of the recording."""
 
 
 class JudgedPictures(Observer):
-    """Puts the picture of each result into a recording, where the times say which one it is.
+    """Adds the picture of each result to a recording, if it can be found by its time.
 
-    It observes the camera whose results are recorded; its pictures come from elsewhere.
+    It observes the camera whose results are recorded; its pictures come from a source of frames.
 
     Args:
         recorder: recorder that keeps the pictures.
@@ -45,7 +45,7 @@ class JudgedPictures(Observer):
         self._streams = asyncio.Event()
 
     def on_results(self, results: Sequence[Result]) -> None:
-        """Look for the pictures of results."""
+        """Find the pictures of results."""
         self._settled.clear()
         self._matcher.results += results
         self._settle(results[0].camera)
@@ -54,9 +54,9 @@ class JudgedPictures(Observer):
         """Record pictures of an open source until it ends.
 
         Raises:
-            FrameSourceError: the source is gone, or stuck.
+            FrameSourceError: the source is lost, or hangs.
 
-        Cancellation: safe; everything until then is recorded.
+        Cancellation: safe; earlier pictures are recorded.
         """
 
         def take(frame: Frame) -> bool:
@@ -72,13 +72,13 @@ class JudgedPictures(Observer):
             tap.close()
 
     async def wait_streaming(self) -> None:
-        """Wait until a picture has come, before which no result can have one; 2 s at most."""
+        """Wait until the first picture has come, 2 s at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FIRST_PICTURE_TIMEOUT):
                 await self._streams.wait()
 
     async def wait_settled(self) -> None:
-        """Wait until each result so far has its picture, or can have none; 2 s at most."""
+        """Wait until the picture of each result has come or cannot come, 2 s at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_PICTURE_TIMEOUT):
                 await self._settled.wait()

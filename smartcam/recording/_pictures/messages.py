@@ -1,8 +1,8 @@
-"""Pictures as Foxglove's messages of Protocol Buffers, with what a frame says beside the pixels.
+"""Pictures as Foxglove's messages of Protocol Buffers, with the other attributes of a frame.
 
 A viewer reads ``foxglove.RawImage``, ``CompressedImage`` or ``CompressedVideo``. Fields from 100 on
-are ours, and part of the schema in the file: the pixel format by its PFNC name, the times as the
-source had them, the number, what was lost. So the frame that is read is the frame that was written.
+are smartcam's, and part of the schema in the file: the PFNC name of the pixel format, the source's
+times, the number, the lost frames. So the frame that is read equals the frame that was written.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import Drawing
 
 MAX_SIDE_PX: Final = 1 << 20
-"""Pixels along a side of a picture that is written, or read."""
+"""Largest number of pixels along a side of a picture that is written or read."""
 
 MAX_FIELDS: Final = 1000
-"""Largest number of fields of a message that is read; ours have fewer than 30."""
+"""Largest number of fields of a message that is read; smartcam's have fewer than 30."""
 
 RAW: Final = "foxglove.RawImage"
 COMPRESSED: Final = "foxglove.CompressedImage"
@@ -58,7 +58,7 @@ _ENCODINGS: Final = {
     "YUV422_8": "yuyv",
     "YUV422_8_UYVY": "uyvy",
 }
-"""Encodings that Foxglove knows, by our formats; all others have the name of the format itself."""
+"""Foxglove's encodings, by smartcam's formats; others have the name of the format itself."""
 
 _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": "h264"}
 
@@ -83,8 +83,9 @@ _OURS: Final = {
     "result_received": WireField(116, "double"),
     "annotations_from": WireField(117, "uint64"),
 }
-"""Fields of ours: those of a frame, what the recorder left out before, number and arrival of the
-result that was made of the picture, and which message of ``/CAMERA/annotations`` has its marks."""
+"""smartcam's fields: attributes of a frame, pictures that the recorder left out before it, number
+and arrival of its result, and the number of the message in ``/CAMERA/annotations`` with its
+marks."""
 
 SCHEMAS: Final[dict[str, Fields]] = {
     RAW: {
@@ -127,11 +128,11 @@ def schema_of(picture: RecordedPicture) -> str:
 
 
 def check_readable(frame: Frame) -> None:
-    """See that what is written of a frame can be read again.
+    """Check that the message of a frame can be read again.
 
     Raises:
-        FrameFormatError: the message cannot be, and the recording would end there for those who
-            read it.
+        FrameFormatError: the message could not be read, and neither could the rest of the
+            recording.
     """
     said, form = "", find_format(frame.format.name)
     if not (1 <= frame.width <= MAX_SIDE_PX and 1 <= frame.height <= MAX_SIDE_PX):
@@ -193,7 +194,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
         encoding = _ENCODINGS.get(frame.format.name, frame.format.name)
         values |= {"width": frame.width, "height": frame.height, "step": frame.stride}
         values["encoding"] = encoding
-        if frame.format.name in _ENCODINGS:  # the last row may have come without its padding
+        if frame.format.name in _ENCODINGS:  # the last row may lack its padding
             padding = bytes(max(0, frame.stride * frame.height - data.nbytes))
     else:
         values["format"] = _COMPRESSIONS.get(frame.format.name, frame.format.name)
@@ -210,7 +211,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
 
 @cache
 def schema_data(name: str) -> bytes:
-    """Return the schema of a message as MCAP has it: a FileDescriptorSet."""
+    """Return the schema of a message for MCAP: a FileDescriptorSet."""
     return file_set(name, {name.partition(".")[2]: SCHEMAS[name]}, {})
 
 
@@ -229,7 +230,7 @@ def picture_of(
         drawings: marks in that message, which the picture gets if it names it.
 
     Raises:
-        ValueError: the message is not valid, or has not what its format asks for.
+        ValueError: the message is not valid, or lacks a field of its format.
     """
     values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
     said = _Values(values)
@@ -275,7 +276,7 @@ def _frame(said: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> 
 
 
 class _Values:
-    """The values of a message by the names of its fields, checked where they are asked for."""
+    """The values of a message by the names of its fields, checked on access."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values

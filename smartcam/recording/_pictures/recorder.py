@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
 
 class PictureRecorder(Protocol):
-    """Anything that pictures are recorded by: a file, a video, a folder of files."""
+    """A recorder of pictures: a file, a video, or a folder of files."""
 
     @property
     def has_room(self) -> bool:
-        """True if a picture would not have to wait long for the disk."""
+        """True if a picture would not wait long for the disk."""
         ...
 
     def add_picture(self, frame: Frame, *, camera: str = "") -> bool:
-        """Keep a picture; return False where it is left out, and counted."""
+        """Add a picture; return False if it is left out, and counted."""
         ...
 
     async def wait_failed(self) -> RecordingError:
-        """Wait until the recording fails and return why."""
+        """Wait until the recording fails and return the error."""
         ...
 
 
@@ -42,13 +42,13 @@ async def record_frames(
     count: int | None,
     on_start: Callable[[], None],
 ) -> ReaderStatistics:
-    """Record every picture of a source, as :meth:`Recorder.record` says."""
+    """Record every picture of a source, like :meth:`Recorder.record`."""
     check_kind(source, FrameSource, "source", "a FrameSource", "recording")
     if count is not None:
         count = check_integer(count, "count", 1, 1 << 62, "recording")
     check_callable(on_start, "on_start", "recording")
     camera = check_text(camera, "camera", "recording", most=MAX_NAME_CHARACTERS)
-    _ = source.format  # it is open
+    _ = source.format  # raises if the source is not open
     kept = 0
     refusals: list[SmartCamError] = []
 
@@ -57,7 +57,7 @@ async def record_frames(
         try:
             if kept == count or not recorder.add_picture(frame, camera=camera):
                 return False
-        except SmartCamError as exc:  # the driver, which calls, can do nothing about it
+        except SmartCamError as exc:  # must not reach the driver, which calls this
             refusals.append(exc)
             tap.close()
             return False

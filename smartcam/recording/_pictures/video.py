@@ -1,4 +1,4 @@
-"""Write pictures as a Matroska video, which loses only fractions of milliseconds of their times."""
+"""Write pictures as a Matroska video, with their times rounded to milliseconds."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class VideoFile:
             )
 
     def start(self) -> None:
-        """Do nothing: the first picture decides about the form."""
+        """Do nothing: the first picture decides the format."""
 
     def add(self, item: object, /) -> None:
         """Write a picture.

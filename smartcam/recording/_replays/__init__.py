@@ -1,1 +1,1 @@
-"""Emulate a recorded camera: what it sends at which time."""
+"""Emulate a recorded camera, with its messages and their times."""

@@ -1,10 +1,10 @@
-"""A recorded camera that spoke in lines, emulated: each line gets what the recorded one got.
+"""Emulate a recorded camera whose protocol has lines: each line gets its recorded answer.
 
-The n-th trigger gets what the n-th recorded one got, byte for byte and after the same time; a
-trigger behind the last one gets nothing. Every other line gets what the camera answered at the same
+The n-th trigger gets the answer of the n-th recorded one, byte for byte and after the same time; a
+trigger after the last one gets no answer. Every other line gets the camera's answer at the same
 moment of the recording: before the first trigger, during the n-th one, or after its answer. So a
-client that asks more or less often than the recorded one hears the state that belongs to the
-trigger. A line that was never said ends the connection: nobody knows its answer.
+client that sends a line more or less often than the recorded one gets the state that belongs to
+the trigger. A line that was not recorded ends the connection, since its answer is unknown.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class TimedLine(NamedTuple):
-    """Bytes that the camera said, so many seconds after what they answer."""
+    """Bytes that the camera sent, and the seconds since the line that they answer."""
 
     seconds: float
     data: bytes
@@ -45,14 +45,14 @@ class TimedLine(NamedTuple):
 
 @dataclass(slots=True)
 class LineAnswers:
-    """The answers to a line, for each time that it was said.
+    """The answers to a line, for each time that the client sent it.
 
     Attributes:
         given: the answers.
         moments: the moment of each: 0 before the first trigger, 2n - 1 during the n-th one, 2n
             after its answer.
-        next: index of the answer that is played next, where order decides.
-        asked: number of times that the line was said since the moment began.
+        next: index of the next answer, if they are played in order.
+        asked: number of times that the line was sent since the moment began.
         asked_at: moment that `asked` counts in.
     """
 
@@ -64,11 +64,11 @@ class LineAnswers:
 
     @property
     def left(self) -> int:
-        """Number of answers that were not played yet, in this round."""
+        """Number of answers that are left, in this round."""
         return max(0, len(self.given) - self.next)
 
     def take(self, *, loop: bool) -> list[TimedLine]:
-        """Return the next ones; behind the last the last again, or the first."""
+        """Return the next answer; after the last one the last again, or with ``loop`` the first."""
         if loop and self.next >= len(self.given):
             self.next = 0
         found = self.given[min(self.next, len(self.given) - 1)]
@@ -76,9 +76,9 @@ class LineAnswers:
         return found
 
     def take_at(self, moment: int) -> list[TimedLine]:
-        """Return the next ones of a moment; behind its last the last again.
+        """Return the next answer of a moment; after its last one the last again.
 
-        Where nothing was recorded then, the nearest moment of the same kind answers, an earlier one
+        Without an answer at the moment, use the nearest moment of the same kind, earlier ones
         first: before and after triggers are one kind, during triggers is the other.
         """
         if moment != self.asked_at:
@@ -94,10 +94,10 @@ class LineAnswers:
 
 @dataclass(slots=True)
 class LinesPlan:
-    """Everything that a recorded camera sent.
+    """The answers of a recorded camera.
 
     Attributes:
-        greeting: bytes sent before any line came.
+        greeting: bytes sent before the first line.
         answers: answers to each line, by the line without its end.
         secrets: answers to lines that were not recorded, such as passwords, by place in a session.
         triggers: number of triggers that were recorded.
@@ -110,7 +110,7 @@ class LinesPlan:
 
 
 def eight_bits(picture: Frame) -> NDArray[np.uint8]:
-    """Return the brightness of a picture, of more than 8 bits the upper 8."""
+    """Return the brightness of a picture; with more than 8 bits, the upper 8."""
     grey: NDArray[Any] = picture.grey()
     if grey.dtype.itemsize > 1:
         grey = grey >> (picture.format.depth - 8)
@@ -119,9 +119,9 @@ def eight_bits(picture: Frame) -> NDArray[np.uint8]:
 
 @dataclass(slots=True)
 class _AskedLine:
-    """A line of the recorded client: what it got, and where in the recording that began and ended.
+    """A line of the recorded client: its answer, and its begin and end in the recording.
 
-    A line that was not recorded is known by its place in its session.
+    A line that was not recorded, such as a password, is identified by its place in the session.
     """
 
     at: float
@@ -132,7 +132,7 @@ class _AskedLine:
 
 
 def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
-    """Work out what each line got: what came behind it, or what names it as its question.
+    """Find the answer to each line: bytes after it, or bytes that name it as their request.
 
     Raises:
         RecordingError: the recording is more than :data:`MAX_REPLAY_BYTES`.
@@ -156,7 +156,7 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
             )
         if item.direction == "<":
             answered = known.get(codec.answer_key(data), now)
-            answered.at = answered.at or at  # nobody asked for a greeting
+            answered.at = answered.at or at  # a greeting answers no line
             answered.end = number
             answered.pieces.append(TimedLine(max(0.0, at - answered.at), data))
             continue
@@ -170,13 +170,13 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
 
 
 def _forget_silence(lines: list[_AskedLine]) -> None:
-    """Leave out the last line of a link that ended before an answer: its answer is not known."""
+    """Leave out the last line of a link that ended before its answer, which is unknown."""
     if lines and not lines[-1].pieces:
         lines.pop()
 
 
 def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
-    """Put what each line got in its place in a plan."""
+    """Add the answer of each line to a plan."""
     triggers = [one for one in lines if isinstance(one.line, bytes) and is_trigger(codec, one.line)]
     plan.triggers = len(triggers)
     for one in lines:
@@ -203,12 +203,12 @@ def is_trigger(codec: LineCodec, line: bytes) -> bool:
 
 
 def bare(codec: LineCodec, data: bytes) -> bytes:
-    """Return a client's line without its end, and without what differs each time it is said."""
+    """Return a client's line without its end, and without parts that differ each time."""
     return codec.text(data).encode(codec.encoding, "replace")
 
 
 class ReplayedLines(LineCamera):
-    """An emulated camera that plays what a camera of lines said; see :func:`replay`."""
+    """An emulated camera that replays a camera whose protocol has lines; see :func:`replay`."""
 
     def __init__(
         self,
@@ -247,31 +247,31 @@ class ReplayedLines(LineCamera):
         self._on_over = None if loop else on_over
         self._places: dict[LineClient, int] = {}
         self._triggered = 0  # triggers that were played
-        self._answered = 0  # the last trigger that was answered to its end
+        self._answered = 0  # the last trigger whose whole answer was sent
         self._images = self._recorded_images(recording, known.name)
 
     def make_codec(self) -> LineCodec:
-        """Return the lines of the recorded camera."""
+        """Return the codec of the recorded camera."""
         return self._kind.make_codec(self)
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
-        """Return a new client, as the recorded camera has them."""
+        """Return a new client of the recorded camera's kind."""
         if issubclass(self._kind, TicketedCamera):
             return TicketedClient(self, link, server)
         return super().make_client(link, server)
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Note a client's line as it came."""
+        """Note the unchanged line of a client."""
         if isinstance(client, TicketedClient):
             client.ticket = self.lines.request_key(message.data)
 
     @property
     def url(self) -> str:
-        """Its address, with what the recorded one says beside host and port."""
+        """The camera's URL, with the recorded one's parameters."""
         return self._address._replace(host=self.host, port=self.port).url
 
     def _recorded_images(self, recording: Recording, camera: str) -> dict[int, bytes]:
-        """Return the answers to a line that asks for a picture, by the triggers before it."""
+        """Return the answers to a request for a picture, by the number of triggers before it."""
         if not recording.counts.pictures:
             return {}
         triggers, of_result = 0, dict[int, int]()
@@ -297,7 +297,7 @@ class ReplayedLines(LineCamera):
         return found
 
     def _image_for(self, line: str) -> bytes | None:
-        """Return the picture of the last trigger; None if no picture is asked for, or known."""
+        """Return the picture of the last trigger; None for another line, or without a picture."""
         row = self.lines.row_of(line)
         if self.lines.message_type(m.Sender.CLIENT, row) is not m.ReadImage:
             return None
@@ -311,7 +311,7 @@ class ReplayedLines(LineCamera):
         )
 
     def begins_session(self, message: HeardLine) -> bool:
-        """Return True: whoever says a line that is not in the recording is sent away."""
+        """Return True: an unrecorded line ends the connection."""
         return True
 
     def greet(self, client: LineClient) -> None:
@@ -322,7 +322,7 @@ class ReplayedLines(LineCamera):
         self._play(client, self.plan.greeting)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Give a line what the recorded one got."""
+        """Answer a line with its recorded answer."""
         place = self._places[client]
         self._places[client] += 1
         if self._at_once:
@@ -366,7 +366,7 @@ class ReplayedLines(LineCamera):
         return 2 * number - (self._answered < self._triggered)
 
     def _ended(self, client: LineClient, *, trigger: bool) -> Callable[[], None]:
-        """Return the call for the moment when a line has its whole answer."""
+        """Return the function to call when the whole answer to a line is sent."""
         number = self._triggered
 
         def end() -> None:
@@ -379,7 +379,7 @@ class ReplayedLines(LineCamera):
     def _play(
         self, client: LineClient, pieces: list[TimedLine], done: Callable[[], None] | None = None
     ) -> None:
-        """Say pieces, each at its time; then it is done."""
+        """Send pieces, each at its time; then call ``end``."""
         if not pieces:
             if done is not None:
                 done()
@@ -395,7 +395,7 @@ class ReplayedLines(LineCamera):
             self.after(piece.seconds / self._speed, say)
 
     def lost(self, link: ClientLink) -> None:
-        """Forget a link that is gone; a second call does nothing."""
+        """Remove a closed link; a second call does nothing."""
         client = self._clients.get(link)
         if client is not None:
             self._places.pop(client, None)

@@ -41,7 +41,7 @@ class ReplayedPictures:
         recording: recording that is played.
         camera: name of the camera in it.
         applications: planned results, by application.
-        speed: factor by which it is played faster than recorded.
+        speed: factor by which the replay is faster than the recording.
 
     Attributes:
         name: name of the camera.
@@ -68,11 +68,11 @@ class ReplayedPictures:
         return FrameSource(_ResultPictures(self), timeout=None, stall=None, linger=2.0)
 
     def begins(self) -> None:
-        """Note that an inspection begins: its picture is exposed from now on."""
+        """Note the beginning of an inspection, whose picture is exposed from now on."""
         self._began = time.monotonic()
 
     def given(self, application: int, data: bytes) -> None:
-        """Show the picture of a result that is sent now."""
+        """Show the picture of the result that is being sent."""
         key = application, data
         pictures = self._pictures.get(key)
         found = None
@@ -113,9 +113,9 @@ def _told_apart(
 
 
 def _in_one_order(applications: Mapping[int, TakeList]) -> dict[tuple[int, bytes], int]:
-    """Return the number of containers with the same bytes, of those that come in one order.
+    """Return the numbers of containers with the same bytes, for those with a certain order.
 
-    Triggered ones and those that come by themselves are played each in an order of their own.
+    Containers of triggers and those without a trigger are replayed in two separate orders.
     """
     triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     unasked: collections.Counter[tuple[int, bytes]] = collections.Counter()

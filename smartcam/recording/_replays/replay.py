@@ -1,16 +1,17 @@
-"""A recorded camera, emulated: it sends what the real one sent, with the same timing.
+"""Emulate a recorded camera, which sends the recorded messages with the same timing.
 
-The device is the emulator's own. Its applications give the recorded containers, byte for byte:
+The device is the emulator's own. Its applications send the recorded containers, byte for byte:
 
-- The n-th trigger of an application gets what the n-th one got, after the same time; where that had
-  no result it gets none, and where it was dropped it is dropped.
-- What came unasked comes by itself: counted from the begin of the run, then each from the one
-  before. It waits while the camera is stopped or has another application; nothing is left out.
-- Overheat and System Error come and go, counted from the begin of the first session.
+- The n-th trigger of an application gets the n-th recorded container of a trigger, after the same
+  time; if the recorded trigger had no result it gets none, and if it was dropped it is dropped.
+- Containers without a trigger come by themselves: the first at its time after the start of the
+  run, each other at its time after the one before. They wait while the camera is stopped or has
+  another application; none is left out.
+- Overheat and System Error come and go at their times after the start of the first session.
 
-One thing cannot be as recorded: the sequence numbers of a client that sets them, as one does whose
-layout has an ``@sequence`` field. Such a client gets its own numbers, in that field; which one it
-is, is known from the ``interpret_as`` in the recording.
+Only sequence numbers are not as recorded, if the client sets them, as a client does whose layout
+has an ``@sequence`` field. Such a client gets its own numbers in that field, whose place is known
+from the ``interpret_as`` in the recording.
 """
 
 from __future__ import annotations
@@ -46,16 +47,16 @@ if TYPE_CHECKING:
 from smartcam.recording._replays.schedule import ReplayPlan, Take, TakeList
 
 MAX_SPEED = 1000.0
-"""Times faster, or slower, than recorded: beyond it timers of a millisecond decide."""
+"""Largest factor of the speed; beyond it the timers' millisecond is too coarse."""
 
 MIN_INSPECTION_TIME = 1e-6
-"""Seconds that a replayed inspection takes at least: its take is chosen when it has begun."""
+"""Least seconds of a replayed inspection, whose take is chosen after its beginning."""
 
 NEVER = 0.0001
-"""Rate of a free-running application, per second: it is the replay that sends its containers."""
+"""Rate of a free-running application, per second; the replay itself sends its containers."""
 
 MAX_LOAD_TIME = 3600.0
-"""Seconds that an emulated switch takes at most."""
+"""Largest number of seconds of an emulated switch."""
 
 
 @dataclass(slots=True, eq=False)
@@ -68,7 +69,7 @@ class _Takes:
 
     @property
     def head(self) -> Take | None:
-        """The next one; None if there is none any more."""
+        """The next take; None if none is left."""
         return self._takes[self._next] if self._next < len(self._takes) else None
 
     @property
@@ -77,7 +78,7 @@ class _Takes:
         return len(self._takes) - self._next
 
     def pop(self) -> Take | None:
-        """Take the next one away."""
+        """Remove and return the next take."""
         head = self.head
         self._next += head is not None
         if self._loop and self._next >= len(self._takes):
@@ -92,7 +93,7 @@ class _Numbers(NamedTuple):
     offset: int  # offset of its first byte
 
     def put(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
-        """Return a container with another number; one that has none as it is."""
+        """Return a container with another number; unchanged if it has no number."""
         end = self.offset + self.field.size
         if len(data) < end:
             return data
@@ -109,13 +110,13 @@ class _Track:
 
     waits: bool  # whether the camera waits for triggers
     triggered: _Takes  # takes for triggers
-    unasked: _Takes  # takes that come by themselves
+    unasked: _Takes  # takes without a trigger
     current: Take | None = None  # the take of the inspection under way
-    # further containers, still to be sent
+    # further containers to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
-    # numbering of containers by the client's numbers; None: they keep their own
+    # place of the client's numbers in containers; None: containers keep their own numbers
     numbers: _Numbers | None = None
-    # is told each container that is given, as it was recorded
+    # function that is called with each recorded container when it is sent
     told: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
@@ -133,12 +134,12 @@ class _Track:
 
 
 class _PlayedApplication(Application):
-    """An application whose containers a track gives."""
+    """An application whose containers come from a track."""
 
     _track: _Track | None = PrivateAttr(default=None)
 
     def play(self, track: _Track) -> _PlayedApplication:
-        """Have containers given by ``track``."""
+        """Use the containers of ``track``."""
         self._track = track
         return self
 
@@ -157,34 +158,34 @@ class _PlayedApplication(Application):
 
 
 class ReplayedCamera(EmulatedCamera):
-    """An emulated camera that plays a recording.
+    """An emulated camera that replays a recording.
 
-    It is in the application that gave the first container, and runs if anything came. When the
-    recording is over, triggers get no result and nothing comes any more, unless ``loop``. All
+    Its application is that of the first container, and runs if there are containers. At the end of
+    the recording, triggers get no result and no containers come any more, unless ``loop``. All
     containers are kept in memory.
 
     Args:
-        recording: recording to play.
-        camera: name of the camera in it; default the only one there is.
-        speed: factor by which to play faster than recorded, 0.001 to 1000.
-        loop: begin again where something is over: each application's takes on their own.
+        recording: recording to replay.
+        camera: name of the camera in it; default the only one.
+        speed: factor by which to replay faster than recorded, 0.001 to 1000.
+        loop: begin again at the end: each application's takes on their own.
         host: address to listen on.
         port: port to listen on, 0 for a free one.
         transport: default the recorded one.
         dialect: default the recorded one.
-        quirks: what is not known of real cameras, beside the recorded deviations of the dialect:
-            fields of :class:`~smartcam.emulator.Quirks`.
-        clock: clock that the replay runs by; default: real time.
+        quirks: behaviour of the camera, besides the recorded deviations of the dialect: fields of
+            :class:`~smartcam.emulator.Quirks`.
+        clock: clock of the replay; default: real time.
         name: name for logs; default the recorded one.
-        on_over: function that is called once, in the event loop, when nothing is left; never with
+        on_over: function that is called once, in the event loop, at the end; never with
             ``loop``.
 
     Attributes:
-        plan: plan of what is played.
-        speed: speed that was given.
+        plan: plan of the replay.
+        speed: factor of the speed.
 
     Raises:
-        ConfigurationError: something given is wrong, or the camera cannot be replayed.
+        ConfigurationError: an argument is wrong, or the camera cannot be replayed.
     """
 
     def __init__(
@@ -246,20 +247,20 @@ class ReplayedCamera(EmulatedCamera):
         self.device.set_endian(self.plan.endian)
         self._set_conditions(self.plan.conditions)
         self._armed: Take | None = None  # the take before which triggers are to be dropped
-        self._ready: int | None = None  # the application that may send by itself now
-        self._reference = 0.0  # the next unasked take is counted from here
+        self._ready: int | None = None  # the application that may send without a trigger now
+        self._reference = 0.0  # time from which the next untriggered take is counted
         self._alarm: TimerHandle | None = None
-        self._due = False  # an unasked take is to begin as soon as it can
-        self._round: float | None = None  # time at which the present round of conditions began
-        self._changed = 0  # changes of conditions in it
+        self._due = False  # whether an untriggered take should begin as soon as possible
+        self._round: float | None = None  # time of the start of this round of conditions
+        self._changed = 0  # number of changes of conditions in this round
         self._change_alarm: TimerHandle | None = None
         self._pictures: ReplayedPictures | None = None
 
     def _show_pictures(self, recording: Recording, camera: str) -> ReplayedPictures | None:
-        """Return the recorded pictures of the results, shown as these are given; None: no pictures.
+        """Return the recorded pictures, each shown with its result; None without pictures.
 
         Args:
-            recording: recording that is played.
+            recording: recording that is replayed.
             camera: name of the camera in it.
         """
         if not recording.counts.pictures:
@@ -279,9 +280,9 @@ class ReplayedCamera(EmulatedCamera):
         return sum(track.triggered.left + track.unasked.left for track in self._tracks.values())
 
     async def stop(self) -> None:
-        """Close the port and every connection; the replay stands still. Does nothing if stopped.
+        """Close the port and every connection; the replay pauses. Does nothing if stopped.
 
-        Cancellation: everything is closed nevertheless.
+        Cancellation: everything is still closed.
         """
         self._pause()
         if self._change_alarm is not None:
@@ -290,7 +291,7 @@ class ReplayedCamera(EmulatedCamera):
         await super().stop()
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Take a message of a link; a client that sets a sequence number gets it."""
+        """Handle a message of a link, and a sequence number that the client sets."""
         if isinstance(message, m.SetSequenceNumber):
             for track in self._tracks.values():
                 track.numbers = self._numbers
@@ -304,7 +305,7 @@ class ReplayedCamera(EmulatedCamera):
         super()._end_step()
 
     def _play(self) -> None:
-        """Look what became of the device, and do what follows for the replay."""
+        """Follow the device's state with the replay."""
         if self._change_alarm is None and self.has_session:
             self._arm_change()
         track = self._tracks[self.device.active_application]
@@ -322,7 +323,7 @@ class ReplayedCamera(EmulatedCamera):
             tell()
 
     def _begin(self, track: _Track, take: Take | None) -> None:
-        """Begin an inspection, which takes as long as the recorded one."""
+        """Begin an inspection with the recorded duration."""
         track.current, self._armed = take, None
         if self._pictures is not None:
             self._pictures.begins()
@@ -330,14 +331,14 @@ class ReplayedCamera(EmulatedCamera):
             self.device.change_run(late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME))
 
     def _arm_drops(self, track: _Track) -> None:
-        """Have the next triggers dropped where the recorded ones were."""
+        """Make the device drop the next triggers if the recorded ones were dropped."""
         head = track.triggered.head
         if head is not None and head.drops and head is not self._armed:
             self._armed = head
             self.device.drop_triggers(head.drops)
 
     def _send(self, containers: list[bytes]) -> None:
-        """Say containers of the active application, behind what the device has said."""
+        """Send containers of the active application, after the device's own messages."""
         self._collect()
         number = self.device.active_application
         messages: list[m.Message] = [
@@ -348,7 +349,7 @@ class ReplayedCamera(EmulatedCamera):
     # ------------------------------------------------------------------ by itself
 
     def _play_unasked(self, track: _Track) -> None:
-        """Send what is due, and set the alarm for the next."""
+        """Send the take that is due, and set the timer for the next one."""
         runs = self.has_session and self.device.running
         ready = self.device.active_application if runs else None
         if ready != self._ready:
@@ -372,7 +373,7 @@ class ReplayedCamera(EmulatedCamera):
         elif self.device.trigger():
             self._begin(track, take)
         else:
-            return  # it takes no trigger now; later
+            return  # the device accepts no trigger now; try later
         self._due = False
         self._reference += (take.gap + take.seconds) / self.speed
         track.unasked.pop()
@@ -383,7 +384,7 @@ class ReplayedCamera(EmulatedCamera):
             pass
 
     def _pause(self) -> None:
-        """Hold back what comes by itself."""
+        """Hold back takes without a trigger."""
         self._ready, self._due = None, False
         if self._alarm is not None:
             self._alarm.cancel()
@@ -392,7 +393,7 @@ class ReplayedCamera(EmulatedCamera):
     # ------------------------------------------------------------------ conditions
 
     def _arm_change(self) -> None:
-        """Set the alarm for the next change; the first session begins the first round."""
+        """Set the timer for the next change; the first session begins the first round."""
         if self._round is None:
             self._round = self.clock.now
         changes = self.plan.changes
@@ -417,10 +418,10 @@ class ReplayedCamera(EmulatedCamera):
 
 
 def _numbers(interpret_as: str | None) -> _Numbers | None:
-    """Return the offset of the sequence number; None if it is not told, or nowhere."""
+    """Return the place of the sequence number; None if it is unknown, or there is none."""
     try:
         layout = None if interpret_as is None else resolve(interpret_as).layout
-    except ConfigurationError:  # a plug-in's that is not there, or a mapping
+    except ConfigurationError:  # a plug-in that is not installed, or a mapping
         return None
     if layout is None:
         return None
@@ -452,24 +453,24 @@ def replay(
     on_over: Callable[[], None] | None = None,
     **options: Any,
 ) -> ReplayedCamera | ReplayedLines:
-    """Return an emulated camera that plays a recording, of whatever protocol.
+    """Return an emulated camera that replays a recording, for any protocol.
 
-    One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th trigger what the
-    recorded n-th one got, after the same time, and other lines what was answered at that moment.
-    One of a fleet's camera has no frames: its results are played.
+    For a protocol of frames it is a :class:`ReplayedCamera`. With a protocol of lines the n-th
+    trigger gets the n-th recorded answer, after the same time, and other lines the answer of that
+    moment. For a fleet's camera, which has no recorded frames, the results are replayed.
 
     Args:
-        recording: recording to play.
-        camera: name of the camera in it; default the only one there is.
-        speed: factor by which to play faster than recorded, 0.001 to 1000.
-        loop: begin again where something is over.
-        on_over: function that is called once, in the event loop, when no trigger is left; never
-            with ``loop``.
+        recording: recording to replay.
+        camera: name of the camera in it; default the only one.
+        speed: factor by which to replay faster than recorded, 0.001 to 1000.
+        loop: begin again at the end.
+        on_over: function that is called once, in the event loop, at the end; never with
+            ``loop``.
         options: options of :class:`ReplayedCamera`, or of a :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
-        ConfigurationError: something given is wrong, or the camera cannot be replayed.
-        UnsupportedError: its protocol brings no emulated camera.
+        ConfigurationError: an argument is wrong, or the camera cannot be replayed.
+        UnsupportedError: its protocol has no emulated camera.
     """
     check_recording(recording, "replay")
     speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
@@ -493,5 +494,5 @@ def replay(
 
 
 def check_speed(speed: float) -> float:
-    """Return a speed that can be kept; else ConfigurationError."""
+    """Return a speed; raise ConfigurationError if it is out of range."""
     return check_number(speed, "speed", 1 / MAX_SPEED, MAX_SPEED, "replay")

@@ -1,7 +1,7 @@
-"""Plan a replay from a recording's frames, or from results where it has none; pure.
+"""Plan a replay from a recording's frames, or from its results without frames; no I/O.
 
-A container belongs to the oldest trigger without one. Others came unasked: by the digital input,
-where the application waits for triggers, or from a free run.
+A container belongs to the oldest trigger without one. Other containers came without a trigger of
+the client: by the digital input, if the application waits for triggers, or from a free run.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from smartcam.recording._reader import RecordedCamera, Recording
 
 CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
-"""Bits that an operator of the emulated camera can set; the others follow from its work."""
+"""Bits that an operator of the emulated camera can set; the others follow from its operation."""
 
 MAX_TIME_BEHIND_FIRST = 0.1
-"""Seconds behind its first container in which an inspection's others come, where the camera says
-all the time that it waits for a trigger."""
+"""Seconds after an inspection's first container in which its others come, if the camera always
+reports that it waits for a trigger."""
 
 MAX_REPLAY_BYTES = 1 << 30
 """Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
@@ -56,8 +56,8 @@ class Take:
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
     seconds: float  # seconds from its beginning to its first container, or to its end without one
-    # seconds from the end of the one before, or from the begin of the run, to its begin; only where
-    # nobody had triggered it
+    # seconds from the end of the take before, or from the start of the run, to its beginning; only
+    # for a take without a trigger
     gap: float = 0.0
     drops: int = 0  # triggers that the camera dropped before it
 
@@ -69,13 +69,13 @@ class TakeList:
     application: int
     triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
     unasked: list[Take] = field(default_factory=list[Take])  # the others
-    waits: bool = True  # whether it waits for triggers; otherwise it runs free
-    load_time: float | None = None  # seconds that a switch to it took; None if none was recorded
+    waits: bool = True  # whether the application waits for triggers; otherwise it runs free
+    load_time: float | None = None  # seconds of a switch to it; None if none was recorded
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A condition set or cleared, seconds after the begin of the first session."""
+    """A condition that is set or cleared, seconds after the start of the first session."""
 
     at: float
     condition: Status
@@ -84,13 +84,13 @@ class Change:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayPlan:
-    """Everything that a replay needs to know."""
+    """The plan of a replay."""
 
     dialect: str
     quirks: tuple[str, ...]  # deviations from the dialect
     transport: Literal["tcp", "udp"]
     applications: Mapping[int, TakeList]  # takes of each application, by id; never empty
-    active: int  # id of the one that gave the first container
+    active: int  # id of the application of the first container
     running: bool  # whether the camera ran
     endian: int  # the status message's endian field
     conditions: Status  # conditions at first
@@ -99,7 +99,7 @@ class ReplayPlan:
 
 
 def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
-    """Work out how to play a camera of a recording, by default the only one in it.
+    """Plan the replay of a camera of a recording, by default the only one in it.
 
     Raises:
         ConfigurationError: there is no such camera, it had no session, or it cannot be emulated.
@@ -143,7 +143,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
 def _fitting(
     recording: Recording, lists: Mapping[int, TakeList], dialect: FramedDialect
 ) -> dict[int, TakeList]:
-    """Return the applications that can be emulated; one that cannot must have given nothing."""
+    """Return the applications that can be emulated; others must have no containers."""
     fitting: dict[int, TakeList] = {}
     for number, found in lists.items():
         if number in dialect.application_ids and number >= 1:
@@ -159,7 +159,7 @@ def _fitting(
 def _spoken(
     recording: Recording, camera: RecordedCamera
 ) -> tuple[FramedDialect, Literal["tcp", "udp"]]:
-    """Return the dialect and the transport that the camera spoke."""
+    """Return the dialect and the transport of the camera."""
     if not camera.url:
         raise ConfigurationError(
             f"recording {recording.path}: there was no session with camera {camera.name!r}"
@@ -221,7 +221,7 @@ _ANSWERS = {("<", "SwitchAnswer"): _What.SWITCHED, ("<", "QueryAnswer"): _What.N
 
 
 def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
-    """Return steps of which those before a time only say what the camera is then."""
+    """Return steps, where those before a time are replaced by the camera's state at that time."""
     single = {_What.TRIGGER, _What.CONTAINER, _What.SWITCH}
     return [
         step._replace(at=max(step.at, at))
@@ -231,16 +231,16 @@ def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
 
 
 class _Seams:
-    """Makes steps of what a recording says of itself: where it begins, and what is missing.
+    """Makes steps of a recording's beginnings and gaps.
 
-    So nothing is taken for what it is not.
+    So results around a gap are not matched with wrong triggers.
     """
 
     def __init__(self) -> None:
-        self._whole = False  # what came before is known
+        self._whole = False  # whether all earlier items are known
 
     def steps(self, item: Item | RecordedState, at: float) -> list[_ReplayStep]:
-        """Return the steps of an item at a time that does not go back."""
+        """Return the steps of an item, at a time that does not decrease."""
         if isinstance(item, RecordedError) and item.error == GAP:
             self._whole = False
             return [_ReplayStep(at, _What.LOST)]
@@ -265,8 +265,8 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
     """Yield the steps among the items; their times never go back.
 
     Raises:
-        ConfigurationError: a frame has not the fields of its message.
-        RecordingError: there is too much of them.
+        ConfigurationError: a frame lacks a field of its message.
+        RecordingError: the containers are too large together.
     """
     at, active, size = 0.0, m.UNNAMED_APPLICATION, 0
     seams = _Seams()
@@ -297,16 +297,16 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
                 f"{MAX_REPLAY_BYTES} at most for a replay"
             )
         if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
-            step = step._replace(number=active)  # a quirk: it does not say whose it is
+            step = step._replace(number=active)  # a quirk: the container has no application id
         elif step.what in {_What.SWITCHED, _What.NAMED}:
             active = step.number
         yield step
 
 
 def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) -> list[_ReplayStep]:
-    """Return the steps of a camera of a fleet, of which there are results and events, in order.
+    """Return the steps of a fleet's camera from its results and events, in order.
 
-    A trigger stands in front of the first of its results; one without a result is left out.
+    A trigger precedes the first of its results; a trigger without a result is left out.
 
     Raises:
         ConfigurationError: ``endian`` is no number.
@@ -333,7 +333,7 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
             case Result():
                 size += len(item.raw)
                 if item.triggered_at is None:
-                    steps.append(_ReplayStep(at, _What.ABORT))  # the inspection before is over
+                    steps.append(_ReplayStep(at, _What.ABORT))  # the earlier inspection is over
                 elif item.triggered_at != triggered_at:
                     steps.append(_ReplayStep(at - (item.latency or 0.0), _What.TRIGGER))
                 triggered_at = item.triggered_at
@@ -354,9 +354,9 @@ _BY_AGENT = {_What.TRIGGER, _What.ABORT, _What.CONTAINER}
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
     """Return steps with times that fit their order.
 
-    When a result came is said by the agent's clock, when something else happened by the program's.
+    The times of results are on the agent's clock, those of other events on the program's.
     """
-    least, most = -math.inf, math.inf  # what the agent's clock lacks
+    least, most = -math.inf, math.inf  # bounds of the difference between the clocks
     by_program, by_agent = -math.inf, -math.inf  # the last times
     for step in steps:
         if step.what is _What.CONTAINER:
@@ -378,7 +378,7 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
 
 
 def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
-    """Return steps whose statuses say nothing of single inspections: their times are too coarse."""
+    """Return steps without statuses of single inspections, whose times are too coarse."""
     settled: list[_ReplayStep] = []
     active: int | None = None
     for step in steps:
@@ -395,7 +395,7 @@ def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
 
 
 def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
-    """Return the step that a frame means; None if it does not matter."""
+    """Return the step of a frame; None if it has none."""
     key, fields = (entry.direction, entry.message), entry.fields
     if key in _PLAIN:
         return _ReplayStep(at, _PLAIN[key])
@@ -419,7 +419,7 @@ def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
     """Return the applications that ran and never waited for a trigger."""
     seen: dict[int, Status] = {}
     active: int | None = None
-    early = Status(0)  # before it is known whose they are
+    early = Status(0)  # bits of statuses before the application is known
     for step in steps:
         if step.what is _What.STATUS:
             if step.bits.loading:
@@ -440,7 +440,7 @@ def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
 
 
 class _ScheduleMaker:
-    """Follows a recording, step by step."""
+    """Makes a plan from the steps of a recording."""
 
     def __init__(self, free: set[int]) -> None:
         self.lists: dict[int, TakeList] = {}  # takes so far, by application
@@ -456,13 +456,13 @@ class _ScheduleMaker:
         self._active: int | None = None
         self._status: Status | None = None  # last status in this session
         self._last: Status | None = None  # last status of all sessions
-        self._triggers: list[float] = []  # without a container so far
-        self._drops = 0  # triggers dropped since the last take
-        self._waits_from = self._waited_until = 0.0  # when Waiting for Trigger rose, and fell
-        self._open: Take | None = None  # take whose inspection may send more
-        self._opened = 0.0  # when it sent its first container
-        self._began_unasked: float | None = None  # an inspection that nobody had triggered
-        self._reference = 0.0  # the next unasked one is counted from here
+        self._triggers: list[float] = []  # times of triggers without a container so far
+        self._drops = 0  # number of triggers dropped since the last take
+        self._waits_from = self._waited_until = 0.0  # times at which Waiting for Trigger rose, fell
+        self._open: Take | None = None  # take whose inspection may send more containers
+        self._opened = 0.0  # time of its first container
+        self._began_unasked: float | None = None  # start of an inspection without a trigger
+        self._reference = 0.0  # time from which the next untriggered take is counted
         self._switching: tuple[float, int] | None = None
         self._takers: Mapping[_What, Callable[[_ReplayStep], None]] = {
             _What.CONNECTED: self._on_connected,
@@ -477,12 +477,12 @@ class _ScheduleMaker:
         }
 
     def take(self, step: _ReplayStep) -> None:
-        """Take the next step."""
+        """Add the next step."""
         self.now = step.at
         self._takers[step.what](step)
 
     def finish(self) -> None:
-        """End the plan: what a trigger under way would have given is not known."""
+        """End the plan, without the result of a trigger under way, which is unknown."""
         self._triggers.clear()
 
     # ------------------------------------------------------------------ steps
@@ -493,7 +493,7 @@ class _ScheduleMaker:
         self._status = None
 
     def _on_lost(self, _: _ReplayStep) -> None:
-        self._triggers.clear()  # their results went with the link
+        self._triggers.clear()  # their results were lost with the link
         self._open = self._began_unasked = self._switching = None
 
     def _on_status(self, step: _ReplayStep) -> None:
@@ -532,16 +532,16 @@ class _ScheduleMaker:
         """Note that the camera dropped the last trigger."""
         self._triggers.pop()
         if self._triggers:
-            return  # one of ours is under way: the emulated camera drops it by itself
+            return  # a triggered inspection is under way: the emulated camera drops it by itself
         if Status.WAITING_FOR_TRIGGER in bits:
             self._drops += 1
-        elif self._began_unasked is None:  # for one that nobody had triggered, which shows late
+        elif self._began_unasked is None:  # an untriggered inspection, which shows late
             self._began_unasked = self._waited_until
 
     def _on_trigger(self, _: _ReplayStep) -> None:
         self._open = None
         if self._waits:
-            self._give_up()  # where it waits, the inspection before is over
+            self._give_up()  # since the camera waits, the earlier inspection is over
         self._triggers.append(self.now)
 
     def _on_switch(self, step: _ReplayStep) -> None:
@@ -560,7 +560,7 @@ class _ScheduleMaker:
         self._name(step.number)
         found = self._list(step.number)
         if not found.waits:
-            self._triggers.clear()  # it ignores them
+            self._triggers.clear()  # a free-running application ignores them
             found.unasked.append(Take([step.data], 0.0, gap=self._gap(self.now)))
         elif self._triggers:
             began = self._triggers.pop(0)
@@ -585,7 +585,7 @@ class _ScheduleMaker:
         return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
 
     def _is_over(self) -> bool:
-        """Return True if the camera waits, and has been silent too long to send more results."""
+        """Return True if the camera waits, and was silent too long for more results."""
         return self._waits and self.now - self._opened > MAX_TIME_BEHIND_FIRST
 
     # ------------------------------------------------------------------ inside
@@ -596,7 +596,7 @@ class _ScheduleMaker:
         return gap
 
     def _give_up(self) -> None:
-        """Give up the inspection under way: its trigger has no result."""
+        """End the inspection under way, whose trigger has no result."""
         if self._active is not None and self._list(self._active).waits:
             for began in self._triggers:
                 ended = self._waits_from if self._waits_from > began else self.now

@@ -1,4 +1,4 @@
-"""The thesis' five calibration services at a camera's node: in messages."""
+"""Serve the thesis' five calibration services at a camera's node."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Pose, Result
 
 OWN_FRAMES = 20.0
-"""Seconds for a picture of the camera itself."""
+"""Seconds of the timeout for a picture of the camera itself."""
 
 
 def calibrations_of(
@@ -46,7 +46,7 @@ def calibrations_of(
 
 
 class RosCalibrationCamera:
-    """A node's camera during calibration, whose results are read without a calibration.
+    """A node's camera during calibration; its results are interpreted without a calibration.
 
     Args:
         camera: the camera.
@@ -79,7 +79,7 @@ class RosCalibrationCamera:
 
 
 class RosCalibrationFace:
-    """A camera's node as the five services see it, in messages.
+    """The part of a camera's node that answers the five services.
 
     Args:
         camera: the camera.
@@ -112,7 +112,7 @@ class RosCalibrationFace:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a field of a message to that of a request."""
+    """Convert a field of a message to the field of a request."""
     if hasattr(value, "frame_id"):
         return {"stamp": utc_of(value), "frame_id": value.frame_id}
     if hasattr(value, "tolist"):

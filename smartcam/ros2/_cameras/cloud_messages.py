@@ -1,4 +1,4 @@
-"""Depth and clouds as ROS' messages and back; nothing here knows a node."""
+"""Convert depth and clouds to ROS' messages and back, without a node."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 
 """Types of numpy by the numbers of ``sensor_msgs/PointField``."""
 
 STEP: Final = 16
-"""Bytes of a point: x, y, z and rgb."""
+"""Number of bytes of a point: x, y, z and rgb."""
 
 NO_DISPARITY: Final = -1.0
-"""Value that stands for no disparity, pixels: less than ``min_disparity``."""
+"""Value for no disparity, pixels: less than ``min_disparity``."""
 
 DISPARITY_STEP: Final = 1 / 16
-"""Pixels that OpenCV's matchers tell apart."""
+"""Resolution of OpenCV's matchers, pixels."""
 
 
 LARGEST_VALUE: Final = 65534.0
@@ -55,13 +55,13 @@ class CloudPoints(NamedTuple):
 def depth_fields(
     depth: NDArray[np.float32], header: dict[str, Any], encoding: str = "32FC1"
 ) -> dict[str, Any]:
-    """Return a depth picture as ``sensor_msgs/Image``, as REP-118 has it.
+    """Return a depth picture as ``sensor_msgs/Image``, as REP-118 defines it.
 
     Args:
-        depth: (H, W), metres; 0: none.
+        depth: (H, W), metres; 0: no depth.
         header: header of the message.
-        encoding: ``32FC1``, metres, NaN for none; ``16UC1``, millimetres, 0 for none and for what
-            is farther than 65.535 m.
+        encoding: ``32FC1``, metres, NaN for no depth; ``16UC1``, millimetres, 0 for no depth and
+            for depths of more than 65.535 m.
     """
     if encoding == "32FC1":
         shown = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
@@ -72,7 +72,7 @@ def depth_fields(
 def compressed_depth_fields(
     depth: NDArray[np.float32], header: dict[str, Any], encoding: str = "32FC1"
 ) -> dict[str, Any]:
-    """Return a depth picture as image_transport's ``compressedDepth`` has it.
+    """Return a depth picture in the form of image_transport's ``compressedDepth``.
 
     Its data are an int32, which is 0, two float32 (a, b), and a PNG with 16 bits. For ``32FC1`` a
     value v of the PNG is the depth ``a / (v - b)``, 0 means no depth; a and b are such that the
@@ -81,7 +81,7 @@ def compressed_depth_fields(
     Source: ``codec.cpp`` and ``compression_common.h`` of image_transport_plugins.
 
     Args:
-        depth: (H, W), metres; 0: none.
+        depth: (H, W), metres; 0: no depth.
         header: header of the message.
         encoding: as for :func:`depth_fields`.
     """
@@ -106,7 +106,7 @@ def compressed_depth_fields(
 
 
 def _millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Return depths in millimetres, 0 for none and for what is too far for 16 bits."""
+    """Return depths in millimetres, 0 for no depth and for depths too large for 16 bits."""
     whole = np.rint(depth * np.float32(1000))
     fits = (whole > 0) & (whole <= np.iinfo(np.uint16).max)
     return np.where(fits, whole, 0).astype(np.uint16)
@@ -122,11 +122,11 @@ def disparity_fields(
     """Return ``stereo_msgs/DisparityImage``.
 
     Args:
-        disparity: (H, W), pixels; NaN: none, which the message has as -1.
+        disparity: (H, W), pixels; NaN: none, for which the message has -1.
         header: header of the left picture.
         focal: focal length, pixels.
         baseline: distance of the two cameras, metres.
-        largest: largest disparity that was looked for, pixels.
+        largest: largest disparity of the search, pixels.
     """
     height, width = disparity.shape
     shown = np.nan_to_num(disparity, nan=NO_DISPARITY).astype(np.float32)
@@ -158,8 +158,8 @@ def cloud_fields(
     """Return ``sensor_msgs/PointCloud2`` with x, y, z and, with colours, rgb.
 
     Args:
-        points: (N, 3), or organized as a picture (H, W, 3) with NaN for none, metres.
-        colours: colours of the points, red first, or grey without the last axis; None: none.
+        points: (N, 3), or organized as a picture (H, W, 3) with NaN for no point, metres.
+        colours: colours of the points, red first, or grey without the last axis; None: no colours.
         header: header of the message.
     """
     rows = points if points.ndim == 3 else points[None]
@@ -192,7 +192,7 @@ def cloud_fields(
 
 
 def cloud_from(message: Any) -> CloudPoints:
-    """Return the points of a ``sensor_msgs/PointCloud2``, row by row; those with NaN are left out.
+    """Return the points of a ``sensor_msgs/PointCloud2``, row by row, without those with NaN.
 
     Raises:
         RosMessageError: the cloud has no x, y and z, they are no floats, or there are too few

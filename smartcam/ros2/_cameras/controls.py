@@ -1,4 +1,4 @@
-"""Set the device of a camera's frames by parameters of the camera's node.
+"""Set the device of a camera's frames through parameters of the camera's node.
 
 The controls of a V4L2 device have the names and types that v4l2_camera gives them; the features of
 any other device have their own names, in lower case with underscores.
@@ -31,9 +31,9 @@ class CameraControls:
 
     A boolean control is ``bool``, any other ``int``, within the control's range. A feature that can
     be set is ``bool``, ``int``, ``float``, or ``str`` for an entry's name; its range is in the
-    description, since other features may change it. Setting the parameter sets the device; what the
-    device refuses is refused in its words. After each set the parameters of all features are as
-    the device has them then.
+    description, since other features may change it. Setting the parameter sets the device; if the
+    device refuses a value, the parameter is refused with the device's error. After each set the
+    parameters of all features are read from the device again.
 
     Args:
         node: node of ROS 2.
@@ -43,7 +43,7 @@ class CameraControls:
     def __init__(self, node: Any, source: Callable[[], Awaitable[FrameSource]]) -> None:
         self._node, self._source = node, source
         self._declared: list[str] = []
-        self._features: dict[str, str] = {}  # name of the feature, by that of its parameter
+        self._features: dict[str, str] = {}  # feature by parameter
         self._refreshing: asyncio.Task[None] | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -64,7 +64,7 @@ class CameraControls:
         self._features = {}
         declared, self._declared = self._declared, []
         for name in declared:
-            with contextlib.suppress(ConfigurationError):  # somebody else has done so
+            with contextlib.suppress(ConfigurationError):  # another program has undeclared it
                 self._node.parameters.undeclare(name)
 
     async def _run(self) -> None:
@@ -75,7 +75,7 @@ class CameraControls:
                 await self._declare_features(source)
                 return
             controls = await driver.controls()
-        except UnsupportedError:  # a source that has none
+        except UnsupportedError:  # a source without controls
             return
         except SmartCamError as exc:
             logger.warning("%s ! its controls are no parameters: %s", self._node.full_name, exc)
@@ -107,7 +107,7 @@ class CameraControls:
         """Set a feature.
 
         Raises:
-            SmartCamError: the device does not take the value.
+            SmartCamError: the device refuses the value.
         """
         await source.features[name].set(value)
         if self._refreshing is None or self._refreshing.done():
@@ -116,9 +116,9 @@ class CameraControls:
             )
 
     async def _refresh(self, source: FrameSource) -> None:
-        """Have all parameters be as the device has their features: setting one may change others.
+        """Update all parameters from the device, since setting a feature may change others.
 
-        It waits first until the device has taken over the setting that caused it.
+        First waits until the device has applied the setting that caused the call.
         """
         await asyncio.sleep(REFRESH_DELAY)
         for parameter, name in [*self._features.items()]:
@@ -158,7 +158,7 @@ async def _set(driver: Any, name: str, value: int) -> None:
     """Set a control.
 
     Raises:
-        SmartCamError: the device does not take the value, or has another one afterwards.
+        SmartCamError: the device refuses the value, or has another one afterwards.
     """
     has = await driver.set_control(name, int(value))
     if has != int(value):

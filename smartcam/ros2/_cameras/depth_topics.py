@@ -1,4 +1,4 @@
-"""Publish what two cameras see: disparity, depth, a cloud, and the rectified lenses."""
+"""Publish the depth of two cameras: disparity, depth, a cloud, and the rectified lenses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from smartcam.ros2._cameras.cloud_messages import (
 )
 from smartcam.ros2._cameras.image_messages import array_fields, header_fields
 from smartcam.ros2._cameras.lens_messages import lens_fields
-from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
 from smartcam.ros2._cameras.transforms import StaticTransforms
 from smartcam.ros2._node.qos import DRIVER
 
@@ -40,32 +40,32 @@ TOPICS: Final = {
     "left/camera_info": "sensor_msgs/msg/CameraInfo",
     "right/camera_info": "sensor_msgs/msg/CameraInfo",
 }
-"""Names, private to the node, and types; as those of ROS' ``stereo_image_proc``."""
+"""Names, private to the node, and types, the same as in ROS' ``stereo_image_proc``."""
 
 
 class DepthTopics:
-    """Publishes what two cameras see while somebody hears it, the newest pair only.
+    """Publishes the depth of two cameras while it has a subscriber, the newest pair only.
 
     ::
 
         topics = DepthTopics(lambda: StereoDepth(open(LEFT), open(RIGHT), calibration), node)
 
-    All messages of a pair have one stamp, when the left picture was captured, and one frame: that
-    of the left camera after rectification, z ahead and y down. With ``place`` it is on
-    ``/tf_static`` from the first pair on.
+    All messages of a pair have one stamp, the time of the left picture's capture, and one frame:
+    the frame of the left camera after rectification, z ahead and y down. With ``place`` the frame
+    is on ``/tf_static`` from the first pair on.
 
     Args:
-        stereo: function that makes a :class:`smartcam.depth.StereoDepth`, not open, each time that
-            somebody begins to hear; or one that is open, which stays the caller's, and streams on.
+        stereo: function that returns a closed :class:`smartcam.depth.StereoDepth` each time that
+            a subscriber comes; or an open one, which the caller closes, and which always streams.
         node: open node of ROS.
         frame_id: frame id of the left camera after rectification; "": the node's name with
             ``_left_optical``.
         depth_encoding: ``32FC1``, metres, or ``16UC1``, millimetres.
-        place: where the left camera is: its hand-eye calibration, or a transform from the left
-            camera's frame; None: not known, and not said.
-        parent_frame: name of the frame that ``place`` puts the camera in; empty: its own name.
-        organized: whether clouds have a point for each pixel, NaN where there is none; else they
-            have those that there are.
+        place: place of the left camera: its hand-eye calibration, or a transform from the left
+            camera's frame; None: not known, and not published.
+        parent_frame: name of the parent frame of ``place``; empty: the name that ``place`` has.
+        organized: whether clouds have a point for each pixel, NaN for no depth; otherwise they
+            have only valid points.
 
     Raises:
         ConfigurationError: another encoding.
@@ -99,7 +99,7 @@ class DepthTopics:
         self._thread: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
-        """Have the topics; the cameras stream when somebody hears."""
+        """Declare the topics; the cameras stream while there is a subscriber."""
         if self._stream is not None:
             return
         for name, kind in TOPICS.items():
@@ -110,9 +110,9 @@ class DepthTopics:
         self._stream.start()
 
     async def close(self) -> None:
-        """Be gone; a pair of the caller's stays open. Idempotent.
+        """Withdraw the topics; a pair of the caller's stays open. Idempotent.
 
-        Cancellation: all is closed nevertheless.
+        Cancellation: everything is still closed.
         """
         stream, self._stream = self._stream, None
         try:
@@ -138,7 +138,7 @@ class DepthTopics:
             yield self._stereo
 
     def _learn(self, stereo: StereoDepth) -> None:
-        """Take over what an open pair knows of itself, and say where it is."""
+        """Note the values of an open pair, and publish its place."""
         self._nearest, place = stereo.nearest, self._place
         if place is not None:
             turn = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
@@ -154,7 +154,7 @@ class DepthTopics:
         loop = asyncio.get_running_loop()
         for name, publisher in heard.items():
             fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
-            await say_newest(publisher, fields)
+            await publish_newest(publisher, fields)
 
     def _fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
         header = header_fields(frame.utc, self.frame_id)
@@ -172,7 +172,7 @@ class DepthTopics:
             return array_fields(frame.left, "mono8" if frame.left.ndim == 2 else "rgb8", header)
         lens, projection = frame.camera_info, None
         if name == "right/camera_info":
-            # as ROS has it: from the left rectified frame, so that the shift stands in it
+            # ROS' projection is from the left rectified frame, so it includes the shift
             projection = np.column_stack([lens.matrix, [-focal * frame.baseline, 0, 0]])
         height, width = frame.depth.shape
         return lens_fields(lens, header, (width, height), projection=projection)

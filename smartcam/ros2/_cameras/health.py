@@ -1,6 +1,6 @@
-"""Tell a camera's health to ROS: its status, and its diagnostics.
+"""Convert a camera's health to ROS: its status, and its diagnostics.
 
-A node reports it for its camera, a bag for a recorded camera.
+A node publishes the health of its camera, a bag that of a recorded camera.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MAX_ERROR_CHARACTERS = 1000
-"""Largest number of characters of an error in a message; what is longer is cut."""
+"""Largest number of characters of an error in a message; a longer one is cut."""
 
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ``diagnostic_msgs/msg/DiagnosticStatus``."""
@@ -33,7 +33,7 @@ TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.INPUT_CONTAINER: (WARN, "Input Container: input data and inspections are out of step"),
     Status.OVERTRIGGERED: (WARN, "Overtriggered: a trigger was dropped"),
 }
-"""Bits of the status that are errors, the worst first: level and words."""
+"""Error bits of the status, the worst first: level and text."""
 
 
 class KnownState(NamedTuple):
@@ -55,7 +55,7 @@ class KnownState(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera[Any]) -> KnownState:
-        """Return the present state of a camera."""
+        """Return the current state of a camera."""
         if not camera.connected:
             return cls(camera.name, why=str(camera.trouble or ""))
         try:
@@ -66,7 +66,7 @@ class KnownState(NamedTuple):
 
     @property
     def bits(self) -> Status:
-        """The status of the present session; no bits if none was sent."""
+        """The status of the current session; no bits if none was sent."""
         return self.status if self.connected and self.status is not None else Status(0)
 
 
@@ -82,8 +82,8 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
     """Return the health of a camera.
 
     Args:
-        known: what is known of the camera.
-        heard: whether there is a sign of the program that has the session with the camera.
+        known: known state of the camera.
+        heard: whether the program that has the session with the camera is alive.
     """
     if not known.connected:
         text = known.why[:MAX_ERROR_CHARACTERS] or "there was no session yet"
@@ -103,7 +103,7 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
 
 
 def status_fields(known: KnownState) -> dict[str, Any]:
-    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` but for its header."""
+    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` without its header."""
     connected, status, how = known.connected, known.bits, health(known)
     bad = Status.BUSY in status or Status.SYSTEM_ERROR in status
     application = known.application if connected else None

@@ -1,7 +1,7 @@
-"""Pictures as ROS' messages and back; nothing here knows a node.
+"""Convert pictures to ROS' messages and back, without a node.
 
 The names of encodings are those of ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
-in millimetres, 0 for none, or 32FC1 in metres, NaN for none.
+in millimetres, 0 for no depth, or 32FC1 in metres, NaN for no depth.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 BILLION: Final = 1_000_000_000
 
 UNKNOWN_DURATION: Final = 1.0
-"""Seconds before its stamp in which a picture of another node may have been exposed."""
+"""Seconds before its stamp within which a picture of another node may have been exposed."""
 
 _BAYER: Final = {"GR": "grbg", "RG": "rggb", "GB": "gbrg", "BG": "bggr"}
 
@@ -50,10 +50,10 @@ ENCODINGS: Final[dict[str, str]] = {
     "YCbCr601_422_8": "yuv422_yuy2",
     "YCbCr601_422_8_CbYCrY": "yuv422",
 }
-"""Encodings of ROS by the names of the pixel formats that are sent as they are.
+"""Encodings of ROS by the names of the pixel formats that are sent unchanged.
 
 Pixels of 10, 12 and 14 bits are sent with 16 bits and the same values. Frames of other formats are
-made ``rgb8`` or unpacked first: see :func:`prepared`.
+converted to ``rgb8`` or unpacked first: see :func:`prepared`.
 """
 
 _FORMATS: Final[dict[str, str]] = {
@@ -78,9 +78,9 @@ _DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
 
 
 def stamp_fields(utc: float) -> dict[str, int]:
-    """Return a time, seconds since 1970, as the fields of ``builtin_interfaces/Time``."""
+    """Return a time in seconds since 1970 as the fields of ``builtin_interfaces/Time``."""
     whole = int(max(utc, 0.0))
-    more = round(max(utc - whole, 0.0) * BILLION)  # apart, since both together lose digits
+    more = round(max(utc - whole, 0.0) * BILLION)  # separate, since a sum would lose digits
     return {"sec": whole + more // BILLION, "nanosec": more % BILLION}
 
 
@@ -92,13 +92,13 @@ def header_fields(utc: float, frame_id: str) -> dict[str, Any]:
 def prepared(frame: Frame) -> Frame:
     """Return the frame in a format that ROS has a name for; blocks.
 
-    What it has one for stays as it is. Samples that share bytes are unpacked to 16 bits. Y, U and V
-    in planes, of full range, of BT.709 or BT.2020 become RGB8 or RGB16, since ROS' names say
-    nothing of that; so do the pixels of a JPEG, PNG or JPEG XL, as they are in it.
+    A frame in such a format is returned unchanged. Samples that share bytes are unpacked to 16
+    bits. Y, U and V in planes, of full range, of BT.709 or BT.2020 become RGB8 or RGB16, since ROS
+    has no names for them; so do the pixels of a JPEG, PNG or JPEG XL.
 
     Raises:
-        FrameFormatError: there is no way, or the frame's bytes are wrong.
-        MissingExtraError: what reads its format is not installed.
+        FrameFormatError: the format cannot be converted, or the frame's bytes are wrong.
+        MissingExtraError: the extra that reads the format is not installed.
     """
     from smartcam.frames._inside import converted, decoded, with_pixels
 
@@ -117,7 +117,7 @@ def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:
     """Return the fields of ``sensor_msgs/Image``; the pixels are not copied.
 
     Raises:
-        FrameFormatError: ROS has no name for the format (:func:`prepared` finds another), or there
+        FrameFormatError: ROS has no name for the format (:func:`prepared` converts it), or there
             are too few bytes.
     """
     encoding = ENCODINGS.get(frame.format.name)
@@ -140,7 +140,7 @@ def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:
 
 
 def _whole_rows(frame: Frame) -> memoryview:
-    """Return the bytes of all rows; the last one may have come without its padding."""
+    """Return the bytes of all rows; the last row may have no padding."""
     data, size = memoryview(frame.data).cast("B"), frame.stride * frame.height
     if data.nbytes >= size:
         return data[:size]
@@ -166,8 +166,8 @@ class Compression(NamedTuple):
     """The steps from a frame to ``sensor_msgs/CompressedImage``.
 
     Attributes:
-        how: ``jpeg``, ``png`` or, for a JPEG as it came, "".
-        first: the format that it is made before; "": none.
+        how: ``jpeg``, ``png``, or "" for a JPEG that is sent unchanged.
+        first: the format to which the frame is converted first; "": none.
         encoding: encoding of the pixels after decoding.
     """
 
@@ -183,9 +183,9 @@ class Compression(NamedTuple):
 
 
 def compression(frame: Frame) -> Compression:
-    """Return the compression of a frame: PNG, without loss, for depth, JPEG for all else.
+    """Return the compression of a frame: PNG, without loss, for depth, JPEG for all others.
 
-    In a JPEG, of more than 8 bits the highest 8 are sent, and of a Bayer pattern the colours.
+    A JPEG has the highest 8 bits of a sample, and the colours of a Bayer pattern.
 
     Raises:
         FrameFormatError: the frame is of H.264.
@@ -223,7 +223,7 @@ def compressed_fields(frame: Frame, text: str, frame_id: str) -> dict[str, Any]:
 
 
 def utc_of(header: Any) -> float:
-    """Return a header's time, seconds since 1970."""
+    """Return a header's time in seconds since 1970."""
     return float(header.stamp.sec) + float(header.stamp.nanosec) / BILLION
 
 
@@ -237,17 +237,17 @@ def frame_from(
 ) -> Frame:
     """Return the frame of a ``sensor_msgs/Image`` or ``sensor_msgs/CompressedImage``.
 
-    The pixels are not copied where the message has them as smartcam does. The time is the header's.
+    The pixels are not copied if the message has smartcam's format. The time is the header's.
 
     Args:
         message: message of either type.
         source: name of the camera; "": the header's ``frame_id``.
         sequence: number of the frame, such as that of the subscription's ``attachment``.
-        duration: seconds before the stamp in which the frame may have been exposed.
+        duration: seconds before the stamp within which the frame may have been exposed.
         camera_info: model of the lens; None: not known.
 
     Raises:
-        FrameFormatError: an encoding without a pixel format, fewer bytes than the size asks for, or
+        FrameFormatError: an encoding without a pixel format, fewer bytes than the size requires, or
             no JPEG or PNG.
         MissingExtraError: the message is compressed and the extra ``frames`` is not installed.
     """
@@ -306,14 +306,14 @@ def _compressed(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
 
 
 def pixels_from(message: Any) -> NDArray[Any]:
-    """Return the pixels of a ``sensor_msgs/Image`` as numbers; nothing is converted.
+    """Return the pixels of a ``sensor_msgs/Image`` as numbers, without a conversion.
 
     Returns:
-        (H, W) or (H, W, C), of 8UC1, 32FC1 and their like and of all encodings with a name, except
-        of Y, U and V; a view, in this machine's byte order where that differs.
+        (H, W) or (H, W, C), for 8UC1, 32FC1 and similar ones and for all named encodings, except
+        of Y, U and V; a view, unless the message has another byte order than this machine.
 
     Raises:
-        FrameFormatError: there is no such encoding, or fewer bytes than the size asks for.
+        FrameFormatError: there is no such encoding, or fewer bytes than the size requires.
     """
     kind, channels = _samples(message.encoding)
     order = ">" if message.is_bigendian else "<"
@@ -334,7 +334,7 @@ def pixels_from(message: Any) -> NDArray[Any]:
 
 
 def _samples(encoding: str) -> tuple[str, int]:
-    """Return the kind of numbers and how many a pixel has."""
+    """Return the type of an encoding's numbers, and their count for a pixel."""
     bits, _, rest = encoding.partition("C")
     if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and rest in {*"1234", ""}:
         return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(rest or 1)

@@ -1,4 +1,4 @@
-"""A camera's lens on ROS: ``camera_info``, where it is kept, and ``set_camera_info``."""
+"""A camera's lens in ROS: ``camera_info``, its file, and ``set_camera_info``."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def as_path(url: str) -> Path | None:
 
 
 class CameraLens:
-    """The lens of a camera's pictures: that of a file, else the one that a frame carries.
+    """The lens of a camera's pictures: from a file, otherwise from the frame.
 
     Args:
         name: name of the camera, for the file.
         frame_id: the camera's optical frame.
-        url: the file, ``camera_info`` of ROS, which need not be there yet; "": none.
+        url: URL of a file with ``camera_info`` of ROS, which need not exist yet; "": no file.
         size: function that returns the pictures' width and height.
 
     Raises:
@@ -65,7 +65,7 @@ class CameraLens:
         self._writing = asyncio.Lock()
 
     async def load(self) -> None:
-        """Read the file, once; log one that is not valid, and take it as missing."""
+        """Read the file, once; if the file is not valid, log that and ignore it."""
         if self._read or self._path is None:
             return
         async with self._writing:
@@ -80,7 +80,7 @@ class CameraLens:
             self._read = True
 
     def fields(self, frame: Frame) -> dict[str, Any]:
-        """Return ``sensor_msgs/CameraInfo`` beside the image of a frame."""
+        """Return the ``sensor_msgs/CameraInfo`` of a frame."""
         header, size = header_fields(frame.utc, self._frame_id), (frame.width, frame.height)
         info = self._info
         lens = frame.camera_info if info is None else info.camera
@@ -104,7 +104,7 @@ class CameraLens:
     async def set(self, request: Any) -> dict[str, Any]:
         """Serve ``sensor_msgs/srv/SetCameraInfo``.
 
-        Cancellation: the file is the old one or the new one, whole.
+        Cancellation: the file is either the old one or the new one, complete.
         """
         try:
             where = await self._set(request.camera_info)

@@ -1,4 +1,4 @@
-"""Lenses as ROS' ``camera_info`` and back; nothing here knows a node."""
+"""Convert lenses to ROS' ``camera_info`` and back, without a node."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LENSES: Final = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""Models of distortion, and how many coefficients each may come with."""
+"""Possible numbers of coefficients by the model of distortion."""
 
 
 def lens_fields(
@@ -29,11 +29,11 @@ def lens_fields(
     """Return the fields of ``sensor_msgs/CameraInfo``.
 
     Args:
-        lens: model of the lens; None: not calibrated, for which K, D, R and P are zero in ROS.
+        lens: model of the lens; None: not calibrated, so K, D, R and P are zero.
         header: header of the picture.
         size: width and height of the picture, pixels.
         rectification: (3, 3), from the camera's frame into the rectified one; None: no rotation.
-        projection: (3, 4), of the rectified picture, pixels; None: the lens without distortion.
+        projection: (3, 4), of the rectified picture, pixels; None: of the lens without distortion.
     """
     fields: dict[str, Any] = {"header": header, "width": size[0], "height": size[1]}
     if lens is None:
@@ -53,11 +53,11 @@ def lens_from(message: Any) -> CameraInfo | None:
     """Return the lens of a ``sensor_msgs/CameraInfo``, its rectification and projection.
 
     Returns:
-        None if it was not calibrated.
+        The lens; None if it is not calibrated.
 
     Raises:
-        RosMessageError: the lens is of a model that smartcam does not have, binned or of a region.
-        CalibrationError: its matrix or coefficients are no lens.
+        RosMessageError: the model of the lens is unknown, or the picture is binned or a region.
+        CalibrationError: the matrix or coefficients do not make a lens.
     """
     if not message.k[0]:
         return None

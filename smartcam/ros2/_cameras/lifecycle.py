@@ -1,6 +1,6 @@
-"""The life cycle of a camera's node: what its states mean, and its services.
+"""The life cycle of a camera's node: the meaning of its states, and its services.
 
-Services and topic are those of rcl_lifecycle (``com_interface.c``).
+Services and topic are as in rcl_lifecycle (``com_interface.c``).
 """
 
 from __future__ import annotations
@@ -23,42 +23,42 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 PATIENCE_TIMEOUT = 60.0
-"""Seconds that one wait for a camera takes before the next one begins."""
+"""Largest number of seconds of one wait for a camera, before the next wait begins."""
 
 RETRY = Backoff(initial=0.5, maximum=10.0)
-"""Delays after which a camera that is there, but could not be had as wanted, is tried again."""
+"""Delays between attempts to configure a connected camera."""
 
 
 class CameraLifecycle(Lifecycle):
     """The life cycle of a camera's node.
 
-    A camera may be shared by many programs, and the node is one of them: whatever its state, the
-    camera's session, its run mode and the other programs stay as they are. What each means:
+    A camera may be shared by many programs, of which the node is one: no state of the node affects
+    the camera's session, its run mode or the other programs. The states and transitions:
 
     ================ ===============================================================
-    Unconfigured     status and diagnostics are published, services answer; nothing
-                     else is asked of the camera
-    configure        waits for a session with the camera, and for its application to
-                     be loaded, run and ready where one is wanted; this is the only
-                     transition that may change something at the camera
-    Inactive         the camera is there; results are not published
-    activate         results, pictures and frames of reference are published
-    Active           they are; a camera that is lost leaves it Active, since it is
-                     connected again by itself: status and diagnostics tell
-    deactivate       nothing more is published
-    cleanup          the same, and the node no longer needs the camera, whose
-                     session stays with its owner
+    Unconfigured     status and diagnostics are published, services answer; the node
+                     does nothing else with the camera
+    configure        waits for a session with the camera, and loads and runs its
+                     application if one is set; this is the only transition that
+                     may change something at the camera
+    Inactive         the camera is connected; results are not published
+    activate         starts to publish results, pictures and frames of reference
+    Active           all is published; if the camera is lost, the node stays Active
+                     until the reconnect: status and diagnostics show the loss
+    deactivate       ends publishing
+    cleanup          the node no longer needs the camera, whose session its owner
+                     keeps
     shutdown         the node does nothing more, for good; it stays in the graph
                      until its program closes it
     ================ ===============================================================
 
-    Where ``autostart`` is set it goes to Active by itself as soon as the camera is there, unless
-    somebody asks for a transition first, or the camera refuses the application.
+    With ``autostart`` the node goes to Active by itself as soon as the camera is connected, unless
+    a program requests a transition first, or the camera refuses the application.
 
     Args:
-        camera: camera that the node stands for.
-        node: node of ROS 2 or of ROS 1, where there are no services of a life cycle.
-        application: id of the application to have running and ready; None: that of the settings.
+        camera: camera of the node.
+        node: node of ROS 2, or of ROS 1, which has no services of a life cycle.
+        application: id of the application to load and run; None: that of the settings.
         autostart: whether the node goes to Active by itself.
     """
 
@@ -75,9 +75,9 @@ class CameraLifecycle(Lifecycle):
         super().__init__(node.full_name, {"configure": self._have_camera}, limit)
 
     async def start(self) -> None:
-        """Serve, and go to Active by itself where that is wanted."""
+        """Serve, and go to Active with ``autostart``."""
         manage = getattr(self._node, "manage", None)
-        if manage is not None:  # rclpy has a life cycle of its own, which follows this one
+        if manage is not None:  # rclpy has its own life cycle, which follows this one
             self._ends.append(manage(self, self._on_change_state))
         elif is_managed(self._node):
             await self._declare()
@@ -88,13 +88,13 @@ class CameraLifecycle(Lifecycle):
         event = self._node.publisher("~/transition_event", "lifecycle_msgs/msg/TransitionEvent")
         self._ends.append(event)
         self._event = event
-        self.listen(self._say)
+        self.listen(self._publish_transition)
         for name, (kind, handler) in self._services().items():
             self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
-            await asyncio.sleep(0)  # to declare takes the engine a while
+            await asyncio.sleep(0)  # a declaration takes the engine a while
 
     def _services(self) -> dict[str, tuple[str, Callable[[Any], Awaitable[Any]]]]:
-        def told(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
+        def answering(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
             async def answer(_request: object) -> dict[str, Any]:
                 return fields()
 
@@ -104,10 +104,10 @@ class CameraLifecycle(Lifecycle):
         ways = "GetAvailableTransitions"
         return {
             "change_state": ("ChangeState", self._on_change_state),
-            "get_state": ("GetState", told(lambda: {"current_state": self.state._asdict()})),
-            "get_available_states": ("GetAvailableStates", told(lambda: states)),
-            "get_available_transitions": (ways, told(lambda: _described(self.available))),
-            "get_transition_graph": (ways, told(lambda: _described(TRANSITIONS))),
+            "get_state": ("GetState", answering(lambda: {"current_state": self.state._asdict()})),
+            "get_available_states": ("GetAvailableStates", answering(lambda: states)),
+            "get_available_transitions": (ways, answering(lambda: _described(self.available))),
+            "get_transition_graph": (ways, answering(lambda: _described(TRANSITIONS))),
         }
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
@@ -119,11 +119,11 @@ class CameraLifecycle(Lifecycle):
             return {"success": False}
         return {"success": True}
 
-    def _say(self, transition: LifecycleTransition) -> None:
+    def _publish_transition(self, transition: LifecycleTransition) -> None:
         self._event.publish({"timestamp": time.time_ns(), **transition.fields})
 
     def _begins(self) -> None:
-        """Stop starting by itself, since others have taken over."""
+        """End the automatic start, since another program has requested a transition."""
         starting = self._starting
         if starting is not None and starting is not asyncio.current_task():
             starting.cancel()
@@ -140,8 +140,8 @@ class CameraLifecycle(Lifecycle):
         await have_application(camera, application, limit)
 
     async def _start_up(self) -> None:
-        """Go to Active as soon as the camera is there, however long that takes."""
-        told, delays = "", RETRY.delays()
+        """Go to Active as soon as the camera is connected, without a time limit."""
+        logged, delays = "", RETRY.delays()
         while True:
             try:
                 await self._camera.wait_connected(PATIENCE_TIMEOUT)
@@ -150,19 +150,19 @@ class CameraLifecycle(Lifecycle):
             except (LinkError, ResponseTimeoutError) as exc:
                 why = str(exc)
             except SmartCamError as exc:
-                # trying again would stop the camera each time, which others use
-                text = "%s ! it stays %s until somebody configures it: %s"
+                # a further attempt would stop the shared camera each time
+                text = "%s ! it stays %s until a program configures it: %s"
                 logger.error(text, self.name, self.state.label, exc)  # noqa: TRY400 - it is said
                 return
             else:
                 return
-            level = logging.DEBUG if why == told else logging.WARNING
+            level = logging.DEBUG if why == logged else logging.WARNING
             logger.log(level, "%s ! it is not active yet: %s", self.name, why)
-            told = why
+            logged = why
             await asyncio.sleep(next(delays))
 
     async def close(self) -> None:
-        """End the node: tell others, and then stop its services. Idempotent."""
+        """End the node: publish that, and then stop its services. Idempotent."""
         self.closed = True
         starting, self._starting = self._starting, None
         try:
@@ -177,10 +177,10 @@ class CameraLifecycle(Lifecycle):
 
 
 async def have_application(camera: Camera[Any], application: int, timeout: float) -> None:
-    """Have an application running and ready; each step has ``timeout`` seconds.
+    """Load and run an application; each step has ``timeout`` seconds.
 
     Raises:
-        SmartCamError: a step has failed.
+        SmartCamError: a step failed.
     """
     if await camera.query_application() != application:
         await camera.switch_application(application, timeout=timeout)

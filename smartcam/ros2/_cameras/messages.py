@@ -1,8 +1,8 @@
 """Convert smartcam's values of a camera to messages of ROS; pure.
 
-Lengths are metres and angles radians on both sides, and axes are as REP-103 has them: a camera's
-plane has x right, y up and z towards the camera, right-handed. A calibration has brought poses into
-the robot's frame before they come here.
+Lengths are metres and angles radians on both sides, and axes are as in REP-103: a camera's plane
+has x right, y up and z towards the camera, right-handed. Poses already are in the robot's frame if
+there is a calibration.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ MAX_ERROR_CHARACTERS = 1000
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error as a field ``error`` has it: never empty, one that UTF-8 can say."""
+    """Return an error's text for a field ``error``: never empty, and valid as UTF-8."""
     text = str(error) or type(error).__name__
     return utf8(text[:MAX_ERROR_CHARACTERS])
 
 
 def utf8(text: str) -> str:
-    """Return a text without what no string of ROS can hold: NUL, and halves of pairs."""
+    """Return a text without characters that no string of ROS can hold: NUL and lone surrogates."""
     return text.replace("\0", "\ufffd").encode(errors="replace").decode()
 
 
@@ -50,8 +50,8 @@ class ResultMessages:
 
     Args:
         types: types of the messages, from the node that publishes them.
-        camera: name of the camera, which is the frame of poses without a calibration.
-        frame_id: name of that frame in ROS.
+        camera: name of the camera, which is also its frame: that of poses without a calibration.
+        frame_id: name of the camera's frame in ROS.
         calibration: calibration of the camera's settings, which names the robot's frame.
         robot_frame: name of the robot's frame in ROS; empty: the calibration's own.
 
@@ -103,7 +103,7 @@ class ResultMessages:
         """Return the frame of a result's poses.
 
         Raises:
-            RosMessageError: the poses are in several.
+            RosMessageError: the poses are in several frames.
         """
         found = localizations_of(result.value)
         frames = {one.pose.header.frame_id for one in found or ()}
@@ -118,7 +118,7 @@ class ResultMessages:
         return self._in_ros.get(frame_id, frame_id)
 
     def _empty_frame(self, application: int) -> str:
-        """Return the frame of a result in which nothing was found, as smartcam calls it."""
+        """Return smartcam's name of the frame of a result without localizations."""
         calibration = calibration_of(self._calibration, application)
         return frame_of_robot(calibration) or self._camera
 
@@ -146,7 +146,7 @@ class ResultMessages:
         """Return the ``Detection3DArray`` of a result: one hypothesis for each part.
 
         ``class_id`` is its feature, ``score`` its quality, ``bbox.center`` its pose; sizes and
-        covariances are 0, which says that they are not known.
+        covariances are 0, which means that they are not known.
 
         Raises:
             RosMessageError: the poses are in several frames.
@@ -177,16 +177,16 @@ class ResultMessages:
         return made
 
     def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:
-        """Return the message of a result as it came and as it was read.
+        """Return the message of a result: its container and its value.
 
         Args:
             result: result to send.
-            parts: localizations of the result, in metres; None if the result has none of that kind:
-                the message has the value as JSON then.
+            parts: localizations of the result, in metres; None if the result has none: then the
+                message has the value as JSON.
         """
         try:
             frame_id = self.frame_of(result)
-        except RosMessageError:  # each part says its own
+        except RosMessageError:  # each part has its own frame
             frame_id = ""
         text, error = "", ""
         if parts is None and not isinstance(result.value, bytes):
@@ -197,7 +197,7 @@ class ResultMessages:
         return self._cls.Result(
             self.header(result.received_at, frame_id),
             self._camera,
-            max(result.application, 0),  # -1 where a camera does not say it
+            max(result.application, 0),  # -1 if a camera does not report it
             result.number,
             error,
             self.localizations(parts or ()),
@@ -206,6 +206,6 @@ class ResultMessages:
         )
 
     def failed(self, error: BaseException, at: datetime) -> Any:
-        """Return the message of a result that could not be read."""
+        """Return the message of a result that could not be interpreted."""
         header = self.header(at, self.frame_id)
         return self._cls.Result(header, self._camera, 0, 0, error_text(error), [], "", b"")

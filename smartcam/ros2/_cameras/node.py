@@ -1,4 +1,4 @@
-"""A camera as a node of ROS: what it is made of, and its life."""
+"""A camera as a node of ROS: its parts, and their start and stop."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 class CameraPart(Protocol):
-    """A part of a camera's node, which owns what it declares, and its tasks."""
+    """A part of a camera's node, which owns its topics and services, and its tasks."""
 
     def start(self) -> Awaitable[None] | None:
-        """Declare the part, and begin."""
+        """Declare topics and services, and start."""
         ...
 
     async def close(self) -> None:
-        """End the part, within seconds; also where starting it failed."""
+        """End the part, within seconds; also if its start failed."""
         ...
 
 
@@ -63,26 +63,26 @@ PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: StaticTransforms(one.node, one.frames.transforms()),
     lambda one: one.lifecycle,
 )
-"""Parts of a node, in the order in which they start. The life cycle is the last, so that its events
-are heard."""
+"""Parts of a node, in the order of their start. The life cycle is the last, so that the others get
+its events."""
 
 
 class CameraNode(Server):
     """A camera as a node of ROS; ``async with`` opens and closes it.
 
-    The camera is its owner's: it is open, connected or not, and stays so. The node is opened and
-    closed with this. See :class:`CameraLifecycle` for what its states mean.
+    The camera is open, connected or not, and its owner closes it. The node is opened and closed
+    with this object. See :class:`CameraLifecycle` for the meaning of the states.
 
     Args:
-        camera: open camera that the node stands for.
-        node: node of ROS 2, or of ROS 1 behind a rosbridge.
+        camera: open camera of the node.
+        node: node of ROS 2, or of ROS 1 through a rosbridge.
         options: settings of the node.
 
     Attributes:
-        lifecycle: life cycle of the node, which says whether results are published.
+        lifecycle: life cycle of the node, which decides whether results are published.
         status: publisher of the camera's status and diagnostics.
         results: publisher of the camera's results.
-        services: services by which other nodes use the camera.
+        services: services of the camera for other nodes.
         calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
@@ -120,12 +120,12 @@ class CameraNode(Server):
 
     @property
     def frame_id(self) -> str:
-        """The frame of what it sees."""
+        """The frame of the camera's results."""
         return self.options.frame_id or self.camera.name
 
     @property
     def frames(self) -> CameraFrames:
-        """The names of the camera's frames, and where they are."""
+        """The names of the camera's frames, and their places."""
         options = self.options
         return CameraFrames(
             self.frame_id,
@@ -158,12 +158,12 @@ class CameraNode(Server):
         self.results.active = self.lifecycle.active
 
     async def start(self) -> None:
-        """Open the node, and begin with all that it is made of.
+        """Open the node, and start all its parts.
 
         Raises:
-            SmartCamError: something of it is not valid; all is undone.
+            SmartCamError: a part cannot start; then the node is closed again.
 
-        Cancellation: leaves it closed.
+        Cancellation: the node is closed.
         """
         async with self._turn:
             if self._stack is not None:
@@ -179,11 +179,11 @@ class CameraNode(Server):
                         begun = part.start()
                         if inspect.isawaitable(begun):
                             await begun
-                        await asyncio.sleep(0)  # to declare takes the engine a while
+                        await asyncio.sleep(0)  # a declaration takes the engine a while
                 self._stack = stack.pop_all()
 
     async def stop(self) -> None:
-        """End all of it, and the node. Idempotent, bounded."""
+        """Close all parts and the node. Idempotent, bounded."""
         async with self._turn:
             stack, self._stack = self._stack, None
             if stack is not None:
@@ -191,7 +191,7 @@ class CameraNode(Server):
 
 
 async def _closed(part: CameraPart) -> None:
-    """Close a part; the others are closed whatever becomes of it."""
+    """Close a part; log a failure, so that the others are closed too."""
     try:
         await part.close()
     except Exception:

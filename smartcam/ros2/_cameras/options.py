@@ -24,28 +24,28 @@ class CameraNodeOptions:
 
     Attributes:
         frame_id: name of the camera's frame; empty for the camera's name.
-        parent_frame: name of the robot's frame; empty: as a calibration calls it.
-        flange_frame: name of the frame of the part of the robot that carries the camera; empty: as
-            a calibration calls it.
-        place: hand-eye calibration, which says where the camera is; None without.
+        parent_frame: name of the robot's frame; empty: the name in a calibration.
+        flange_frame: name of the frame of the part of the robot that carries the camera; empty: the
+            name in a calibration.
+        place: hand-eye calibration, the camera's place; None without.
         calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
             calibration of the camera's settings was made; None if the camera stands still.
         autostart: whether the life cycle goes to Active by itself.
-        application: id of the application to have running and ready once configured; None: that
-            of the camera's settings.
+        application: id of the application that configuring loads and runs; None: that of the
+            camera's settings.
         diagnostics_period: seconds between two diagnostics.
-        status_rate: most messages of status a second.
+        status_rate: largest number of messages of status a second.
         hardware_id: id of the hardware in diagnostics; empty for the camera's address.
-        settings: what the session with the camera is told, where that is not what the camera's own
-            settings say: the agent's, of a camera of a fleet.
-        heard: whether there is any sign of the agent that has the session; None if nobody is
-            between.
-        frames: parameters that say where its frames come from, by v4l2_camera's names:
+        settings: settings of the session with the camera, if they differ from the camera's own:
+            the agent's, for a camera of a fleet.
+        heard: function that returns whether the agent with the session is alive; None if there is
+            no agent.
+        frames: parameters for the source of its frames, by v4l2_camera's names:
             ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
         controls: function that returns the open source of the frames, whose device's controls
-            become parameters; None: there are none.
-        calibrations: folder that calibrations of the camera are written to, or the calibrations
-            that other faces of the camera have, too; None: the services for them refuse.
+            become parameters; None: no controls.
+        calibrations: folder for calibrations of the camera, or calibrations that are shared with
+            other interfaces of the camera; None: the services for them refuse.
     """
 
     frame_id: str = ""

@@ -1,4 +1,4 @@
-"""Parameters of a camera's node: what a fleet file says of the camera, and where it can be set."""
+"""Parameters of a camera's node: the camera's settings from a fleet file, some of them settable."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from smartcam.settings import CameraSettings
 
 SWITCH_TIMEOUT = 9.0
-"""Seconds that a switch may take at most: setting a parameter is given up after 10."""
+"""Seconds of the timeout of a switch: setting a parameter is given up after 10."""
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 PERIODS = (0.1, 3600.0)
-"""Seconds between two diagnostics."""
+"""Range of the seconds between two diagnostics."""
 
 SAID: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
     "url": ("where the camera is, without a password", lambda one: masked(one.address.url)),
@@ -50,7 +50,7 @@ SAID: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
         lambda one: one.liveness_timeout or 0.0,
     ),
 }
-"""Parameters that can only be read: the description, and the way to the value in the settings."""
+"""Read-only parameters: the description, and a function that returns the value."""
 
 FRAMES = {
     "video_device": "where frames come from",
@@ -58,11 +58,11 @@ FRAMES = {
     "image_size": "width and height of frames in pixels",
     "camera_info_url": "where the lens is said",
 }
-"""Names as v4l2_camera has them."""
+"""Descriptions by v4l2_camera's names."""
 
 
 def as_text(spec: object) -> str:
-    """Return in one line how results are read."""
+    """Return an interpretation in one line."""
     if spec is None:
         return ""
     if isinstance(spec, Mapping):
@@ -71,17 +71,17 @@ def as_text(spec: object) -> str:
 
 
 class CameraParameters:
-    """Declares the parameters by which a camera is known and set.
+    """Declares parameters for a camera's settings.
 
-    ``application`` is the active application, 0 where that is not known. Setting this parameter
-    switches the camera, for all who use it: the value counts once the camera is ready, and where
-    the camera refuses, the parameter is refused with its words.
+    ``application`` is the active application, 0 if that is not known. Setting this parameter
+    switches the camera, for all its users: the parameter has the new value once the camera is
+    ready; if the camera refuses, the parameter is refused with the camera's error.
 
     Args:
-        camera: camera that the parameters are about.
+        camera: camera of the parameters.
         node: node of ROS 2.
         options: settings of the camera's node.
-        status: publisher of the status, which tells of the camera's changes and has the period of
+        status: publisher of the status, which reports the camera's changes and has the period of
             diagnostics.
     """
 
@@ -146,7 +146,7 @@ class CameraParameters:
             self._stop_listening()
         declared, self._declared = self._declared, []
         for name in declared:
-            with contextlib.suppress(ConfigurationError):  # somebody else has done so
+            with contextlib.suppress(ConfigurationError):  # another program has undeclared it
                 self._parameters.undeclare(name)
 
     def _active(self) -> int:

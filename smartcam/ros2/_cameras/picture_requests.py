@@ -1,4 +1,4 @@
-"""One picture on request, by a service."""
+"""Serve one picture for each request."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_TIMEOUT: Final = 60.0
-"""Longest ``timeout`` of a request, seconds, and the one of a request without any."""
+"""Longest ``timeout`` of a request in seconds, and the default."""
 
 
 async def one_frame(
     frames: FrameSource | None, camera: Camera[Any] | None, timeout: float
 ) -> Frame:
-    """Return a picture: the first that is exposed after this, or the last one of the camera.
+    """Return a picture: the first that is exposed after the call, or the last one of the camera.
 
     Raises:
-        SmartCamError: there is no picture in time.
+        SmartCamError: no picture came in time.
     """
     if frames is not None:
         return await frames.after(time.monotonic(), timeout=timeout)
@@ -46,7 +46,7 @@ async def one_frame(
 
 
 def frame_of_file(data: bytes, source: str) -> Frame:
-    """Return the frame of a file's bytes, a bitmap or a JPEG, that came just now; blocks.
+    """Return the frame of a bitmap's or a JPEG's bytes, with the present time; blocks.
 
     Raises:
         FrameFormatError: the file is neither.
@@ -78,13 +78,13 @@ def frame_of_file(data: bytes, source: str) -> Frame:
 
 
 class PictureRequests:
-    """Serves ``smartcam_msgs/srv/RequestImage``: one picture, and the lens beside it.
+    """Serves ``smartcam_msgs/srv/RequestImage``: a picture and its lens.
 
     Args:
-        node: node that serves.
+        node: node of the service.
         frame_id: name of the camera's optical frame.
         lens: the camera's lens.
-        take: function that returns a picture within so many seconds.
+        take: function that returns a picture within a number of seconds.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class PictureRequests:
         try:
             return await self._serve(request.timeout)
         except SmartCamError as exc:
-            logger.warning("%s ! a picture was asked for in vain: %s", self._node.full_name, exc)
+            logger.warning("%s ! a request for a picture failed: %s", self._node.full_name, exc)
             return {"error": error_text(exc)}
 
     async def _serve(self, asked: float) -> dict[str, Any]:

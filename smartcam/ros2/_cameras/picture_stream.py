@@ -1,4 +1,4 @@
-"""A stream of pictures on a topic, while somebody hears it: the newest only."""
+"""Publish the newest pictures on a topic while it has a subscriber."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 Item = TypeVar("Item")
 
 LOOK_INTERVAL: Final = 0.1
-"""Seconds between two looks whether somebody hears."""
+"""Seconds between two checks for a subscriber."""
 
 SELDOM_INTERVAL: Final = 1.0
-"""Seconds between two looks where the graph tells of new listeners."""
+"""Seconds between two checks if the graph reports new subscribers."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
-"""Delays after which a source that ended is opened again, while somebody hears."""
+"""Delays after which a source that ended is opened again, while there is a subscriber."""
 
 
 class HeardPictures(Generic[Item]):
-    """Reads a source while one of its topics is heard, and has each frame published.
+    """Reads a source while one of its topics has a subscriber, and publishes each frame.
 
     Args:
         name: name of the camera, for the log.
         publishers: publishers of the topics.
-        read: opens a reader whose iteration waits for so many seconds.
-        publish: publishes a frame; the next one is taken when it is done.
+        read: function that opens a reader whose iteration waits for a number of seconds.
+        publish: coroutine function that publishes a frame; the next frame is read after it.
 
     Attributes:
-        frames: frames that were published.
+        frames: number of published frames.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class HeardPictures(Generic[Item]):
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Begin to look whether somebody hears."""
+        """Start to check for subscribers."""
         if self._task is None:
             watches = [getattr(one, "watch", None) for one in self._publishers]
             if None not in watches:
@@ -67,7 +67,7 @@ class HeardPictures(Generic[Item]):
             )
 
     def end(self) -> None:
-        """Read no longer, as soon as may be. Idempotent."""
+        """Stop reading as soon as possible. Idempotent."""
         watches, self._watches = self._watches, []
         for end in watches:
             end()
@@ -75,9 +75,9 @@ class HeardPictures(Generic[Item]):
             self._task.cancel()
 
     async def close(self) -> None:
-        """Read no longer. Idempotent.
+        """Stop reading. Idempotent.
 
-        Cancellation: it ends nevertheless.
+        Cancellation: reading still ends.
         """
         self.end()
         if self._task is not None:
@@ -86,7 +86,7 @@ class HeardPictures(Generic[Item]):
 
     @property
     def heard(self) -> bool:
-        """True if somebody hears one of the topics, as far as is known."""
+        """True if one of the topics has a subscriber, as far as is known."""
         return any(getattr(one, "heard", True) for one in self._publishers)
 
     async def _run(self) -> None:
@@ -101,7 +101,7 @@ class HeardPictures(Generic[Item]):
                 await self._pause(next(delays))
 
     async def _until_heard(self) -> None:
-        """Wait until somebody hears; look seldom where the graph wakes it."""
+        """Wait for a subscriber; check seldom if the graph reports subscribers."""
         loop = asyncio.get_running_loop()
         often = 0.0
         while not self.heard:
@@ -114,21 +114,23 @@ class HeardPictures(Generic[Item]):
                 await asyncio.sleep(0)
 
     async def _pause(self, seconds: float) -> None:
-        """Wait before the source is opened again, for as long as somebody hears."""
+        """Wait before the source is opened again, while there is a subscriber."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
-        while self.heard and loop.time() < end:  # noqa: ASYNC110 - nothing tells of it
+        while self.heard and loop.time() < end:  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(LOOK_INTERVAL)
 
     async def _stream(self) -> None:
-        """Publish until nobody hears, or the source ends."""
+        """Publish until there is no subscriber, or the source ends."""
         try:
             async with self._read(LOOK_INTERVAL) as reader:
                 while self.heard:
                     with contextlib.suppress(FrameTimeoutError):
                         await self._one(await anext(reader))
         except StopAsyncIteration:
-            self._tell("the source of pictures ended; it is tried again while somebody hears")
+            self._tell(
+                "the source of pictures ended; it is opened again while there is a subscriber"
+            )
         except SmartCamError as exc:
             self._tell(str(exc))
         except Exception:
@@ -137,21 +139,21 @@ class HeardPictures(Generic[Item]):
     async def _one(self, frame: Item) -> None:
         try:
             await self._publish(frame)
-        except FrameFormatError as exc:  # the next one may be whole
+        except FrameFormatError as exc:  # the next frame may be complete
             self._tell(str(exc))
             return
         self.frames += 1
         self._told = ""
 
     def _tell(self, text: str) -> None:
-        """Say in the log what is wrong, once until pictures come again."""
+        """Log an error, once until pictures come again."""
         if text != self._told:
             self._told = text
             logger.warning("%s ! %s", self._name, text)
 
 
-async def say_newest(publisher: Any, fields: dict[str, Any]) -> None:
-    """Publish the newest; a node of ROS 1 has a queue of its own for that."""
+async def publish_newest(publisher: Any, fields: dict[str, Any]) -> None:
+    """Publish the newest message; a node of ROS 1 has its own queue for that."""
     newest = getattr(publisher, "publish_newest", None)
     if newest is None:
         publisher.publish(fields)

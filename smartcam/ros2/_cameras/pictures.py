@@ -1,4 +1,4 @@
-"""A camera's pictures on ROS: ``image_raw``, ``camera_info``, ``image_raw/compressed``."""
+"""A camera's pictures in ROS: ``image_raw``, ``camera_info``, ``image_raw/compressed``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smartcam.ros2._cameras.image_messages import (
 )
 from smartcam.ros2._cameras.lens import CameraLens
 from smartcam.ros2._cameras.picture_requests import PictureRequests, one_frame
-from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
 from smartcam.ros2._node.qos import DRIVER
 
 if TYPE_CHECKING:
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 
 SIZE_TIMEOUT: Final = 10.0
-"""Seconds for a picture whose size is asked for."""
+"""Seconds of the timeout for a picture that is taken for its size."""
 
 MAX_STAMPS: Final = 16
-"""Stamps of pictures that are remembered: each has one ``camera_info``."""
+"""Number of remembered stamps of pictures: each stamp gets one ``camera_info``."""
 
 
 class CameraPictures:
-    """Publishes what a camera sees, while somebody hears it, and serves single pictures.
+    """Publishes a camera's pictures while there is a subscriber, and serves single pictures.
 
     Topics, private to the node: ``image_raw``, ``camera_info``, ``image_raw/compressed``; services:
-    ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp:
-    when it was captured. A slow subscriber gets the newest, and holds up nobody.
+    ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp: the
+    time of the capture. A slow subscriber gets the newest picture, and delays no other.
 
     Args:
-        camera: the camera; None if ``frames`` is all there is.
+        camera: the camera; None if there is only ``frames``.
         node: open node of ROS.
-        frames: an open source of its pictures, which stays the caller's; None: the camera's own
-            :meth:`~smartcam.Camera.frames`, where it has some.
+        frames: an open source of pictures, which the caller closes; None: the camera's own
+            :meth:`~smartcam.Camera.frames`, if it has some.
         frame_id: the optical frame, z ahead and y down (REP-103); "": the node's name with
             ``_optical``.
-        camera_info_url: the file of the lens, ``file:///PATH`` or a path, which need not be there
-            yet; "": none, and the lens is that of the frames.
+        camera_info_url: the file of the lens, ``file:///PATH`` or a path, which need not exist
+            yet; "": no file, and the lens is that of the frames.
         quality: quality of JPEGs, 1 to 100.
 
     Raises:
@@ -100,7 +100,7 @@ class CameraPictures:
         return True
 
     def start(self) -> None:
-        """Have the topics and services; the device streams when somebody hears."""
+        """Declare topics and services; the device streams while there is a subscriber."""
         if self._thread is not None:
             return
         self._thread = ThreadPoolExecutor(1, "smartcam-ros2-pictures")
@@ -131,9 +131,9 @@ class CameraPictures:
             one.start()
 
     async def close(self) -> None:
-        """Be gone; a source of the caller's stays open. Idempotent.
+        """Withdraw topics and services; a source of the caller's stays open. Idempotent.
 
-        Cancellation: all is closed nevertheless.
+        Cancellation: everything is still closed.
         """
         streams, self._streams = self._streams, []
         for one in streams:
@@ -182,7 +182,7 @@ class CameraPictures:
             ready = frame
             if frame.format.name not in ENCODINGS:
                 ready = await self._in_thread(lambda: prepared(frame))
-            await say_newest(self._image, image_fields(ready, self.frame_id))
+            await publish_newest(self._image, image_fields(ready, self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_small(self, frame: Frame) -> None:
@@ -195,11 +195,11 @@ class CameraPictures:
             small = await self._codecs.png(small)
         elif way.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        await say_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
+        await publish_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:
-        """Publish the lens beside a picture; where two streams have it, once."""
+        """Publish the lens of a picture; once if two streams have the picture."""
         if frame.utc in self._stamps:
             return
         self._stamps.append(frame.utc)
@@ -208,9 +208,9 @@ class CameraPictures:
             self._info.publish(self._lens.fields(frame))
 
     async def _in_thread(self, work: Callable[[], Value]) -> Value:
-        """Have the thread for it do something; what is under way is finished."""
+        """Run a function in the thread for pictures; a started function is finished."""
         if self._thread is None:
-            raise RosError("these pictures are closed")
+            raise RosError("the publisher of pictures is closed")
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
 

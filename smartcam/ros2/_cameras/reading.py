@@ -1,4 +1,4 @@
-"""Find out how a camera's results are read, before they can be published."""
+"""Find out how a camera's results are interpreted, before they are published."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def reading_of(camera: Camera[Any]) -> Interpretation:
-    """Return the camera's own interpretation, which a trigger may replace for its results."""
+    """Return the camera's own interpretation; a trigger may have another for its results."""
     return camera._default  # noqa: SLF001 - smartcam's own
 
 
@@ -38,20 +38,20 @@ def calibration_of(given: Any, application: int) -> Any:
 
 
 def frame_of_robot(calibration: Any) -> str:
-    """Return the frame that a calibration says its poses are in; empty if it says none."""
+    """Return the frame of a calibration's poses; empty if the calibration has no name for it."""
     named = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
     return named if isinstance(named, str) else ""
 
 
 def calibrated(camera: Camera[Any], application: int) -> bool:
-    """Return True if a calibration brings an application's localizations to a robot."""
+    """Return True if an application has a calibration to a robot's frame."""
     return calibration_of(camera.settings.calibration, application) is not None
 
 
 def localizations_in_metres(
     camera: Camera[Any], result: Result[Any], spec: str | None = None
 ) -> list[Localization] | None:
-    """Return a result's localizations; None if it has none, or has them in pixels.
+    """Return a result's localizations; None if it has none, or they are in pixels.
 
     Args:
         camera: the camera.
@@ -65,4 +65,4 @@ def localizations_in_metres(
     if in_pixels(reader):
         return None
     other = not parts and reader is not None and without_poses(reader) is not None
-    return None if other else parts  # an empty list may be of texts, or of records
+    return None if other else parts  # an empty list may be one of texts, or of records

@@ -1,7 +1,7 @@
-"""The results of a camera on topics of its node, each once and in order.
+"""Publish the results of a camera on topics of its node, each once and in order.
 
-``~/results`` has all of them, ``~/localizations`` (``PoseArray``) and ``~/detections``
-(``Detection3DArray``) those that are localizations in metres.
+``~/results`` has all results, ``~/localizations`` (``PoseArray``) and ``~/detections``
+(``Detection3DArray``) have results with localizations in metres.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ TOPICS: Final = {"results": RESULT, "localizations": POSES, "detections": DETECT
 """Names, private to the node, and types."""
 
 MAX_QUEUED_BYTES: Final = 1 << 24
-"""Largest number of bytes of the containers whose results wait for a topic with a delay."""
+"""Largest number of bytes of containers whose results wait for a topic with a delay."""
 
 MAX_WAITING_RESULTS: Final = 4096
-"""Largest number of results that wait to be published; the oldest beyond is dropped, counted."""
+"""Largest number of results that wait to be published; beyond it the oldest is dropped, counted."""
 
 
 class CameraResults:
-    """Publishes the results of a camera, whoever triggered it.
+    """Publishes the results of a camera, of any program's triggers.
 
-    A header's stamp is when a result arrived, by the clock of the machine that has the session (of
-    a camera of a fleet: its agent's); no protocol of these cameras says when it was made. Results
-    that arrived together have the same one. Its ``frame_id`` is the camera's, or the robot's where
-    a calibration brought it there.
+    A header's stamp is the time of the result's arrival, by the clock of the machine that has the
+    session (for a camera of a fleet: its agent's); no protocol of these cameras has the time of the
+    picture. Results that arrived together have the same stamp. The ``frame_id`` is the camera's, or
+    with a calibration the robot's.
 
-    What cannot be read has only a message on ``~/results``, with its ``error``. Localizations in
-    pixels stand there as JSON, and nowhere else: the other topics have metres.
+    A result that cannot be interpreted has a message on ``~/results`` only, with its ``error``.
+    Localizations in pixels are only there, as JSON: the other topics have metres.
 
     Args:
-        camera: camera whose results are published.
+        camera: camera of the results.
         node: node that publishes them, of ROS 2 or ROS 1.
         frame_id: name of the camera's frame; by default the camera's name.
-        robot_frame: name of the robot's frame; empty: as the calibration calls it.
+        robot_frame: name of the robot's frame; empty: the name in the calibration.
 
     Attributes:
-        active: whether results are published; otherwise they are let go as they come.
-        taken: results that came to be published, those that could not be read included.
-        failed: results that could not be read.
-        refused: messages that could not be made of a result.
+        active: whether results are published; otherwise they are discarded as they come.
+        taken: number of results that came, including those that could not be interpreted.
+        failed: number of results that could not be interpreted.
+        refused: number of messages that could not be made from a result.
     """
 
     def __init__(
@@ -84,18 +84,18 @@ class CameraResults:
 
     @property
     def dropped(self) -> int:
-        """Results that came faster than they could be published, and those a delay dropped."""
+        """Number of results that were dropped, because they came too fast or by a delay."""
         waiting = 0 if self._stream is None else self._stream.statistics().dropped
         return waiting + (0 if self._outlet is None else self._outlet.dropped)
 
     @property
     def heard(self) -> bool:
-        """True if anybody hears any of the topics."""
+        """True if one of the topics has a subscriber."""
         outlet = () if self._outlet is None else (self._outlet,)
         return any(_heard(one) for one in (*self._publishers.values(), *outlet))
 
     def start(self) -> None:
-        """Have the topics, and publish what comes from now on. Idempotent.
+        """Declare the topics, and publish results from now on. Idempotent.
 
         Raises:
             RosError: the node is not open.
@@ -122,7 +122,7 @@ class CameraResults:
             logger.info("%s: without %s: %s", self._node.full_name, name, exc)  # as in ROS 1
 
     async def close(self) -> None:
-        """Publish no more, and have the topics no more. Idempotent."""
+        """Stop publishing, and withdraw the topics. Idempotent."""
         task, self._task = self._task, None
         stream, self._stream = self._stream, None
         try:
@@ -143,12 +143,12 @@ class CameraResults:
     def publish_on(
         self, topic: str, min_delay: float = 0.0, queue_size: int = DEFAULT_QUEUED_RESULTS
     ) -> None:
-        """Publish all results on one more topic, in place of the last one given here.
+        """Publish all results on a further topic, which replaces the last one given here.
 
         Args:
             topic: name of the topic, whose messages are as on ``~/results``; empty for none.
-            min_delay: least seconds between two messages; results wait for that.
-            queue_size: most results that may wait; beyond, the oldest is dropped and counted.
+            min_delay: least seconds between two messages, for which results wait.
+            queue_size: largest number of waiting results; beyond it the oldest is dropped, counted.
 
         Raises:
             ConfigurationError: the topic has no valid name, or a number is out of range.
@@ -201,7 +201,7 @@ class CameraResults:
                 return
             else:
                 self._take(result)
-            await asyncio.sleep(0)  # others want the loop, too
+            await asyncio.sleep(0)  # let other tasks run
 
     def _take(self, result: Result) -> None:
         if not self.active:
@@ -209,9 +209,11 @@ class CameraResults:
         self.taken += 1
         parts, make = localizations_in_metres(self._camera, result), self._messages
         if parts is not None:
-            self._say("localizations", lambda: make.poses(result, parts))
-            self._say("detections", lambda: make.detections(result, parts))
-        self._say_result(_Made(result.number, lambda: make.result(result, parts), len(result.raw)))
+            self._publish_to("localizations", lambda: make.poses(result, parts))
+            self._publish_to("detections", lambda: make.detections(result, parts))
+        self._publish_result(
+            _Made(result.number, lambda: make.result(result, parts), len(result.raw))
+        )
 
     def _take_failed(self, error: InterpretationError) -> None:
         if not self.active:
@@ -221,14 +223,14 @@ class CameraResults:
         level = logging.DEBUG if self.failed > 1 else logging.WARNING
         logger.log(level, "%s ! a result has no poses: %s", self._camera.name, error)
         message = self._messages.failed(error, datetime.now(UTC))
-        self._say_result(_Made(0, lambda: message, 0))
+        self._publish_result(_Made(0, lambda: message, 0))
 
-    def _say_result(self, made: _Made) -> None:
-        self._say("results", made.make)
+    def _publish_result(self, made: _Made) -> None:
+        self._publish_to("results", made.make)
         if self._outlet is not None:
             self._outlet.offer(made, self._put)
 
-    def _say(self, name: str, make: Any) -> None:
+    def _publish_to(self, name: str, make: Any) -> None:
         publisher = self._publishers.get(name)
         if publisher is not None:
             self._put(publisher, make)
@@ -250,7 +252,7 @@ class CameraResults:
 
 
 def _heard(publisher: Any) -> bool:
-    """Return False if it is known that nobody hears a topic, else True."""
+    """Return False if it is known that a topic has no subscriber, otherwise True."""
     return bool(getattr(publisher, "heard", True))
 
 
@@ -259,7 +261,7 @@ def _name(publisher: Any) -> str:
 
 
 class _Made(NamedTuple):
-    """A message that is made when it is said."""
+    """A message that is built when it is published."""
 
     number: int
     make: Any
@@ -270,7 +272,7 @@ class _SubscriberOutlet:
     """A topic with a delay between two messages, and a queue for that.
 
     Attributes:
-        dropped: results that found no room, or were left when it was closed.
+        dropped: number of results dropped for want of room, or at the end.
     """
 
     def __init__(self, topic: str, publisher: Any, min_delay: float, queue_size: int) -> None:
@@ -283,11 +285,11 @@ class _SubscriberOutlet:
 
     @property
     def heard(self) -> bool:
-        """True if anybody hears the topic."""
+        """True if the topic has a subscriber."""
         return _heard(self._publisher)
 
     def offer(self, made: _Made, put: Any) -> None:
-        """Have a message said, when it is time."""
+        """Publish a message when the delay is over."""
         if not self.heard:
             return
         self._queue.append(made)
@@ -311,7 +313,7 @@ class _SubscriberOutlet:
         self._go_on(put)
 
     def heir(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
-        """Return an outlet that goes on with the same publisher; waiting results are dropped."""
+        """Return an outlet for the same publisher with other limits; drop waiting results."""
         self._end()
         made = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
         made.dropped = self.dropped
@@ -324,6 +326,6 @@ class _SubscriberOutlet:
             self._timer.cancel()
 
     def close(self) -> None:
-        """Say nothing more; what waits is dropped."""
+        """Stop publishing, and drop waiting messages."""
         self._end()
         self._publisher.close()

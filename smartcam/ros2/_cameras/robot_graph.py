@@ -1,4 +1,4 @@
-"""Take pictures on topics and frames of TF from ROS, for a calibration."""
+"""Get pictures from topics and frames of TF from ROS, for a calibration."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
 LENS_WAIT: Final = 1.5
-"""Seconds that the lens of a camera on a topic is waited for, before a wizard begins."""
+"""Seconds of the timeout for a lens from a topic, before a wizard begins."""
 
 PICTURE_WAIT: Final = 25.0
-"""Seconds that a picture on a topic is waited for."""
+"""Seconds of the timeout for a picture from a topic."""
 
 MAX_APART: Final = 60.0
-"""Seconds between a stamp and this computer's clock beyond which the stamp is no time of this
-clock."""
+"""Largest number of seconds between a stamp and this computer's clock; beyond it the stamp is of
+another clock."""
 
 
 class CameraGraph:
-    """The graph that a camera's node is in, for the calibrations of the camera.
+    """The ROS graph of a camera's node, for the calibrations of the camera.
 
     Args:
         node: open node of ROS.
         calibrations: the calibrations; None if there are none.
-        owned: whether the calibrations end with the node, since no other face has them.
+        owned: whether the calibrations end with the node, since no other interface shares them.
     """
 
     def __init__(self, node: Any, calibrations: ThesisCalibration | None, *, owned: bool) -> None:
@@ -62,11 +62,11 @@ class CameraGraph:
         await self._transforms.close()
 
     def check_topic(self, topic: str) -> None:
-        """Raise ConfigurationError if there can be no such topic."""
+        """Raise ConfigurationError if a topic is not valid."""
         self._full(topic)
 
     def listen(self) -> None:
-        """Hear transforms from now on."""
+        """Subscribe to transforms from now on."""
         self._transforms.listen()
 
     async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
@@ -80,11 +80,11 @@ class CameraGraph:
     async def picture(self, topic: str) -> tuple[Any, float | None]:
         """Return the grey levels of a picture that was taken after this call, and its time, UTC.
 
-        A stamp that is no time of this computer's clock tells nothing: then the second picture that
-        comes counts, and it has no time.
+        If a stamp is not of this computer's clock, the second picture that comes is returned,
+        without a time.
 
         Raises:
-            CalibrationError: NO_PICTURE: none came in time.
+            CalibrationError: NO_PICTURE: no picture came in time.
             FrameFormatError: the message is no picture.
         """
         full = self._full(topic)
@@ -104,13 +104,13 @@ class CameraGraph:
         return await asyncio.to_thread(frame.grey), utc
 
     async def lens(self, topic: str) -> CameraModel | None:
-        """Return the lens that ``camera_info`` beside a topic with pictures tells.
+        """Return the lens from the ``camera_info`` of a topic with pictures.
 
-        None if nobody says it within :data:`LENS_WAIT`, or the lens was not calibrated.
+        None if no message came within :data:`LENS_WAIT`, or the lens is not calibrated.
 
         Raises:
-            RosMessageError, CalibrationError: the message is no lens, or one that smartcam has no
-                model of.
+            RosMessageError, CalibrationError: the message is not a valid lens, or its model is
+                unknown.
         """
         beside = f"{self._full(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
         heard = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))
@@ -127,7 +127,7 @@ class CameraGraph:
         return resolve(topic, self._node.namespace, self._node.name)
 
     def _kind(self, topic: str) -> str:
-        """Return the type of a topic with pictures: what is known of it, or what its name says."""
+        """Return the type of a topic with pictures, from the graph, otherwise from its name."""
         graph = getattr(self._node, "graph", None)
         types = [] if graph is None else graph.topics().get(topic, [])
         for kind in (IMAGE, COMPRESSED):
@@ -146,7 +146,7 @@ class CameraGraph:
 
 
 async def _fresh(heard: Any, came: list[float]) -> tuple[Any, float | None]:
-    """Return the first picture that was taken from now on, and its time."""
+    """Return the first picture that was taken after the call, and its time."""
     begun = time.time()
     while True:
         message = await anext(heard)

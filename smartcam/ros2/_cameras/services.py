@@ -1,6 +1,6 @@
 """The services of a camera's node: the thesis' eleven, those of std_srvs, and a typed trigger.
 
-An error never leaves a call without a reply where the reply has a field for it.
+If the reply has a field for an error, a call with an error gets a reply.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_RESULTS: Final = 1000
-"""Largest number of results that one answer brings."""
+"""Largest number of results in one answer."""
 
 MAX_INPUT_BYTES: Final = 1 << 16
 MAX_LAYOUT_CHARACTERS: Final = 10_000
@@ -41,10 +41,10 @@ CLOSE_TIMEOUT: Final = 5.0
 
 
 class CameraServices:
-    """Serves a camera; calls go to it as those of any program do.
+    """Serves a camera to other nodes, whose calls are like those of any program.
 
-    Two calls at once are as two programs': one trigger after the other, each within its own
-    timeout. A caller that goes away ends its call, and the camera stays usable.
+    Simultaneous calls are like those of two programs: one trigger after the other, each within its
+    own timeout. A call ends when its caller is lost, and the camera stays usable.
 
     Args:
         camera: the camera.
@@ -74,7 +74,7 @@ class CameraServices:
             "reboot": ("Trigger", self._reboot),
             "run": ("SetBool", self._run),
         }
-        # a trigger of another application has time of its own to go there and back
+        # a trigger of another application needs more time, to switch twice
         self._limit = MAX_TIMEOUT + 2 * camera.settings.switch_timeout + CLOSE_TIMEOUT
         self._served: list[Any] = []
 
@@ -101,7 +101,7 @@ class CameraServices:
             raise
 
     async def close(self) -> None:
-        """Serve no more; calls under way are given up. Idempotent, bounded."""
+        """Withdraw the services and cancel running calls. Idempotent, bounded."""
         served = self._withdraw()
         await self._thesis.close()
         try:
@@ -118,7 +118,7 @@ class CameraServices:
             one.close()
         return served
 
-    # ------------------------------------------------------------------ errors become fields
+    # ------------------------------------------------------------------ errors as fields
 
     def _serve(self, name: str, kind: str, handler: Any) -> None:
         response = self._node.types.service(kind).response
@@ -136,7 +136,7 @@ class CameraServices:
         async def handler(request: Any) -> dict[str, Any]:
             try:
                 return {"error": "", **await do(request)}
-            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+            except Exception as exc:  # noqa: BLE001 - the caller gets any error
                 return {"error": self._told(exc)}
 
         return handler
@@ -149,7 +149,7 @@ class CameraServices:
         async def handler(request: Any) -> dict[str, Any]:
             try:
                 return {"success": True, "message": await do(request)}
-            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+            except Exception as exc:  # noqa: BLE001 - the caller gets any error
                 return {"success": False, "message": self._told(exc)}
 
         return handler

@@ -1,4 +1,4 @@
-"""Publishes what a camera's node says of the camera: its status, latched, and diagnostics."""
+"""Publish a camera's status, latched, and its diagnostics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_EVENTS = 64
-"""Largest number of events that wait; what counts is the state after them."""
+"""Largest number of events that wait; only the state after them is published."""
 
 RISING: Mapping[str, str] = {
     "dropped": "results were dropped: a subscriber is too slow",
@@ -48,17 +48,17 @@ RISING: Mapping[str, str] = {
     "overtriggers": "triggers were dropped: they come too fast",
     "late": "results came after their triggers had given up",
 }
-"""Counters that are a warning where they have risen since the last diagnostics."""
+"""Counters that are a warning if they have risen since the last diagnostics."""
 
 COUNTERS = tuple(one.name for one in dataclasses.fields(Statistics) if one.type in {"int", int})
 MEANS = ("round_trip", "processing")
 
 
 class CameraStatus:
-    """Publishes a camera's status when it changes, and its diagnostics again and again.
+    """Publishes a camera's status when it changes, and its diagnostics periodically.
 
     Args:
-        camera: camera that the status is of.
+        camera: camera of the status.
         node: node of ROS 2 or 1.
         options: settings of the camera's node.
         state: function that returns the state of the life cycle.
@@ -77,7 +77,7 @@ class CameraStatus:
         self._said: dict[str, Any] | None = None
         self._due = -math.inf  # loop time of the next status
         self._since: datetime | None = None
-        self._before: dict[str, int] = {}  # counters, when the last diagnostics were said
+        self._before: dict[str, int] = {}  # counters at the last diagnostics
         self._woken = asyncio.Event()
         self._heard: list[Callable[[], None]] = []
         self._events: Any = None
@@ -93,12 +93,12 @@ class CameraStatus:
         self._events = self._camera.events(max_queue=MAX_WAITING_EVENTS)
         if self._camera.connected:
             self._since = datetime.now(UTC)
-        self._guarded(self._say_if_new)
+        self._guarded(self._publish_if_new)
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(self._follow()), loop.create_task(self._repeat())]
 
     async def close(self) -> None:
-        """Say nothing more. Idempotent."""
+        """Stop publishing. Idempotent."""
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
@@ -111,17 +111,17 @@ class CameraStatus:
             await asyncio.wait(tasks)
 
     def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
-        """Have ``heard`` called when a status is said that differs; return what ends that."""
+        """Call ``heard`` at each change of the status; return a function that ends that."""
         self._heard.append(heard)
         return lambda: self._heard.remove(heard) if heard in self._heard else None
 
     def set_period(self, seconds: float) -> None:
-        """Say diagnostics in this period from now on."""
+        """Publish diagnostics in this period from now on."""
         self.period = seconds
         self._woken.set()
 
     def _guarded(self, say: Callable[[], None]) -> None:
-        """Say something; that it cannot be said now does not end what says it."""
+        """Call a function that publishes; log its errors."""
         try:
             say()
         except SmartCamError as exc:
@@ -137,15 +137,15 @@ class CameraStatus:
     # ------------------------------------------------------------------ the status
 
     async def _follow(self) -> None:
-        """Say each change; of those that come too fast what they have left."""
+        """Publish each change; of changes that come too fast only the last state."""
         loop = asyncio.get_running_loop()
-        with contextlib.suppress(SmartCamError):  # it ended for good, and the status says why
+        with contextlib.suppress(SmartCamError):  # the camera has failed, and the status says why
             async for event in self._events:
                 self._note(event)
                 await asyncio.sleep(self._due - loop.time())
-                self._guarded(self._say_if_new)
+                self._guarded(self._publish_if_new)
         await asyncio.sleep(self._due - loop.time())
-        self._guarded(self._say_if_new)
+        self._guarded(self._publish_if_new)
 
     def _note(self, event: object) -> None:
         if isinstance(event, (Connected, Reconnected)):
@@ -153,7 +153,7 @@ class CameraStatus:
         elif isinstance(event, Disconnected):
             self._since = None
 
-    def _say_if_new(self) -> None:
+    def _publish_if_new(self) -> None:
         fields = status_fields(KnownState.of(self._camera))
         if fields == self._said:
             return
@@ -166,14 +166,14 @@ class CameraStatus:
     # ------------------------------------------------------------------ diagnostics
 
     async def _repeat(self) -> None:
-        """Say diagnostics in their period; what was missed is left out."""
+        """Publish diagnostics periodically; missed ones are left out."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
             if getattr(self._diagnostics, "heard", True):
                 self._guarded(self._diagnose)
             if loop.time() >= self._due:
-                self._guarded(self._say_if_new)  # why it is away changes without an event
+                self._guarded(self._publish_if_new)  # the reason of a loss changes without an event
             missed = max(0.0, loop.time() - due)
             due += self.period * (1 + missed // self.period)
             with contextlib.suppress(TimeoutError):
@@ -204,11 +204,11 @@ class CameraStatus:
 
     def _hardware_id(self) -> str:
         options = self._options
-        told = options.settings.address if options.settings is not None else None
-        return options.hardware_id or hardware_id(told or place_of(self._camera))
+        address = options.settings.address if options.settings is not None else None
+        return options.hardware_id or hardware_id(address or place_of(self._camera))
 
     def _is_heard(self, counted: Statistics) -> bool:
-        """Return True if there is, or was, any sign of the program that has the session."""
+        """Return True if the program that has the session is alive, or was."""
         if self._options.heard is not None:
             return self._options.heard()
         return bool(counted.sessions or counted.last_error)

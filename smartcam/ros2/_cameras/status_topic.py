@@ -1,4 +1,4 @@
-"""A camera's status on a topic that the thesis' Setup names, beside ``~/status``."""
+"""Publish a camera's status on the topic of the thesis' Setup, besides ``~/status``."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ MAX_WAITING_EVENTS: Final = 64
 
 
 class CameraStatusTopic:
-    """Publishes a camera's status, latched, when it changes, on one topic at most.
+    """Publishes a camera's status, latched, when it changes, on at most one topic.
 
     Args:
-        camera: camera whose status is published.
+        camera: camera of the status.
         node: node that publishes the topic.
         messages: maker of the headers.
     """
@@ -42,7 +42,7 @@ class CameraStatusTopic:
         self._ending: set[asyncio.Task[None]] = set()
 
     def resolve(self, topic: str) -> str:
-        """Return a topic's full name; empty for none, and for the one that a node always has.
+        """Return a topic's full name; empty for none, and for ``~/status``.
 
         Raises:
             ConfigurationError: the topic is not valid.
@@ -53,7 +53,7 @@ class CameraStatusTopic:
         return "" if full == f"{self._node.full_name}/status" else full
 
     def publish_on(self, topic: str) -> None:
-        """Publish on a topic in place of the one before; empty for none.
+        """Publish on a topic instead of the previous one; empty for none.
 
         Raises:
             ConfigurationError: the topic is not valid.
@@ -80,7 +80,7 @@ class CameraStatusTopic:
             publisher.close()
 
     async def close(self) -> None:
-        """Publish no more. Idempotent."""
+        """Stop publishing. Idempotent."""
         self._end()
         if self._ending:
             await asyncio.wait(tuple(self._ending))
@@ -92,18 +92,18 @@ class CameraStatusTopic:
                 fields = status_fields(KnownState.of(self._camera))
                 if fields != said:
                     said = fields
-                    self._say(publisher, fields)
+                    self._publish(publisher, fields)
                     await asyncio.sleep(MIN_INTERVAL)
                 try:
                     await anext(events)
                 except (SmartCamError, StopAsyncIteration):
                     break  # nothing more will come, and the status says why
         if status_fields(KnownState.of(self._camera)) != said:
-            self._say(publisher, status_fields(KnownState.of(self._camera)))
+            self._publish(publisher, status_fields(KnownState.of(self._camera)))
 
-    def _say(self, publisher: Any, fields: dict[str, Any]) -> None:
+    def _publish(self, publisher: Any, fields: dict[str, Any]) -> None:
         header = self._messages.header(datetime.now(UTC), self._messages.frame_id)
         try:
             publisher.publish(publisher.type.new(header=header, **fields))
         except SmartCamError as exc:
-            logger.warning("%s ! its status was not said: %s", self._node.full_name, exc)
+            logger.warning("%s ! its status was not published: %s", self._node.full_name, exc)

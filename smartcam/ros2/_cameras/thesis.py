@@ -1,8 +1,8 @@
-"""The thesis' six services at a camera's node: a face of them that speaks in messages.
+"""Serve the thesis' six services at a camera's node.
 
-There one node had many cameras, and ``camera_name`` said which. Here each camera has a node of its
-own, so the field may be empty; a name that is not this camera's is an error, since who says it
-talks to another camera than they think. What publishes goes through the node's life cycle.
+In the thesis one node had many cameras, and ``camera_name`` chose one. Here each camera has its own
+node, so the field may be empty; another camera's name is an error, since the request is meant for
+another camera. Publishing is started and ended through the node's life cycle.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 
 class ManagedCamera(Protocol):
-    """The life cycle that the thesis' services go through."""
+    """The life cycle that the thesis' services use."""
 
     @property
     def state(self) -> Any:
-        """The present state, with its ``label``."""
+        """The current state, with its ``label``."""
 
     async def configure(self) -> None:
         """Go from Unconfigured to Inactive."""
@@ -48,7 +48,7 @@ class ManagedCamera(Protocol):
 
 
 class RosThesisFace:
-    """A camera's node as the thesis' services see it.
+    """The part of a camera's node that the thesis' services use.
 
     Args:
         camera: the camera.
@@ -67,7 +67,7 @@ class RosThesisFace:
 
     @property
     def stopped(self) -> bool:
-        """True if SmartcameraStop has closed the camera, and nobody has configured it since."""
+        """True if SmartcameraStop has closed the camera, and it was not configured since."""
         return self._stopped and self._state not in {"inactive", "active"}
 
     @stopped.setter
@@ -86,32 +86,32 @@ class RosThesisFace:
 
     @property
     def reading(self) -> Interpretation:
-        """Interpretation by which results are read."""
+        """Interpretation of the results."""
         return reading_of(self._camera)
 
     def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError if results cannot be read by ``spec``."""
+        """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
         self._camera._interpretation(spec)  # noqa: SLF001 - smartcam's own
 
     def read_as(self, spec: str | None) -> None:
-        """Read results by ``spec`` from now on; None: as the settings say."""
+        """Interpret results by ``spec`` from now on; None: by the settings."""
         self._camera._read_by(spec)  # noqa: SLF001 - smartcam's own
 
     def is_calibrated(self, application: int) -> bool:
-        """Return True if a calibration turns an application's localizations into a robot's."""
+        """Return True if an application has a calibration to a robot's frame."""
         return calibrated(self._camera, application)
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError if there can be no such topic."""
+        """Raise ConfigurationError if a topic is not valid."""
         self._status.resolve(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:
-        """Publish the status on this topic, and no longer on the one before."""
+        """Publish the status on this topic, instead of the previous one."""
         self._status.publish_on(topic)
         return {}
 
     async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
-        """Publish results on this topic, and have the node active."""
+        """Publish results on this topic, and activate the node."""
         self._results.publish_on(topic, min_delay, queue)
         if self._state == "active":
             return {}
@@ -123,7 +123,7 @@ class RosThesisFace:
         return {}
 
     async def end_publishing(self) -> None:
-        """Publish no results, and the status on no topic that a request has named."""
+        """Stop publishing results, and the status on the topic of a request."""
         self._results.publish_on("")
         self._status.publish_on("")
         if self._state == "active":
@@ -132,12 +132,12 @@ class RosThesisFace:
             await self._life.cleanup()
 
     async def have_session(self) -> None:
-        """Have the node configured."""
+        """Configure the node if it is not."""
         if self._state not in {"inactive", "active"}:
             await self._life.configure()
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Have an application running and ready."""
+        """Load and run an application."""
         await have_application(self._camera, application, timeout)
 
     async def switch(self, application: int, timeout: float) -> None:
@@ -145,12 +145,12 @@ class RosThesisFace:
         await self._camera.switch_application(application, timeout=timeout)
 
     async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
-        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        """Trigger; return the result's application, and its value by ``spec``."""
         result = await self._camera.trigger(application, interpret_as=spec, timeout=timeout)
         return result.application, result.value
 
     async def close(self) -> None:
-        """Publish no status any more, and read results as the settings say. Idempotent."""
+        """Stop publishing the status, and interpret results by the settings. Idempotent."""
         self.read_as(None)
         await self._status.close()
 
@@ -163,24 +163,24 @@ class ThesisServices:
     """Answers requests of the six services with messages' fields.
 
     Args:
-        face: the camera.
+        face: the part of the node for these services.
         node: node of the camera.
         results: results of the camera, which make messages of localizations.
     """
 
     def __init__(self, face: RosThesisFace, node: Any, results: CameraResults) -> None:
         self._face, self._node, self._messages = face, node, results.messages
-        self._settling = asyncio.Lock()  # what is published changes for one after the other
+        self._settling = asyncio.Lock()  # requests change topics one after the other
 
     async def close(self) -> None:
-        """Publish nothing any more that a request has asked for. Idempotent."""
+        """Stop publishing on topics of requests. Idempotent."""
         await self._face.close()
 
     async def answer(self, name: str, message: Any) -> dict[str, Any]:
-        """Do what a request asks for; return the fields of its answer but ``error``.
+        """Carry out a request; return the fields of its answer without ``error``.
 
         Raises:
-            SmartCamError: as the service ends.
+            SmartCamError: the service failed.
         """
         self._check_name(message.camera_name)
         service = THESIS[name]
@@ -202,7 +202,7 @@ class ThesisServices:
         return found
 
     def _check_name(self, name: str) -> None:
-        """See that a request is meant for this camera.
+        """Check that a request is meant for this camera.
 
         Raises:
             ConfigurationError: the request names another camera.

@@ -1,7 +1,7 @@
-"""Hear ``/tf`` and ``/tf_static`` while somebody asks where a frame is, within bounds.
+"""Receive ``/tf`` and ``/tf_static`` while programs ask for poses of frames, within bounds.
 
-Nothing is extrapolated. A pose that is wanted now is refused where the newest transform on the way
-is old: a robot whose driver has died stands in TF where it stood last.
+Poses are never extrapolated. A present pose is refused if the newest transform on the way is old: a
+robot whose driver has died keeps its last pose in TF.
 """
 
 from __future__ import annotations
@@ -29,31 +29,31 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 TYPE: Final = "tf2_msgs/msg/TFMessage"
 TOPICS: Final = {"/tf": QoS(depth=100), "/tf_static": QoS(latched=True, depth=100)}
-"""Topics of transforms, with the qualities of tf2's own listener."""
+"""Topics of transforms, with the quality of service of tf2's own listener."""
 
 LINGER: Final = 60.0
-"""Seconds for which transforms are heard after the last question."""
+"""Seconds for which transforms are received after the last question."""
 
 WAIT: Final = 3.0
-"""Seconds that a transform which is not known yet is waited for."""
+"""Seconds of the timeout for a transform that is not known yet."""
 
 MAX_AGE: Final = 2.0
-"""Seconds since the newest transform of a frame that moves, by its arrival and by its stamp."""
+"""Largest age of the newest transform of a moving frame, by its arrival and by its stamp."""
 
 MAX_GAP: Final = 1.0
-"""Seconds between two transforms that one in between is interpolated from."""
+"""Largest number of seconds between two transforms to interpolate between."""
 
 NEAR: Final = 0.25
-"""Seconds before the first transform that was heard for which that one is still taken."""
+"""Seconds before the first received transform for which that transform is still used."""
 
 MAX_BACK: Final = 10.0
-"""Seconds that a stamp may be behind the newest one; beyond, the clock was set back."""
+"""Largest number of seconds of a stamp before the newest one; beyond, the clock was set back."""
 
 MAX_FRAMES: Final = 2000
-"""Largest number of frames that are known at a time; others are left out, which the log tells."""
+"""Largest number of known frames; others are left out, and logged."""
 
 MAX_MOMENTS: Final = 300
-"""Transforms of one frame that are kept; the oldest goes first."""
+"""Number of kept transforms of one frame; beyond it the oldest is dropped."""
 
 MAX_NAMED: Final = 20
 """Largest number of frames that the text of an error names."""
@@ -67,11 +67,11 @@ class _FrameLink:
 
     Attributes:
         child: the frame.
-        parent: the frame that it is in.
-        static: message of a transform that does not change; None of one that does.
+        parent: parent of the frame.
+        static: message of a static transform; None if the transform changes.
         times: times of the moments, UTC, in order.
         moments: messages of the transform at these times.
-        came: moment at which the newest one arrived, of the monotonic clock.
+        came: time of the arrival of the newest one, by the monotonic clock.
     """
 
     child: str
@@ -86,7 +86,7 @@ class _FrameLink:
     came: float = 0.0
 
     def add(self, utc: float, message: Any) -> None:
-        """Take where the frame is at a moment; one older than the newest counts for nothing."""
+        """Add the frame's transform at a time; ignore one that is older than the newest."""
         if self.times and utc < self.times[-1] - MAX_BACK:  # the clock was set back
             self.times.clear()
             self.moments.clear()
@@ -112,7 +112,7 @@ class _FrameLink:
         """Return the transform at a time, interpolated.
 
         Raises:
-            CalibrationError: BAD_TIME: it is not known; NOT_RIGID: it is not valid.
+            CalibrationError: BAD_TIME: not known at that time; NOT_RIGID: it is not valid.
         """
         if self.static is not None:
             return _transform(self, self.static, None)
@@ -136,7 +136,7 @@ class _FrameLink:
 
 
 class TransformListener:
-    """Hears transforms of a node's graph, from the first question on.
+    """Receives transforms of a node's graph, from the first question on.
 
     Args:
         node: open node of ROS.
@@ -152,7 +152,7 @@ class TransformListener:
         self._full = False
 
     def listen(self) -> None:
-        """Hear transforms, until :data:`LINGER` seconds after the last question.
+        """Receive transforms until :data:`LINGER` seconds after the last question.
 
         Raises:
             RosError: the node is not open.
@@ -170,7 +170,7 @@ class TransformListener:
         self._timer = loop.call_later(LINGER, self._rest)
 
     def _rest(self) -> None:
-        """Hear no more, and know nothing."""
+        """Unsubscribe, and forget all transforms."""
         if self._timer is not None:
             self._timer.cancel()
         heard, self._heard, self._timer = self._heard, [], None
@@ -181,7 +181,7 @@ class TransformListener:
         self._links.clear()
 
     async def close(self) -> None:
-        """Hear no more. Idempotent."""
+        """Unsubscribe. Idempotent."""
         self._rest()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
@@ -216,11 +216,11 @@ class TransformListener:
 
         Args:
             frame: the frame.
-            base: the frame that it is looked at in.
-            utc: time, seconds since 1970; None for the newest that all on the way are known at.
+            base: the frame of the returned pose.
+            utc: time, seconds since 1970; None for the newest common time of all transforms.
 
         Raises:
-            CalibrationError: ``WRONG_FRAME``: TF does not lead there; ``BAD_TIME``: not at that
+            CalibrationError: ``WRONG_FRAME``: no way in TF; ``BAD_TIME``: no transform at that
                 time, or the newest is old; ``NOT_RIGID``: a transform is not valid.
             RosError: the node is not open.
         """
@@ -243,7 +243,7 @@ class TransformListener:
         return await self._until(found)
 
     async def _until(self, look: Callable[[], Found]) -> Found:
-        """Return the answer of a look, as soon as there is one; bounded."""
+        """Return the result of ``look`` as soon as it succeeds; bounded."""
         self.listen()
         deadline = asyncio.get_running_loop().time() + WAIT
         while True:
@@ -305,7 +305,7 @@ class TransformListener:
 
 
 def _until_shared(chain: list[_FrameLink], frame: str, shared: set[str]) -> list[_FrameLink]:
-    """Return the links of a chain up to the first frame that both have."""
+    """Return the links of a chain up to the first shared frame."""
     found: list[_FrameLink] = []
     for one in chain:
         if frame in shared:

@@ -1,7 +1,7 @@
-"""``/tf_static``: where a camera is, where its calibration says so.
+"""Publish the place of a calibrated camera on ``/tf_static``.
 
-Frames as in REP-103 and REP-105: metres, right-handed; the camera's is the optical one, x right,
-y down and z ahead, whose name has the suffix ``_optical``.
+Frames are as in REP-103 and REP-105: metres, right-handed; the camera's pictures have an optical
+frame, x right, y down and z ahead, whose name has the suffix ``_optical``.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ TYPE = "tf2_msgs/msg/TFMessage"
 
 
 class CameraFrames:
-    """Names a camera's frames, in its messages and on ``/tf_static`` alike.
+    """The names of a camera's frames, for its messages and ``/tf_static``.
 
     Args:
-        frame_id: name of the camera's frame, in which its results are without a calibration.
+        frame_id: name of the camera's frame, that of its results without a calibration.
         calibration: calibration of the camera's settings, or one for each application; None
             without.
         place: hand-eye calibration of the camera; None without.
-        parent: name of the robot's frame; empty: as a calibration calls it.
-        flange: name of the frame of the part of the robot that carries the camera; empty: as a
-            calibration calls it.
+        parent: name of the robot's frame; empty: the name in a calibration.
+        flange: name of the frame of the part of the robot that carries the camera; empty: the name
+            in a calibration.
         calibrated_at: pose of that part in the robot's frame when ``calibration`` was made; None if
             the camera stands still.
 
@@ -64,21 +64,21 @@ class CameraFrames:
         self.robot: str = parent if calibrated_at is None else f"{frame_id}_robot"
 
     def transforms(self) -> list[Transform]:
-        """Return the transforms that the calibrations give.
+        """Return the transforms from the calibrations.
 
         ================== ================================= ==================================
         calibration        parent                            child
         ================== ================================= ==================================
         plane              the robot                         the camera's frame
         sheet              the robot                         the camera's frame with ``_sheet``
-        plane or sheet,    the part of the robot that        the robot's frame as it was when
-        carried camera     carries the camera                the camera was calibrated
+        plane or sheet,    the part of the robot that        the robot's frame at the time of
+        carried camera     carries the camera                the calibration
         hand-eye           the robot's base; its flange,     the pictures' frame
-                           where the robot carries the
+                           if the robot carries the
                            camera
         ================== ================================= ==================================
 
-        Of several applications each has a child with ``_APPLICATION`` at its end.
+        If there are several applications, each one's child has ``_APPLICATION`` at its end.
         """
         found = [] if self._place is None else [self._of_pictures(self._place)]
         if self._calibrated_at is not None:
@@ -95,7 +95,7 @@ class CameraFrames:
         return _named(pose, said or pose.target, self.optical)
 
     def _of_plane(self, calibration: Any, end: str) -> list[Transform]:
-        """Return the frame of a plane; none where a calibration has no plane."""
+        """Return the frame of a plane; none if a calibration has no plane."""
         plane = getattr(calibration, "plane", calibration)
         if getattr(plane, "kind", "") != "plane":
             return []
@@ -127,7 +127,7 @@ def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
 
 
 class StaticTransforms:
-    """Publishes where frames are that do not move, latched: one publisher of all of a node's.
+    """Publishes all static transforms of a node, latched, with one publisher.
 
     Args:
         node: open node of ROS.
@@ -146,31 +146,31 @@ class StaticTransforms:
         """Publish the transforms, if there are any."""
         if self._publisher is None and self._transforms:
             self._publisher = self._node.publisher(TOPIC, TYPE, qos=LATCHED)
-            self._say()
+            self._publish()
 
     async def close(self) -> None:
-        """Be gone. Idempotent."""
+        """Stop publishing. Idempotent."""
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
             publisher.close()
 
     def replace(self, transforms: Iterable[Transform]) -> None:
-        """Publish others in their place, as after a new calibration.
+        """Replace the transforms, as after a new calibration.
 
-        A listener of the old transforms keeps those whose child is none of the new ones: TF forgets
-        nothing.
+        A listener keeps an old transform whose child has no new one, since TF never removes
+        transforms.
 
         Raises:
-            ConfigurationError: a frame without a name or with a ``/`` in front, that is its own
-                parent, or that has two.
+            ConfigurationError: a frame has no name, a ``/`` in front, is its own parent, or has
+                two parents.
         """
         self._transforms = _checked(transforms)
         if self._publisher is not None:
-            self._say()
+            self._publish()
         else:
             self.start()
 
-    def _say(self) -> None:
+    def _publish(self) -> None:
         now = time.time()
         self._publisher.publish(transforms=[transform_fields(one, now) for one in self._transforms])
 

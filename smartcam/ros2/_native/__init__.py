@@ -1,4 +1,4 @@
-"""A node of ROS 2 through the rclpy that is installed, over whatever middleware it has.
+"""A node of ROS 2 through the installed rclpy, over any middleware.
 
-No camera is known here.
+It knows nothing about cameras.
 """

@@ -1,4 +1,4 @@
-"""The graph of nodes, as rclpy knows it."""
+"""The graph of nodes, from rclpy."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 class NativeGraph:
     """A node's view of the others.
 
-    Every method raises a :class:`~smartcam.RosError` where the node is not open.
+    Every method raises a :class:`~smartcam.RosError` if the node is not open.
 
     Args:
-        node: node that asks.
+        node: node whose graph is returned.
     """
 
     def __init__(self, node: NativeNode) -> None:

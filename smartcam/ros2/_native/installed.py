@@ -1,4 +1,4 @@
-"""The rclpy that is installed: its modules, and its classes of messages and services."""
+"""The installed rclpy: its modules, and its classes of messages and services."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def rclpy(name: str = "") -> Any:
 
 
 def distribution() -> str:
-    """Return the distribution of the ROS that is installed, as far as it is known."""
+    """Return the distribution of the installed ROS, as far as it is known."""
     said = os.environ.get("ROS_DISTRO", "")
     return said if said in DISTRIBUTIONS else "jazzy"
 
 
 @functools.cache
 def class_of(name: str) -> Any:
-    """Return the class that rclpy has for a message or a service; None if there is none.
+    """Return rclpy's class of a message or a service; None if there is none.
 
     Args:
         name: name of the type, such as ``std_msgs/msg/String``.
@@ -60,10 +60,10 @@ def class_of(name: str) -> Any:
 
 
 def checked_message(kind: MessageType) -> Any:
-    """Return the class that rclpy has for a type of message; None if there is none.
+    """Return rclpy's class of a type of message; None if there is none.
 
     Raises:
-        ConfigurationError: its fields are others than those that smartcam knows.
+        ConfigurationError: its fields differ from smartcam's.
     """
     found = class_of(kind.name)
     if found is not None:
@@ -72,10 +72,10 @@ def checked_message(kind: MessageType) -> Any:
 
 
 def checked_service(kind: ServiceType) -> Any:
-    """Return the class that rclpy has for a type of service; None if there is none.
+    """Return rclpy's class of a type of service; None if there is none.
 
     Raises:
-        ConfigurationError: its fields are others than those that smartcam knows.
+        ConfigurationError: its fields differ from smartcam's.
     """
     found = class_of(kind.name)
     if found is not None:

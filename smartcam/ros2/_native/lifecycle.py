@@ -1,9 +1,9 @@
 """The life cycle of a node of rclpy: ROS' own state machine, which follows one of smartcam's.
 
 rclpy's own callbacks of a transition block its thread until the transition has ended. A camera may
-take long for one, so the order is the other way round: smartcam's life cycle does the work in the
-event loop, and has ROS' machine make each step. The machine tells of each step and answers who
-asks for the state; requests for a change are answered here.
+take long for a transition, so the order is reversed: smartcam's life cycle does the work in the
+event loop, and makes ROS' machine take each step. The machine publishes each step and answers
+requests for the state; requests for a change are answered here.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 
 
 class NativeLifecycle:
-    """Has ROS' own state machine follow a life cycle of smartcam's.
+    """Makes ROS' own state machine follow a life cycle of smartcam's.
 
     Args:
         node: open node of rclpy.
-        life: life cycle that is followed.
+        life: life cycle to follow.
         handler: coroutine function that answers ``change_state``.
 
     Raises:
-        RosError: rclpy's node has its life cycle in another place.
+        RosError: rclpy's node has its life cycle in another attribute.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class NativeLifecycle:
     def _follow(self, transition: LifecycleTransition) -> None:
         try:
             self._machine.trigger_transition_by_id(transition.id, True)
-        except Exception as exc:  # noqa: BLE001 - the context is gone, and the asker with it
+        except Exception as exc:  # noqa: BLE001 - the context has ended, and the request with it
             logger.warning("%s ! %s: %s", self._name, transition.label, exc)
 
     def close(self) -> None:
-        """Follow no more; changes under way are given up. Idempotent."""
+        """Stop following, and cancel running changes. Idempotent."""
         self._stop_listening()
         self._calls.close()
         self._machine = None

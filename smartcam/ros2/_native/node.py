@@ -92,7 +92,7 @@ class NativeNode(NamedNode):
 
     @property
     def types(self) -> RosTypes:
-        """The messages and services that the node speaks."""
+        """The types of messages and services that the node knows."""
         return self.context.types
 
     @property
@@ -127,7 +127,7 @@ class NativeNode(NamedNode):
         Raises:
             RosError: rclpy cannot create the node.
 
-        Cancellation: leaves it closed.
+        Cancellation: the node is closed.
         """
         if self._spun is not None:
             return
@@ -174,7 +174,7 @@ class NativeNode(NamedNode):
                     await one.wait_closed()
                 await asyncio.to_thread(self.outbox.close, CLOSE_TIMEOUT / 2)
         except TimeoutError:
-            pass  # a handler that does not end when it is cancelled is its author's
+            pass  # the handler's author must end it at cancellation
         finally:
             self._spun = None
             spun.end()
@@ -191,7 +191,7 @@ class NativeNode(NamedNode):
         """Do nothing while the node is open.
 
         Raises:
-            RosError: the node is not open, or rclpy is gone.
+            RosError: the node is not open, or rclpy has ended.
         """
         if self._dead is not None:
             raise RosError(str(self._dead))
@@ -200,7 +200,7 @@ class NativeNode(NamedNode):
     # ------------------------------------------------------------------ for its ends
 
     def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
-        """Call a function in the event loop; return False if the loop is gone."""
+        """Call a function in the event loop; return False if the loop is closed."""
         spun = self._spun
         return spun is not None and spun.in_loop(do, *given)
 
@@ -210,7 +210,7 @@ class NativeNode(NamedNode):
         """Run a coroutine in the event loop; return its future.
 
         Raises:
-            RosError: the event loop is gone.
+            RosError: the event loop is closed.
         """
         loop = self._loop
         if loop is None or loop.is_closed():
@@ -301,7 +301,7 @@ class NativeNode(NamedNode):
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields.
             qos: quality of service; ROS' own for services is used.
-            timeout: seconds that the handler may take.
+            timeout: seconds of the handler's timeout.
 
         Raises:
             ConfigurationError: the name is not valid, or the type is not known or has other fields.

@@ -1,4 +1,4 @@
-"""The thread that hands a node's messages to the middleware, which may have it wait."""
+"""The thread that passes a node's messages to the middleware, which may block."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_MESSAGES = 10_000
-"""Largest number of messages of a node that wait for the middleware; the oldest beyond is dropped
-and counted."""
+"""Largest number of messages of a node that wait for the middleware; beyond it the oldest is
+dropped and counted."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of a node's messages that wait for the middleware."""
@@ -29,7 +29,7 @@ class _ThreadJob(NamedTuple):
 
 
 class MessageThread:
-    """Does what may wait in a thread, in order, with a bound on what waits.
+    """Runs blocking jobs in a thread, in order, with a bound on waiting jobs.
 
     Args:
         name: name of the thread.
@@ -46,7 +46,7 @@ class MessageThread:
     def put(
         self, do: Callable[[], None], size: int = 0, dropped: Callable[[], None] | None = None
     ) -> None:
-        """Have a job done; it is dropped where it can be, and too much waits.
+        """Add a job; if too much waits, a job that may be dropped is dropped.
 
         Raises:
             RosError: the thread ends, or has ended.
@@ -71,7 +71,7 @@ class MessageThread:
         return False
 
     def close(self, timeout: float) -> bool:
-        """Do what waits, and end; blocks.
+        """Do the waiting jobs, and end; blocks.
 
         Returns:
             Whether the thread has ended in time.
@@ -93,5 +93,5 @@ class MessageThread:
                 self._bytes -= job.size
             try:
                 job.do()
-            except Exception as exc:  # noqa: BLE001 - the middleware's own, of any kind
+            except Exception as exc:  # noqa: BLE001 - the middleware may raise any error
                 logger.debug("%s ! %s", self._thread.name, exc)

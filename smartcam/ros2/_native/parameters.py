@@ -1,4 +1,4 @@
-"""Parameters of a node of rclpy: ROS has and serves them, and hooks are carried out here."""
+"""Parameters of a node of rclpy: ROS holds and serves them, and hooks are called here."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 SIM_TIME = "use_sim_time"
-"""The parameter that rclpy has itself."""
+"""A parameter that rclpy declares itself."""
 
 HOOK_TIMEOUT = 2 * SET_TIMEOUT + 1.0
-"""Seconds that a thread of rclpy waits for the hooks of a set, and for the sets before it."""
+"""Seconds for which a thread of rclpy waits for the hooks of a set, and for earlier sets."""
 
 _asked_by_ros: contextvars.ContextVar[bool] = contextvars.ContextVar("asked_by_ros", default=False)
 
 
 class NativeParameters(RosParameters):
-    """The parameters of a node of rclpy, which declares, serves and tells of them.
+    """The parameters of a node of rclpy, which declares, serves and publishes them.
 
-    What is set by others comes here before rclpy takes the value: its hook is carried out, or
-    refuses. Values of the command line or of a parameter file count when one is declared.
+    When another node sets a parameter, its hook is called before rclpy takes the value, and may
+    refuse. A value from the command line or a parameter file is applied at the declaration.
 
     Args:
         node: node that has the parameters.
@@ -47,24 +47,24 @@ class NativeParameters(RosParameters):
         self.undeclare(SIM_TIME)
         self._native = node
         self._ros: Any = None
-        self._own = threading.local()  # set while this side tells rclpy of a value
+        self._own = threading.local()  # set while this object sets a value in rclpy
 
     def open(self) -> None:
-        """Have ROS know what is declared."""
+        """Declare the parameters in ROS."""
         self._ros = self._native.ros
         self._ros.add_on_set_parameters_callback(self._on_set)
         for name in self.names():
             self._declare_in_ros(name)
 
     async def close(self) -> None:
-        """Give up sets that are under way; what is declared stays."""
+        """Cancel running sets; the declarations stay."""
         self._ros = None
         await super().close()
 
     # ------------------------------------------------------------------ from here to ROS
 
     def _tell(self, **what: Any) -> None:
-        """Have ROS know that parameters are new, changed or deleted."""
+        """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
         for name in what.get("new", ()):
@@ -73,14 +73,14 @@ class NativeParameters(RosParameters):
         if changed and not _asked_by_ros.get():
             self._put(lambda: self._ros.set_parameters([self._parameter(one) for one in changed]))
         for name in what.get("deleted", ()):
-            if not self._ros.describe_parameter(name).read_only:  # which rclpy keeps for good
+            if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
                 self._put(lambda name=name: self._ros.undeclare_parameter(name))
 
     def _put(self, do: Any) -> Any:
         self._own.now = True
         try:
             return do()
-        except Exception as exc:  # noqa: BLE001 - rclpy's own, of any kind
+        except Exception as exc:  # noqa: BLE001 - rclpy may raise any error
             logger.warning("%s ! a parameter: %s", self._native.full_name, exc)
         finally:
             self._own.now = False
@@ -88,12 +88,12 @@ class NativeParameters(RosParameters):
     def _declare_in_ros(self, name: str) -> None:
         description = self.describe(name)
         kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
-        told = to_ros(kind, description.encode(), class_of(kind.name))
+        descriptor = to_ros(kind, description.encode(), class_of(kind.name))
         given = self._parameter(name)
         self._own.now = True
         try:
             made = self._ros.declare_parameter(
-                name, given.value, told, ignore_override=description.read_only
+                name, given.value, descriptor, ignore_override=description.read_only
             )
         except Exception as exc:
             del self._declared[name]
@@ -104,7 +104,7 @@ class NativeParameters(RosParameters):
             self._begin_with(name, decode_value(made.get_parameter_value()))
 
     def _begin_with(self, name: str, value: Typed) -> None:
-        """Carry out the value that the command line, or a parameter file, has for a parameter."""
+        """Apply a parameter's value from the command line or a parameter file."""
 
         async def begin() -> None:
             _asked_by_ros.set(True)
@@ -131,7 +131,7 @@ class NativeParameters(RosParameters):
     # ------------------------------------------------------------------ from ROS to here
 
     def _on_set(self, parameters: Sequence[Any]) -> Any:
-        """Answer whether values may be; in the thread that sets them, and within a bound."""
+        """Accept or refuse values; runs in the thread that sets them, bounded."""
         result = class_of("rcl_interfaces/msg/SetParametersResult")
         if getattr(self._own, "now", False):
             return result(successful=True)
@@ -162,7 +162,7 @@ class NativeParameters(RosParameters):
             task = asyncio.current_task()
             if self._ros is None or task is None:
                 raise RosError(f"{self._native.full_name} is closed")
-            self._tasks.add(task)  # which closing gives up
+            self._tasks.add(task)  # close() cancels it
             task.add_done_callback(self._ended)
             _asked_by_ros.set(True)
             await self.set_all(values)

@@ -1,4 +1,4 @@
-"""The ends of services through rclpy: servers and clients."""
+"""Servers and clients of services through rclpy."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ AT_ONCE = QoS(depth=2 * MAX_CONCURRENT_CALLS)
 
 
 class ServiceCalls:
-    """Has the calls of a service carried out in the event loop, and their replies sent by rclpy.
+    """Carries out the calls of a service in the event loop, and gives their replies to rclpy.
 
     Args:
-        node: node that serves.
+        node: node of the service.
         name: name of the service.
         kind: type of the service.
-        cls: class that rclpy has for the type.
+        cls: rclpy's class of the type.
         handler: coroutine function that takes each request and returns the response.
-        timeout: seconds that the handler may take.
+        timeout: seconds of the handler's timeout.
 
     Attributes:
-        calls: calls that came.
-        failed: calls that were refused, or got no reply.
+        calls: number of received calls.
+        failed: number of calls that were refused, or got no reply.
     """
 
     def __init__(
@@ -64,13 +64,13 @@ class ServiceCalls:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def on_request(self, request: Any, _response: Any) -> Any:
-        """Return the response to a request; rclpy calls and awaits it in a thread of its own."""
+        """Return the response to a request; rclpy calls and awaits this in its own thread."""
         with self._lock:
             full = self._under_way >= MAX_CONCURRENT_CALLS
             self._under_way += not full
         if full:
             return self._reply(
-                self._refused(f"{MAX_CONCURRENT_CALLS} calls are under way, which is the most")
+                self._refused(f"{MAX_CONCURRENT_CALLS} calls are running, which is the most")
             )
         try:
             answered = self._future(executor=self._node.executor)
@@ -96,8 +96,8 @@ class ServiceCalls:
 
     def _done(self, task: asyncio.Task[None], answered: Any) -> None:
         self._tasks.discard(task)
-        if not answered.done():  # it was cancelled before it began
-            self._answer(answered, self._refused("the call was given up"))
+        if not answered.done():  # the task was cancelled before it began
+            self._answer(answered, self._refused("the call was cancelled"))
 
     def _answer(self, answered: Any, data: bytes | None) -> None:
         answered.set_result(data)
@@ -109,7 +109,7 @@ class ServiceCalls:
                 reply = await self._handler(self._kind.request.decode(data, whole=False))
             found: bytes | None = self._kind.response.encode(said(reply, {}))
         except asyncio.CancelledError:
-            self._answer(answered, self._refused("the call was given up"))
+            self._answer(answered, self._refused("the call was cancelled"))
             raise
         except TimeoutError as exc:
             given_up = f"no answer in {self._timeout:g} s"
@@ -126,26 +126,26 @@ class ServiceCalls:
     def _refused(self, why: str) -> bytes | None:
         self.failed += 1
         answer = refusal(self._kind, f"{self._name}: {why}", self._node.types)
-        told = "was refused" if answer is not None else "had no reply"
-        logger.warning("%s ! a call %s: %s", self._name, told, why)
+        outcome = "was refused" if answer is not None else "had no reply"
+        logger.warning("%s ! a call %s: %s", self._name, outcome, why)
         return None if answer is None else self._kind.response.encode(answer)
 
     def close(self) -> None:
-        """Give up the calls that are under way. Idempotent."""
+        """Cancel running calls. Idempotent."""
         self._closed = True
         for task in self._tasks:
             task.cancel()
 
     async def wait_closed(self) -> None:
-        """Wait until the calls that were given up have ended."""
+        """Wait until the cancelled calls have ended."""
         if self._tasks:
             await asyncio.wait(tuple(self._tasks))
 
 
 class NativeService:
-    """A service that a node serves through rclpy; made by :meth:`NativeNode.serve`.
+    """A service of a node through rclpy; created by :meth:`NativeNode.serve`.
 
-    A client that is gone is not noticed: no middleware tells of that. Its call goes on to its end.
+    A lost client is not noticed, since no middleware reports it. Its call continues to the end.
 
     Attributes:
         name: absolute name of the service.
@@ -175,7 +175,7 @@ class NativeService:
             )
 
     def close(self) -> None:
-        """Serve no more; calls under way are given up. Idempotent."""
+        """Stop serving, and cancel running calls. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -185,12 +185,12 @@ class NativeService:
         self._node.forget(self)
 
     async def wait_closed(self) -> None:
-        """Wait until the calls that were given up have ended."""
+        """Wait until the cancelled calls have ended."""
         await self._calls.wait_closed()
 
 
 class NativeClient:
-    """Calls a service through rclpy; made by :meth:`NativeNode.client`.
+    """Calls a service through rclpy; created by :meth:`NativeNode.client`.
 
     Attributes:
         name: absolute name of the service.
@@ -210,20 +210,20 @@ class NativeClient:
 
     @property
     def served(self) -> bool:
-        """True if somebody serves the service, as far as is known."""
+        """True if there is a server, as far as is known."""
         if self._closed:
             return False
         try:
             return bool(self._raw.service_is_ready())
-        except Exception:  # noqa: BLE001 - the context is gone, and nobody serves
+        except Exception:  # noqa: BLE001 - the context has ended, so there is no server
             return False
 
     async def wait_served(self, timeout: float = 10.0) -> None:
-        """Wait until somebody serves it.
+        """Wait until there is a server.
 
         Raises:
-            ServiceTimeoutError: nobody does within ``timeout`` seconds.
-            ServiceCallError: the client is closed, or rclpy is gone.
+            ServiceTimeoutError: no server is found within ``timeout`` seconds.
+            ServiceCallError: the client is closed, or rclpy has ended.
         """
         try:
             async with asyncio.timeout(timeout):
@@ -232,7 +232,7 @@ class NativeClient:
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
             raise ServiceTimeoutError(
-                f"{self.name}: nobody serves {self.type.name} there within {timeout:g} s",
+                f"{self.name}: no server for {self.type.name} within {timeout:g} s",
                 service=self.name,
             ) from exc
 
@@ -245,19 +245,19 @@ class NativeClient:
             raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
 
     async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call the service, once somebody serves it.
+        """Call the service, once there is a server.
 
         Args:
-            request: one of the type's own, or a mapping of its fields.
-            timeout: seconds, until somebody serves it and has replied.
-            **fields: the fields, where no request is given.
+            request: a request of the type, or a mapping of its fields.
+            timeout: seconds until a server exists and has replied.
+            **fields: the fields, if no request is given.
 
         Raises:
-            RosMessageError: the request is none of the type.
-            ServiceTimeoutError: nobody serves it, or no reply came in time.
-            ServiceCallError: the client was closed, or rclpy is gone.
+            RosMessageError: the request is not of the type.
+            ServiceTimeoutError: there is no server, or no reply came in time.
+            ServiceCallError: the client was closed, or rclpy has ended.
 
-        Cancellation: leaves the client usable; whether the call is carried out is unknown.
+        Cancellation: the client stays usable; whether the call is carried out is unknown.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
@@ -299,13 +299,13 @@ class NativeClient:
         return asked
 
     def fail(self, why: str) -> None:
-        """End the calls that are under way."""
+        """End running calls."""
         for reply in self._waiting:
             if not reply.done():
                 reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
 
     def close(self) -> None:
-        """Call no more; calls under way end. Idempotent."""
+        """Stop calling, and end running calls. Idempotent."""
         if self._closed:
             return
         self._closed = True

@@ -1,4 +1,4 @@
-"""A node of rclpy, and the thread that owns it: it makes the node, spins it, and ends it."""
+"""A node of rclpy, and the thread that creates, spins and destroys it."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
 LOOK_INTERVAL = 1.0
-"""Seconds between two looks of a spinning thread whether its event loop is still there."""
+"""Seconds between two checks of a spinning thread whether its event loop still runs."""
 
 AFTER_ERROR = 0.05
-"""Seconds that a spinning thread rests after an error, so that one that repeats takes no core."""
+"""Seconds for which a spinning thread pauses after an error, so that a repeated one is cheap."""
 
 EXIT_TIMEOUT = 2.0
-"""Seconds that the end of the program waits for a node that nobody has closed."""
+"""Seconds for which the end of the program waits for a node that was not closed."""
 
 MAX_TOLD = 100
-"""Largest number of errors of a spinning thread that are remembered, so that each is told once."""
+"""Largest number of remembered errors of a spinning thread, each of which is logged once."""
 
 
 class NoReplyError(Exception):
-    """A call that gets no reply; raised in a callback, and caught where it is spun."""
+    """A call gets no reply; raised in a callback, and caught by the spinning thread."""
 
 
 class NativeContext:
-    """The context of rclpy that nodes share, opened by the first of them.
+    """The context of rclpy that nodes share, opened by the first node.
 
     Args:
         domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
-        distribution: name of the distribution whose messages are used; "": as far as it is known,
-            that of the ROS that is installed.
+        distribution: name of the distribution whose messages are used; "": that of the installed
+            ROS, as far as it is known.
         args: arguments for ROS, such as ``--ros-args -p use_sim_time:=true``.
 
     Raises:
@@ -71,7 +71,7 @@ class NativeContext:
 
         Raises:
             ConfigurationError: rclpy refuses the arguments for ROS.
-            RosError: rclpy does not begin.
+            RosError: rclpy does not start.
         """
         with self._lock:
             if not self._users:
@@ -81,7 +81,7 @@ class NativeContext:
 
     def _begin(self) -> Any:
         made = rclpy("context").Context()
-        no_signals = rclpy("signals").SignalHandlerOptions.NO  # they are the program's
+        no_signals = rclpy("signals").SignalHandlerOptions.NO  # the program handles signals
         try:
             rclpy().init(
                 args=["smartcam", *self.args],
@@ -95,13 +95,13 @@ class NativeContext:
         return made
 
     def close(self) -> None:
-        """One user is done; the last one shuts the context down; blocks."""
+        """Release the context for one user; the last one shuts it down; blocks."""
         with self._lock:
             self._users -= 1
             if self._users:
                 return
             context, self._context = self._context, None
-        with contextlib.suppress(Exception):  # it may be shut down already
+        with contextlib.suppress(Exception):  # the context may already be shut down
             context.try_shutdown()
 
 
@@ -109,20 +109,20 @@ _distribution = distribution
 
 
 class SpunNode:
-    """A node of rclpy, made, spun and ended by a thread of its own.
+    """A node of rclpy, created, spun and destroyed by its own thread.
 
     Args:
         context: context that the node shares with others.
         name: name of the node.
         namespace: namespace of the node.
         loop: event loop of the node's users.
-        on_end: function called in the event loop when the thread has ended, with the reason where
-            that was not asked for.
+        on_end: function called in the event loop when the thread has ended, with the reason, or
+            None after :meth:`end`.
         managed: whether the node has a life cycle.
 
     Attributes:
-        ros: the node of rclpy; None before it is made.
-        executor: executor of rclpy; None before the node is made.
+        ros: the node of rclpy; None before it is created.
+        executor: executor of rclpy; None before the node is created.
     """
 
     def __init__(
@@ -147,11 +147,11 @@ class SpunNode:
         )
 
     async def start(self, timeout: float) -> None:
-        """Make the node, and spin it.
+        """Create the node, and spin it.
 
         Raises:
             ConfigurationError: rclpy refuses its arguments.
-            RosError: rclpy makes no node, or not in time.
+            RosError: rclpy cannot create the node, or not in time.
 
         Cancellation: the thread ends by itself.
         """
@@ -168,20 +168,20 @@ class SpunNode:
             raise
 
     def end(self) -> None:
-        """Have the thread end the node, and itself."""
+        """Make the thread destroy the node and end."""
         self._stopping.set()
-        with contextlib.suppress(Exception):  # it may be ending
+        with contextlib.suppress(Exception):  # the executor may be ending
             if self.executor is not None:
-                self.executor.create_task(_nothing, None)  # only work makes it look up
+                self.executor.create_task(_nothing, None)  # only a task wakes the executor
 
     def wake(self) -> None:
-        """Have the thread look for what is new."""
-        with contextlib.suppress(Exception):  # it may be ending
+        """Wake the thread, so that it finds new endpoints."""
+        with contextlib.suppress(Exception):  # the executor may be ending
             if self.executor is not None:
                 self.executor.wake()
 
     def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
-        """Have something done in the event loop; return False where that is gone."""
+        """Call a function in the event loop; return False if the loop is closed."""
         try:
             self._loop.call_soon_threadsafe(do, *given)
         except RuntimeError:
@@ -199,7 +199,7 @@ class SpunNode:
         why: RosError | None = None
         try:
             context = self._context.open()
-        except BaseException as exc:  # noqa: BLE001 - told to the waiter
+        except BaseException as exc:  # noqa: BLE001 - passed to start()
             self.in_loop(self._tell, exc)
             _open.discard(self)
             return
@@ -207,7 +207,7 @@ class SpunNode:
             self._make(context)
             self.in_loop(self._tell, None)
             why = self._spin(context)
-        except BaseException as exc:  # noqa: BLE001 - told to the waiter, or when all has ended
+        except BaseException as exc:  # noqa: BLE001 - passed to start(), or to on_end
             why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
         finally:
             self._close()
@@ -223,7 +223,7 @@ class SpunNode:
             self._made.set_result(None)
         else:
             self._made.set_exception(error)
-            self._made.exception()  # who waited may be gone
+            self._made.exception()  # start() may have been cancelled
 
     def _make(self, context: Any) -> None:
         namespace = "" if self._namespace == "/" else self._namespace
@@ -233,7 +233,7 @@ class SpunNode:
         self.executor.add_node(self.ros)
 
     def _spin(self, context: Any) -> RosError | None:
-        """Spin until that is to end; return the reason where nobody has asked for the end."""
+        """Spin until the end; return its reason, None after :meth:`end`."""
         shut_down = rclpy("executors").ExternalShutdownException
         while not self._stopping.is_set():
             if self._loop.is_closed():
@@ -247,7 +247,7 @@ class SpunNode:
                 continue
             except NoReplyError:
                 pass
-            except Exception as exc:  # noqa: BLE001 - of an end that was closed meanwhile, mostly
+            except Exception as exc:  # noqa: BLE001 - mostly of an endpoint closed meanwhile
                 self._tell_error(exc)
         return None
 
@@ -261,7 +261,7 @@ class SpunNode:
         time.sleep(AFTER_ERROR)
 
     def _close(self) -> None:
-        with contextlib.suppress(Exception):  # of a context that is gone, all handles are
+        with contextlib.suppress(Exception):  # the handles end with their context
             self.executor.shutdown(EXIT_TIMEOUT)
         with contextlib.suppress(Exception):
             self.ros.destroy_node()
@@ -271,7 +271,7 @@ class SpunNode:
 
 
 def managed_node(name: str, *, namespace: str, context: Any) -> Any:
-    """Return a node of rclpy with a life cycle whose services run side by side; blocks."""
+    """Return a node of rclpy with a life cycle whose services run concurrently; blocks."""
     life, groups = rclpy("lifecycle"), rclpy("callback_groups")
     node_class = rclpy("node").Node
     bases = (life.LifecycleNodeMixin, node_class)

@@ -1,8 +1,8 @@
-"""The stamps of messages in ROS' time, where a node has ``use_sim_time``.
+"""Convert the stamps of messages to ROS' time, for a node with ``use_sim_time``.
 
-All stamps are made by the system's clock. Where messages leave the node they become ROS' time: a
-stamp is moved by as much as ROS' time is ahead when its first message leaves. Later messages of the
-same stamp, such as the lens beside a picture, get the same.
+All stamps come from the system's clock. When messages leave the node they are converted to ROS'
+time: a stamp is moved by the seconds by which ROS' time is ahead when its first message leaves.
+Later messages with the same stamp, such as a picture's lens, get the same new stamp.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 HEADER = "std_msgs/msg/Header"
 
 MAX_STAMPS = 256
-"""RosStamps that are remembered with what they became."""
+"""Number of remembered stamps with their new values."""
 
 BILLION = 1_000_000_000
 

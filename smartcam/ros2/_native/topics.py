@@ -39,10 +39,10 @@ def profile_of(qos: QoS) -> Any:
 
 
 class NativePublisher:
-    """Publishes on a topic through rclpy; made by :meth:`NativeNode.publisher`.
+    """Publishes on a topic through rclpy; created by :meth:`NativeNode.publisher`.
 
-    Messages are encoded here and handed over as bytes, so that a picture never becomes a list of
-    numbers; a thread of the node does that, since a middleware may wait for room.
+    Messages are encoded here and passed to rclpy as bytes, so that a picture never becomes a list
+    of numbers; a thread of the node does that, since a middleware may wait for room.
 
     Attributes:
         name: absolute name of the topic.
@@ -65,14 +65,14 @@ class NativePublisher:
 
     @property
     def heard(self) -> bool:
-        """True if the topic has a known subscriber; a latched topic always counts as heard."""
+        """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed or self._raw is None:
             return False
         if self.qos.latched:
             return True
         try:
             return bool(self._raw.get_subscription_count())
-        except Exception:  # noqa: BLE001 - the context is gone, and nobody hears
+        except Exception:  # noqa: BLE001 - the context has ended, so there is no subscriber
             return False
 
     def publish(self, message: object = None, /, **fields: Any) -> None:
@@ -80,26 +80,26 @@ class NativePublisher:
 
         Raises:
             RosMessageError: the message is not of the type.
-            RosError: the publisher is closed, or rclpy is gone.
+            RosError: the publisher is closed, or rclpy has ended.
         """
         self.publish_encoded(self.type.encode(said(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
-        """Publish bytes that are a message of the type already; never waits.
+        """Publish an encoded message of the type; never waits.
 
         Raises:
-            RosError: the publisher is closed, or rclpy is gone.
+            RosError: the publisher is closed, or rclpy has ended.
         """
         self._check_open()
         if self._raw is not None:
-            self._node.outbox.put(lambda: self._say(data), len(data), self._drop)
+            self._node.outbox.put(lambda: self._pass_on(data), len(data), self._drop)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message, and return once the middleware has it; a thread encodes it.
 
         Raises:
             RosMessageError: the message is not of the type.
-            RosError: the publisher is closed, or rclpy is gone.
+            RosError: the publisher is closed, or rclpy has ended.
 
         Cancellation: the message is published or not.
         """
@@ -112,8 +112,8 @@ class NativePublisher:
 
         def say() -> None:
             try:
-                self._say(self.type.encode(what))
-            except Exception as exc:  # noqa: BLE001 - told to the waiter
+                self._pass_on(self.type.encode(what))
+            except Exception as exc:  # noqa: BLE001 - passed to the waiting task
                 failed.append(exc)
             self._node.in_loop(done.set)
 
@@ -122,7 +122,7 @@ class NativePublisher:
         if failed:
             raise failed[0]
 
-    def _say(self, data: bytes) -> None:
+    def _pass_on(self, data: bytes) -> None:
         """Pass a message to rclpy, in the node's thread."""
         if self._node.has_sim_time:
             data = self._node.stamps.moved(self.type, data)
@@ -174,7 +174,7 @@ class NativeSubscription(TopicReader[bytes]):
         )
 
     def _on_message(self, data: bytes) -> None:
-        """Take a message in a thread of rclpy; if the loop is late, drop the newest."""
+        """Receive a message in a thread of rclpy; if the loop is late, drop it."""
         with self._lock:
             if self._crossing >= self._most:
                 return

@@ -1,4 +1,4 @@
 """A node of ROS 2 over the wire format of rmw_zenoh: topics, services, parameters, life cycle.
 
-No camera is known here.
+It knows nothing about cameras.
 """

@@ -28,31 +28,31 @@ ROUTER = "tcp/localhost:7447"
 """Endpoint of the router of rmw_zenoh's nodes (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
 
 SETTINGS: Mapping[str, Any] = {
-    # who publishes latched keeps messages by their times
+    # publishers of latched topics keep messages by their times
     "timestamping/enabled": {"router": True, "peer": True, "client": True},
     # nodes of rmw_zenoh are peers, and learn of each other from their router
     "scouting/gossip/enabled": True,
 }
-"""Settings of a Zenoh session that carries ROS nodes, as the sessions of rmw_zenoh have them."""
+"""Settings of a Zenoh session for ROS nodes, as in the sessions of rmw_zenoh."""
 
 
 CALM, MAX_DIRECT = 0.5, 8
-"""Seconds, and messages that the event loop hands to the engine itself in that time. The engine's
+"""Seconds, and messages that the event loop passes to the engine itself in that time. The engine's
 queue has room for 16 and drops the rest silently while its own thread gets no processor or the link
-takes nothing. A thread, which waits for room, hands over all others: with 0.01 s, 3 of 4 bursts of
-1000 results lost some on a machine that kept the engine's thread waiting; with 0.5 s, none of 8."""
+takes no data. A thread, which waits for room, passes all others: with 0.01 s, 3 of 4 bursts of 1000
+results lost some on a machine that kept the engine's thread waiting; with 0.5 s, none of 8."""
 
 PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
-"""Priorities of long messages of which only the newest counts. The engine has one message of each
-priority and link under way; topics take the priorities in turn, so that the two pictures of a pair
-do not meet in one."""
+"""Priorities of long messages of which only the newest is needed. The engine sends one message of
+each priority and link at a time; topics use the priorities in turn, so that the two pictures of a
+pair do not wait for each other."""
 
 PAUSE, RATE = 0.002, 5e8
 """Seconds, and bytes per second: the time that a healthy link needs for one long message."""
 
 
 class NewestSlot:
-    """A thread, and a priority, for long messages of which the newest counts.
+    """A thread, and a priority, for long messages of which only the newest is needed.
 
     Attributes:
         lane: name of the thread.
@@ -65,18 +65,18 @@ class NewestSlot:
         self._free = 0.0
 
     def wait(self, size: int) -> None:
-        """Wait until the message before should be taken; ``size`` bytes come now."""
+        """Wait until the previous message should be sent; ``size`` bytes come now."""
         time.sleep(max(0.0, self._free - time.monotonic()))
         self._free = time.monotonic() + PAUSE + size / RATE
 
 
 class RosContext:
-    """The context that nodes share, opened by the first of them.
+    """The context that nodes share, opened by the first node.
 
     Args:
-        session: open session of Zenoh, which stays open; None for a session of its own.
-        connect: endpoints that a session of its own connects to.
-        listen: endpoints that a session of its own listens on, which makes it the router.
+        session: open session of Zenoh, which stays open; None for an own session.
+        connect: endpoints that an own session connects to.
+        listen: endpoints that an own session listens on, which makes it the router.
         domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the ROS distribution whose messages and type hashes are used.
 
@@ -136,7 +136,7 @@ class RosContext:
         self._stop_listening = self.graph.listen(self._compare)
 
     async def close(self) -> None:
-        """Let a node go; the last one closes the session, if it is the context's own."""
+        """Release the context for a node; the last one closes an own session."""
         self._users -= 1
         if self._users:
             return
@@ -144,26 +144,26 @@ class RosContext:
         self._stop_listening = _nothing
         self.graph.close()
         for thread in self._threads.values():
-            thread.shutdown(wait=False)  # what waits sees that it is closed, and takes itself back
+            thread.shutdown(wait=False)  # waiting jobs find the session closed, and end
         self._threads.clear()
         if self._owns:
             await self.zenoh.close()
 
     def next_id(self) -> int:
-        """Return a number that nothing else in this session has."""
+        """Return a number that is unique in this session."""
         self._numbers += 1
         return self._numbers
 
-    # ------------------------------------------------------------------ who talks past whom
+    # ------------------------------------------------------------------ incompatible endpoints
 
     def add(self, entity: Entity) -> None:
-        """Add an end of this process; say if another end talks past it."""
+        """Add an endpoint of this process; log incompatible endpoints."""
         self._ends.setdefault((entity.name, entity.kind), []).append(entity)
         for other in self.graph.ends(entity.name, OTHER_END[entity.kind]):
             self._differ(entity, other)
 
     def remove(self, entity: Entity) -> None:
-        """Remove an end that is gone."""
+        """Remove a closed endpoint."""
         ends = self._ends.get((entity.name, entity.kind), [])
         if entity in ends:
             ends.remove(entity)
@@ -173,7 +173,7 @@ class RosContext:
     def watch(
         self, name: str, kind: str, watcher: Callable[[Entity, bool], None]
     ) -> Callable[[], None]:
-        """Have ``watcher(entity, present)`` called for ends that come and go from now on.
+        """Call ``watcher(entity, present)`` for each endpoint that comes or goes from now on.
 
         Args:
             name: name of the topic or service.
@@ -181,7 +181,7 @@ class RosContext:
             watcher: function that is called in the event loop.
 
         Returns:
-            What ends it.
+            A function that ends this.
         """
         found = self._watchers.setdefault((name, kind), [])
         found.append(watcher)
@@ -214,10 +214,10 @@ class RosContext:
                 other.hash,
             )
 
-    # ------------------------------------------------------------------ what may wait
+    # ------------------------------------------------------------------ waiting messages
 
     def slot(self) -> NewestSlot:
-        """Return the slot of one more topic of which the newest counts."""
+        """Return the slot of a further topic of which only the newest message is needed."""
         return next(self._slots)
 
     def waits(self, owner: object) -> bool:
@@ -225,19 +225,19 @@ class RosContext:
         return bool(self._long[owner])
 
     def calm(self) -> bool:
-        """Return True if the event loop may hand one more short message to the engine."""
+        """Return True if the event loop may pass one more short message to the engine."""
         now = time.monotonic()
         if self._in_lane["short"] or now - self._crowded < CALM:
-            # the thread may wait in the engine, and would have the loop wait, too; and the engine
-            # has just been full
+            # the thread may wait in the engine, and would block the loop, too; and the engine has
+            # just been full
             return False
         if now - self._calm_since > CALM:
             self._calm_since, self._said_directly = now, 0
         self._said_directly += 1
         return self._said_directly <= MAX_DIRECT
 
-    def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
-        """Have the thread of a lane call ``say``, which may wait for room; in order."""
+    def send_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+        """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:
             thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")

@@ -1,4 +1,4 @@
-"""Keep the graph: the nodes of a domain, with what they publish, hear, serve and call."""
+"""The graph: the nodes of a domain with their publishers, subscriptions, services and clients."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_ENTITIES = 100_000
-"""Largest number of nodes and ends of topics and services that are kept in mind; what comes beyond
-is not."""
+"""Largest number of nodes and endpoints in the graph; further ones are ignored, which the log
+says."""
 
 
 class RosGraph:
-    """The known graph of a domain, kept by the tokens of those who come and go.
+    """The known graph of a domain, built from the tokens of nodes and endpoints.
 
     Args:
-        domain: the number.
+        domain: number of the domain.
     """
 
     def __init__(self, domain: int) -> None:
@@ -47,7 +47,7 @@ class RosGraph:
         self._told = False
 
     def open(self, session: ZenohSession) -> None:
-        """Watch."""
+        """Subscribe to the tokens."""
         put = session.engine.SampleKind.PUT
 
         def on_sample(sample: Any) -> None:
@@ -61,15 +61,15 @@ class RosGraph:
         )
 
     def close(self) -> None:
-        """Watch no more. Idempotent."""
+        """Unsubscribe from the tokens. Idempotent."""
         if self._declared is not None:
             self._declared.close()
 
     def listen(self, listener: Callable[[Entity, bool], None]) -> Callable[[], None]:
-        """Have ``listener(entity, present)`` called for entities that come and go.
+        """Call ``listener(entity, present)`` for each entity that comes or goes.
 
         Return a function that ends this.
-        For those that are there already it is called at once.
+        For present entities it is called at once.
         """
         self._listeners.append(listener)
         for entity in tuple(self._entities.values()):
@@ -77,7 +77,7 @@ class RosGraph:
         return lambda: self._listeners.remove(listener)
 
     def take(self, token: str, present: bool) -> None:
-        """Take in that somebody has come, or gone."""
+        """Add or remove the entity of a token."""
         known = self._entities.get(token)
         if (known is not None) == present:
             return
@@ -112,7 +112,7 @@ class RosGraph:
             except ENDS_PROGRAM:
                 raise
             except BaseException:
-                logger.exception("the graph: who heard of %s", entity.token)
+                logger.exception("the graph: a listener failed at %s", entity.token)
 
     # ------------------------------------------------------------------ questions
 
@@ -120,7 +120,7 @@ class RosGraph:
         return iter(tuple(self._entities.values()))
 
     def by_gid(self, gid: bytes) -> Entity | None:
-        """Return the entity that has a GID; None if none has it."""
+        """Return the entity with a GID; None if there is none."""
         return self._by_gid.get(gid)
 
     def nodes(self) -> list[str]:
@@ -136,17 +136,17 @@ class RosGraph:
         return self._types({SERVICE})
 
     def ends(self, name: str, kind: str) -> list[Entity]:
-        """Return the ends of a topic or a service.
+        """Return the endpoints of a topic or a service.
 
         Args:
-            name: absolute.
-            kind: ``"MP"`` who publishes, ``"MS"`` who subscribes, ``"SS"`` who serves, ``"SC"`` who
-                calls.
+            name: absolute name.
+            kind: ``"MP"`` for publishers, ``"MS"`` subscriptions, ``"SS"`` services, ``"SC"``
+                clients.
         """
         return list(self._by_name.get((name, kind), {}).values())
 
     def of_node(self, full_name: str) -> list[Entity]:
-        """Return the ends of a node, as ``ros2 node info``."""
+        """Return the endpoints of a node, as ``ros2 node info``."""
         return [one for one in self if one.kind != NODE and one.full_node == full_name]
 
     def _types(self, kinds: set[str]) -> dict[str, list[str]]:
@@ -158,4 +158,4 @@ class RosGraph:
 
 
 OTHER_END = {PUBLISHER: SUBSCRIPTION, SUBSCRIPTION: PUBLISHER, SERVICE: CLIENT, CLIENT: SERVICE}
-"""Whom each kind of end talks to."""
+"""The kind of the endpoint at the other end."""

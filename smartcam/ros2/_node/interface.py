@@ -1,7 +1,7 @@
-"""The methods that a camera's node asks of the node of ROS below it.
+"""The methods of a node of ROS that a camera's node needs.
 
-:class:`~smartcam.ros2.Node` speaks the wire format of rmw_zenoh, a ``NativeNode`` speaks through
-rclpy, and ROS 1's goes through a rosbridge. The parts of a camera know only this.
+:class:`~smartcam.ros2.Node` uses the wire format of rmw_zenoh, a ``NativeNode`` uses rclpy, and ROS
+1's node a rosbridge. The parts of a camera's node use only this interface.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 class PublisherEnd(Protocol):
-    """A topic that is published on.
+    """A publisher of a topic.
 
-    An end may also have ``heard``, which says whether anybody hears the topic as far as is known;
-    ``publish_encoded``, which takes bytes of the type; and ``publish_newest``, which takes
-    pictures: True for pictures, of which a slow subscriber gets the newest only.
+    It may also have ``heard``, True if the topic has a subscriber as far as is known;
+    ``publish_encoded`` for an encoded message; and ``publish_newest`` for pictures, of which a slow
+    subscriber gets only the newest.
     """
 
     @property
@@ -33,23 +33,23 @@ class PublisherEnd(Protocol):
         ...
 
     def close(self) -> None:
-        """Publish no more. Idempotent."""
+        """Stop publishing. Idempotent."""
         ...
 
 
 class ServiceEnd(Protocol):
-    """A service that is served. An end may also have ``wait_closed``."""
+    """A server of a service. It may also have ``wait_closed``."""
 
     def close(self) -> None:
-        """Serve no more; calls under way are given up. Idempotent."""
+        """Stop serving, and cancel running calls. Idempotent."""
         ...
 
 
 class NodeOfRos(Protocol):
     """A node of ROS, opened and closed by ``async with``.
 
-    A node of ROS 2 also has ``graph``, which is how a node with a life cycle is told from others,
-    ``subscribe`` and ``client``.
+    A node of ROS 2 also has ``subscribe``, ``client``, and ``graph``, by which a node with a life
+    cycle is recognized.
 
     Attributes:
         name: name of the node.
@@ -71,7 +71,7 @@ class NodeOfRos(Protocol):
 
     @property
     def types(self) -> RosTypes:
-        """The messages and services that the node speaks."""
+        """The types of messages and services that the node knows."""
         ...
 
     async def __aenter__(self) -> Any:
@@ -79,7 +79,7 @@ class NodeOfRos(Protocol):
         ...
 
     async def __aexit__(self, *exc: object) -> None:
-        """Close the node, with all ends that are left."""
+        """Close the node, with all its endpoints."""
         ...
 
     def publisher(self, topic: str, type: str, *, qos: QoS = ...) -> PublisherEnd:

@@ -1,6 +1,6 @@
-"""The states of a managed node, and the ways between them.
+"""The states of a managed node, and its transitions.
 
-Ids and labels are lifecycle_msgs' and rcl_lifecycle's (``default_state_machine.c``).
+Ids and labels are those of lifecycle_msgs and rcl_lifecycle (``default_state_machine.c``).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 class LifecycleState(NamedTuple):
-    """A state, as ``lifecycle_msgs/msg/State`` has it."""
+    """A state, as in ``lifecycle_msgs/msg/State``."""
 
     id: int
     label: str
 
 
 class LifecycleTransition(NamedTuple):
-    """A way from a state to another, as ``lifecycle_msgs/msg/TransitionDescription`` has it."""
+    """A transition, as in ``lifecycle_msgs/msg/TransitionDescription``."""
 
     id: int
     label: str
@@ -59,7 +59,7 @@ STATES = tuple(
         (15, "errorprocessing"),
     )
 )
-"""States of a node, in the order in which rcl names them."""
+"""States of a node, in rcl's order."""
 
 _STATE = {state.label: state for state in STATES}
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = (
@@ -98,27 +98,27 @@ TRANSITIONS = tuple(
         (62, ERROR, "errorprocessing", "finalized"),
     )
 )
-"""Transitions, in the order in which rcl names them. Nobody can ask for one from number 10 on."""
+"""Transitions, in rcl's order. Those from number 10 on cannot be requested."""
 
 PRIVATE = 10
 """First id of the transitions that follow by themselves."""
 
 
 class Lifecycle:
-    """The states of a managed node, and the ways between them; one at a time.
+    """The states of a managed node, and its transitions, one at a time.
 
-    A transition that has begun goes on when its caller gives up. Its work may fail with a
-    :exc:`~smartcam.SmartCamError`, which leads back; any other error leads over error processing to
-    Unconfigured.
+    A transition that has begun continues when its caller is cancelled. If its work raises a
+    :exc:`~smartcam.SmartCamError`, the node returns to the previous state; after any other error
+    it goes through error processing to Unconfigured.
 
     Args:
-        name: the node's, for texts.
+        name: name of the node, for texts.
         work: functions that do the work of transitions, by their labels.
-        timeout: seconds that a transition may take.
+        timeout: seconds of a transition's timeout.
 
     Attributes:
-        state: the present state; during a transition the state of the transition.
-        closed: True if no transition can be asked for any more.
+        state: the current state; during a transition the state of the transition.
+        closed: True if no transition can be requested any more.
     """
 
     def __init__(
@@ -133,24 +133,24 @@ class Lifecycle:
 
     @property
     def active(self) -> bool:
-        """True if results are to be published."""
+        """True if results should be published."""
         return self.state is ACTIVE
 
     @property
     def available(self) -> list[LifecycleTransition]:
-        """The transitions that begin at the present state."""
+        """The transitions that begin at the current state."""
         return [one for one in TRANSITIONS if one.start is self.state]
 
     def listen(self, heard: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
-        """Have ``heard`` called after each step; return a function that ends this."""
+        """Call ``heard`` after each step; return a function that ends this."""
         self._heard.append(heard)
         return lambda: self._heard.remove(heard) if heard in self._heard else None
 
     async def settled(self) -> None:
-        """Wait until no transition is under way.
+        """Wait for the end of a running transition.
 
         Raises:
-            RosError: a transition takes longer than it may.
+            RosError: a transition takes longer than its timeout.
         """
         try:
             async with asyncio.timeout(self._timeout):
@@ -161,18 +161,18 @@ class Lifecycle:
             raise RosError(text) from exc
 
     async def change(self, label: str = "", number: int = 0) -> None:
-        """Make a transition, once none is under way.
+        """Make a transition, after the end of a running one.
 
         Args:
-            label: name of the transition; where there is one, ``number`` does not count, as in
+            label: name of the transition; with a label ``number`` is ignored, as in
                 rclcpp_lifecycle.
             number: id of the transition.
 
         Raises:
-            RosError: the transition does not begin at the present state.
-            SmartCamError: the transition failed; the error says why.
+            RosError: the transition does not begin at the current state.
+            SmartCamError: the transition failed; the error has the reason.
 
-        Cancellation: a transition that has begun goes on.
+        Cancellation: a transition that has begun continues.
         """
         await self.settled()
         transition = self._find(label, number)
@@ -183,26 +183,26 @@ class Lifecycle:
         await asyncio.shield(self._task)
 
     def _begins(self) -> None:
-        """Begin a transition that was asked for."""
+        """Begin a requested transition."""
 
     async def configure(self) -> None:
-        """Go from Unconfigured to Inactive as :meth:`change` does; else do nothing."""
+        """Go from Unconfigured to Inactive like :meth:`change`; in other states do nothing."""
         await self._have("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
-        """Go from Inactive to Active as :meth:`change` does; else do nothing."""
+        """Go from Inactive to Active like :meth:`change`; in other states do nothing."""
         await self._have("activate", ACTIVE)
 
     async def deactivate(self) -> None:
-        """Go from Active to Inactive as :meth:`change` does; else do nothing."""
+        """Go from Active to Inactive like :meth:`change`; in other states do nothing."""
         await self._have("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
-        """Go from Inactive to Unconfigured as :meth:`change` does; else do nothing."""
+        """Go from Inactive to Unconfigured like :meth:`change`; in other states do nothing."""
         await self._have("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:
-        """Go to Finalized, for good, as :meth:`change` does."""
+        """Go to Finalized, for good, like :meth:`change`."""
         await self._have("shutdown", FINALIZED)
 
     async def _have(self, label: str, *enough: LifecycleState) -> None:
@@ -211,7 +211,7 @@ class Lifecycle:
             await self.change(label)
 
     async def close(self) -> None:
-        """Give up what is under way, and be Finalized. Idempotent."""
+        """Cancel a running transition, and go to Finalized. Idempotent."""
         self.closed = True
         task = self._task
         if task is not None and not task.done():
@@ -252,13 +252,13 @@ class Lifecycle:
         except BaseException as exc:
             logger.exception("%s ! %s failed", self.name, transition.label)
             self._follow(ERROR)
-            self._follow(SUCCESS)  # there is nothing that would have to be put back
+            self._follow(SUCCESS)  # nothing has to be undone
             text = f"{self.name}: {transition.label}: {type(exc).__name__}: {exc}"
             raise RosError(text) from exc
         self._follow(SUCCESS)
 
     def _finished(self, task: asyncio.Task[None]) -> None:
-        """Note how a transition ended; one that was cancelled has failed."""
+        """Handle the end of a transition; a cancelled one has failed."""
         if task.cancelled():
             self._follow(FAILURE)
         else:
@@ -277,4 +277,6 @@ class Lifecycle:
             except ENDS_PROGRAM:
                 raise
             except BaseException:
-                logger.exception("%s ! who was told that it is %s", self.name, self.state.label)
+                logger.exception(
+                    "%s ! a listener failed at the state %s", self.name, self.state.label
+                )

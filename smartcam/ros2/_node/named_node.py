@@ -1,4 +1,4 @@
-"""Name a node of ROS, and say whether it is open, however it speaks."""
+"""A node of ROS with a name, for any transport."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from smartcam._server import Server
 from smartcam.exceptions import RosError
 
 HANDLER_TIMEOUT = 600.0
-"""Seconds that a service's handler may take."""
+"""Seconds of the timeout of a service's handler."""
 
 
 class NamedNode(Server):
@@ -20,7 +20,7 @@ class NamedNode(Server):
         namespace: namespace of the node, such as ``/line1``.
 
     Raises:
-        ConfigurationError: one of the two names of the names is not valid.
+        ConfigurationError: name or namespace is not valid.
     """
 
     def __init__(self, name: str, namespace: str) -> None:

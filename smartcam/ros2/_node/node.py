@@ -49,8 +49,8 @@ class Node(NamedNode):
         domain: number of the domain, which separates systems; None for the variable
             ``ROS_DOMAIN_ID``.
         distribution: name of the ROS distribution, whose type hashes are part of all names.
-        context: context shared with other nodes of this process, in place of the arguments above.
-        parameters: whether other nodes see its parameters and types, by seven services and a topic.
+        context: context shared with other nodes of this process, instead of the arguments above.
+        parameters: whether its parameters and types are served, by seven services and a topic.
         open_timeout: seconds for connecting to the router.
 
     Attributes:
@@ -112,7 +112,7 @@ class Node(NamedNode):
         Raises:
             ConnectFailedError: there is no router, or the node cannot listen.
 
-        Cancellation: leaves it closed.
+        Cancellation: the node is closed.
         """
         if self._token is not None:
             return
@@ -149,7 +149,7 @@ class Node(NamedNode):
                 for one in services:
                     await one.wait_closed()
         except TimeoutError:
-            pass  # a handler that does not end when it is cancelled is its author's
+            pass  # the handler's author must end it at cancellation
         finally:
             await self.context.close()
 
@@ -159,8 +159,8 @@ class Node(NamedNode):
         """Publish on a topic.
 
         Args:
-            topic: absolute, relative to the namespace, or private (``~/it``).
-            type: such as ``std_msgs/msg/String``.
+            topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
+            type: type of the messages, such as ``std_msgs/msg/String``.
             qos: quality of service.
 
         Raises:
@@ -175,8 +175,8 @@ class Node(NamedNode):
         """Subscribe to a topic; read it by ``async for``.
 
         Args:
-            topic: absolute, relative to the namespace, or private (``~/it``).
-            type: such as ``std_msgs/msg/String``.
+            topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
+            type: type of the messages, such as ``std_msgs/msg/String``.
             qos: quality of service; its depth is that of the queue.
 
         Raises:
@@ -202,10 +202,10 @@ class Node(NamedNode):
             service: name of the service, resolved as that of a topic.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
-                mapping of its fields; if it raises, the response says so, if it has fields for
-                that, such as ``success`` or ``error``; else the call gets no reply. The log has it.
+                mapping of its fields; its error is logged, and is in the response if that has
+                fields such as ``success`` or ``error``; otherwise the call gets no reply.
             qos: quality of service.
-            timeout: seconds that the handler may take.
+            timeout: seconds of the handler's timeout.
 
         Raises:
             ConfigurationError: the name is not valid, or there is no such type.

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from smartcam.ros2._node.services import RosClient
 
 CALL_TIMEOUT = 15.0
-"""Seconds; a node of ours gives a set ten."""
+"""Seconds of a call's timeout; a set of a node of smartcam has a timeout of ten seconds."""
 
 
 class ParameterClient:
-    """Another node's parameters; made by :meth:`Node.parameters_of`, and closed with its node.
+    """Another node's parameters; created by :meth:`Node.parameters_of`, and closed with its node.
 
-    Every method raises a :class:`~smartcam.ServiceCallError` where there is no such node, or the
-    node does not answer. A cancelled call leaves the client usable; whether a cancelled set is
-    carried out is not known.
+    Every method raises a :class:`~smartcam.ServiceCallError` if there is no such node, or the node
+    does not answer. After a cancelled call the client is usable; whether a cancelled set is carried
+    out is not known.
 
     Args:
-        client: the asking node's ``client``, which makes the client of a service.
+        client: the method ``client`` of the calling node, which creates the client of a service.
         name: full name of the other node.
         timeout: seconds for one call.
     """
@@ -47,8 +47,8 @@ class ParameterClient:
         """Return the names of parameters.
 
         Args:
-            *prefixes: only these, and what is in these groups; none is all.
-            depth: how many parts of a name below that; 0 is any.
+            *prefixes: names of parameters, and of groups of them; default: all.
+            depth: largest number of parts of a name below a prefix; 0 for any number.
         """
         reply = await self._call(
             "list_parameters", "ListParameters", prefixes=prefixes, depth=depth
@@ -56,7 +56,7 @@ class ParameterClient:
         return list(reply.result.names)
 
     async def get(self, *names: str) -> dict[str, Any]:
-        """Return values by their names; arrays are tuples, None is not set.
+        """Return values by their names; arrays are tuples, and None means not set.
 
         Raises:
             ServiceCallError: one of the parameters is not declared there.
@@ -81,11 +81,11 @@ class ParameterClient:
         """Set parameters, all or none.
 
         Args:
-            values: values by the parameters' names; an ``int`` is no double.
-            **more: further ones.
+            values: values by the parameters' names; an ``int`` is not accepted for a double.
+            **more: further values.
 
         Raises:
-            ConfigurationError: a value can be no parameter.
+            ConfigurationError: a value cannot be a parameter.
             ServiceCallError: the node refused, with its reason.
         """
         both = {**(values or {}), **more}
@@ -123,7 +123,7 @@ class ParameterClient:
             )
 
     def close(self) -> None:
-        """Ask no more. Idempotent."""
+        """Close the clients of the services. Idempotent."""
         clients, self._clients = self._clients, {}
         for client in clients.values():
             client.close()

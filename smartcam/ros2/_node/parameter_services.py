@@ -1,4 +1,4 @@
-"""The services and the topic by which other nodes see a node's parameters.
+"""The services and the topic of a node's parameters.
 
 Names, QoS and answers are those of ``parameter_service.cpp`` and ``node_parameters.cpp`` of rclcpp:
 an undeclared name leaves the answer empty.
@@ -54,7 +54,7 @@ class ParameterServices:
         self._events: PublisherEnd | None = None
 
     def open(self) -> None:
-        """Start to serve, and publish the present parameters."""
+        """Start to serve, and publish the current parameters."""
         self._events = self._node.publisher(
             "/parameter_events", "rcl_interfaces/msg/ParameterEvent", qos=PARAMETERS
         )
@@ -80,7 +80,7 @@ class ParameterServices:
         changed: Sequence[str] = (),
         deleted: Mapping[str, Typed] | None = None,
     ) -> None:
-        """Publish that parameters are new, changed or gone."""
+        """Publish that parameters are new, changed or deleted."""
         if self._events is None or not (new or changed or deleted):
             return
         seconds, rest = divmod(time.time_ns(), 1_000_000_000)
@@ -98,7 +98,7 @@ class ParameterServices:
         found = ((name, self._parameters.find(name)) for name in names)
         return [{"name": name, "value": encode_value(one)} for name, one in found if one]
 
-    # ------------------------------------------------------------------ to read
+    # ------------------------------------------------------------------ reading
 
     async def _describe(self, request: Any) -> dict[str, Any]:
         kind = self._node.types.message("rcl_interfaces/msg/ParameterDescriptor")
@@ -150,7 +150,7 @@ class ParameterServices:
                 await asyncio.sleep(0)
         return {"result": {"names": names, "prefixes": list(prefixes)}}
 
-    # ------------------------------------------------------------------ to set
+    # ------------------------------------------------------------------ setting
 
     async def _set(self, request: Any) -> dict[str, Any]:
         if why := self._too_many(request.parameters):

@@ -1,4 +1,4 @@
-"""Values of ROS parameters: their types and ranges, and how messages say them."""
+"""Values of ROS parameters: their types, ranges and encoding in messages."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class ParameterDescription:
         name: name of the parameter.
         type: name of the type, such as ``integer`` or ``double_array``.
         description: explanation for people.
-        read_only: whether nobody can set it.
-        minimum, maximum: bounds of a number; None is any.
-        step: step of a number from the minimum on; None is any.
+        read_only: whether it cannot be set.
+        minimum, maximum: bounds of a number; None for no bound.
+        step: step of a number from the minimum on; None for any value.
         constraints: further constraints, for people.
         dynamic: whether the type may change.
     """
@@ -64,10 +64,10 @@ class ParameterDescription:
     dynamic: bool = False
 
     def check_range(self, value: Any) -> None:
-        """Look whether a number of its type is in the range.
+        """Check that a number is in the range.
 
         Raises:
-            ConfigurationError: the number is not.
+            ConfigurationError: the number is out of range.
         """
         if not isinstance(value, int | float) or self.minimum is None or self.maximum is None:
             return
@@ -141,10 +141,10 @@ def _double_fits(value: float, first: float, last: float, step: float) -> bool:
 def range_of(
     name: str, number: int, minimum: float | None, maximum: float | None, step: float | None
 ) -> tuple[float | None, float | None, float | None]:
-    """Return a range as it is declared: both bounds, or neither.
+    """Return a declared range: both bounds, or neither.
 
     Raises:
-        ConfigurationError: there can be no such value, or it holds nothing.
+        ConfigurationError: a bound is not valid, or the range is empty.
     """
     if minimum is None and maximum is None and step is None:
         return None, None, None
@@ -198,7 +198,7 @@ class Typed(NamedTuple):
 
     @property
     def type(self) -> str:
-        """The name of its type."""
+        """The name of the value's type."""
         return TYPES[self.number]
 
     def __str__(self) -> str:
@@ -210,11 +210,11 @@ def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
 
     Args:
         name: name of the parameter, for texts.
-        given: a value of Python, or of numpy; or with its type already.
-        declared: the type of a list without elements.
+        given: a value of Python or numpy, or a :class:`Typed` value.
+        declared: number of the type of a list without elements.
 
     Raises:
-        ConfigurationError: the value can be no parameter.
+        ConfigurationError: the value cannot be a parameter.
     """
     if isinstance(given, Typed):
         return given

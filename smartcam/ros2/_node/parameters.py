@@ -1,4 +1,4 @@
-"""The parameters of a node: what is declared, and how it is set."""
+"""Declare and set the parameters of a node."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 SET_TIMEOUT = 10.0
-"""Seconds that a hook may take, and that a set waits for those before it."""
+"""Seconds of a hook's timeout, and of a set's wait for earlier sets."""
 
 MAX_VALUE_SIZE = 1 << 16
 """Largest number of characters, bytes or elements of a value."""
@@ -36,7 +36,7 @@ MAX_PARAMETERS = 1024
 
 
 class _Declared:
-    """A parameter that is declared, with its value."""
+    """A declared parameter with its value."""
 
     __slots__ = ("description", "on_set", "value")
 
@@ -46,10 +46,10 @@ class _Declared:
         self.description, self.value, self.on_set = description, value, on_set
 
     def fitting(self, given: object, *, by_node: bool = False) -> Typed:
-        """Return a value as it would be kept.
+        """Return a value with its type, after checking that the parameter can have it.
 
         Raises:
-            ConfigurationError: the value is of another type, or out of range, or nobody can set it.
+            ConfigurationError: the value is of another type or out of range, or is read-only.
         """
         name = self.description.name
         if self.description.read_only and not by_node:
@@ -83,13 +83,13 @@ class _ParameterChange(NamedTuple):
 class RosParameters:
     """The parameters of a node; other nodes list, get, describe and set them while it is open.
 
-    The type of a parameter is that of the value it is declared with: ``bool``, ``int``, ``float``,
-    ``str``, ``bytes``, or a list of one of the first four; an ``int`` is no ``float``.
+    The type of a parameter is that of its first value: ``bool``, ``int``, ``float``, ``str``,
+    ``bytes``, or a list of one of the first four; an ``int`` is not accepted for a ``float``.
 
     Args:
-        node: node that has the parameters.
-        served: whether other nodes see the parameters.
-        timeout: seconds that one ``on_set`` may take, and that a set waits for those before it.
+        node: node of the parameters.
+        served: whether other nodes can use the parameters.
+        timeout: seconds of the timeout of one ``on_set``, and of a set's wait for earlier sets.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class RosParameters:
         self._node, self._timeout = node, timeout
         self._declared: dict[str, _Declared] = {}
         self._turn = asyncio.Lock()
-        self._setting: asyncio.Task[Any] | None = None  # whose turn it is
+        self._setting: asyncio.Task[Any] | None = None  # task that sets parameters now
         self._tasks: set[asyncio.Task[Any]] = set()
         self._services = ParameterServices(node, self) if served else None
         self.declare(
@@ -111,12 +111,12 @@ class RosParameters:
     # ------------------------------------------------------------------ life
 
     def open(self) -> None:
-        """Let other nodes see the parameters; the node calls it when it is opened."""
+        """Serve the parameters; the node calls this when it is opened."""
         if self._services is not None:
             self._services.open()
 
     async def close(self) -> None:
-        """Give up sets that are under way; declared parameters stay. The node calls it."""
+        """Cancel running sets; declared parameters stay. The node calls this."""
         if self._services is not None:
             self._services.close()
         for task in self._tasks:
@@ -124,7 +124,7 @@ class RosParameters:
         if self._tasks:
             await asyncio.wait(tuple(self._tasks))
 
-    # ------------------------------------------------------------------ what there is
+    # ------------------------------------------------------------------ declarations
 
     def declare(
         self,
@@ -149,13 +149,13 @@ class RosParameters:
             minimum: least value of a number.
             maximum: greatest value of a number.
             step: step of a number, from ``minimum`` on.
-            on_set: function that is called, and awaited, with a new value before it counts; a
-                :class:`~smartcam.SmartCamError` of it refuses the value, with its text.
+            on_set: coroutine function that is called with a new value before the parameter gets
+                it; it refuses the value by a :class:`~smartcam.SmartCamError`, with its text.
             type: name of the type, such as ``string_array``, for a list without elements.
 
         Raises:
-            ConfigurationError: the parameter is declared, or value, name, type or range is not
-                valid.
+            ConfigurationError: the parameter is already declared, or value, name, type or range
+                is not valid.
         """
         if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
             raise ConfigurationError(f"parameter {name!r:.80}: expected a name in printable text")
@@ -209,7 +209,7 @@ class RosParameters:
         return self._of(name).description
 
     def find(self, name: str) -> Typed | None:
-        """Return a value with its type; None if there is none of this name."""
+        """Return a value with its type; None if there is no parameter of this name."""
         found = self._declared.get(name)
         return None if found is None else found.value
 
@@ -222,7 +222,7 @@ class RosParameters:
             )
         return found
 
-    # ------------------------------------------------------------------ to set them
+    # ------------------------------------------------------------------ setting
 
     def update(self, name: str, value: object) -> None:
         """Change the value of a parameter without ``on_set``, even of a read-only one.
@@ -237,26 +237,26 @@ class RosParameters:
             self._tell(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
-        """Set one, as other nodes do.
+        """Set a parameter like another node.
 
         Raises:
             ConfigurationError: there is no parameter of this name, or the value is not valid.
-            RosError: its ``on_set`` failed, or sets before it took too long.
-            SmartCamError: whatever its ``on_set`` raised to refuse it.
+            RosError: its ``on_set`` failed, or earlier sets took too long.
+            SmartCamError: its ``on_set`` refused the value.
 
-        Cancellation: leaves the value as it was; whether ``on_set`` was carried out is unknown.
+        Cancellation: the value is unchanged; whether ``on_set`` was carried out is unknown.
         """
         await self.set_all({name: value})
 
     async def set_all(self, values: Mapping[str, object]) -> None:
-        """Set several at once, or none of them: what failed half way is taken back.
+        """Set several parameters, or none of them: if one fails, the others are undone.
 
         Raises:
             ConfigurationError: there is no parameter of a name, or a value is not valid.
-            RosError: an ``on_set`` failed, or sets before it took too long.
-            SmartCamError: whatever an ``on_set`` raised to refuse it.
+            RosError: an ``on_set`` failed, or earlier sets took too long.
+            SmartCamError: an ``on_set`` refused a value.
 
-        Cancellation: as an ``on_set`` that fails.
+        Cancellation: like a failed ``on_set``.
         """
         if self._setting is not None and self._setting is asyncio.current_task():
             raise RosError(f"{', '.join(values):.80}: an on_set cannot set parameters")
@@ -275,7 +275,7 @@ class RosParameters:
             self._turn.release()
 
     async def carry_out(self, values: Mapping[str, object]) -> None:
-        """Set as :meth:`set_all`, to its end even if the caller is gone."""
+        """Set like :meth:`set_all`, to the end even if the caller is cancelled."""
         task = asyncio.get_running_loop().create_task(self.set_all(values))
         self._tasks.add(task)
         task.add_done_callback(self._ended)
@@ -284,7 +284,7 @@ class RosParameters:
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
-            task.exception()  # whoever asked may be gone, and nobody else wants to know
+            task.exception()  # the caller may have been cancelled
 
     async def _set_now(self, values: Mapping[str, object]) -> None:
         changes = []
@@ -304,7 +304,7 @@ class RosParameters:
         self._tell(changed=[one for one in values if one in self._declared])
 
     async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
-        """Undo what went well; what cannot be undone counts, and is told."""
+        """Undo changes; a change that cannot be undone stays, and is published and logged."""
         for change in reversed(done):
             name = change.declared.description.name
             try:
@@ -317,7 +317,7 @@ class RosParameters:
                 self._tell(changed=[name])
 
     async def _call(self, declared: _Declared, value: Typed) -> None:
-        """Have a hook carry a value out.
+        """Call the hook with a value.
 
         Raises:
             RosError: the hook failed, or took too long.

@@ -1,6 +1,6 @@
-"""Quality of service, and how rmw_zenoh writes it in its tokens.
+"""Quality of service, and its form in rmw_zenoh's tokens.
 
-What equals the default of rmw_zenoh is left out there: ``rmw_zenoh_cpp/src/detail/qos.cpp`` has the
+A token leaves out values that equal a default: ``rmw_zenoh_cpp/src/detail/qos.cpp`` has the
 defaults (reliable, volatile, keep last 42, endless durations), ``liveliness_utils.cpp``
 (``qos_to_keyexpr``, ``keyexpr_to_qos``) the form.
 """
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from smartcam.exceptions import ConfigurationError
 
 DEFAULT_DEPTH = 42
-"""Messages that rmw_zenoh keeps where the depth is 0; a token leaves this number out."""
+"""Number of messages that rmw_zenoh keeps at a depth of 0; a token leaves this number out."""
 
 MAX_QUEUE_DEPTH = 1_000_000
 
@@ -28,10 +28,10 @@ class QoS:
     """The quality of service of a topic or a service.
 
     Attributes:
-        reliable: ``False`` is best effort.
-        latched: transient local: who comes later gets the last ``depth`` messages.
-        depth: messages that are kept, None for all: there the publisher waits.
-        lifespan: seconds after which a message counts for nothing.
+        reliable: ``False`` for best effort.
+        latched: transient local: a later subscriber gets the last ``depth`` messages.
+        depth: number of kept messages, None for all: then the publisher waits.
+        lifespan: seconds after which a message is no longer delivered.
 
     Raises:
         ConfigurationError: a value is not valid.
@@ -52,7 +52,7 @@ class QoS:
 
     @property
     def kept(self) -> int:
-        """Number of messages that are kept where there has to be a bound."""
+        """Number of kept messages, bounded also if ``depth`` is None."""
         return DEFAULT_DEPTH if self.depth is None else self.depth
 
     def encode(self) -> str:
@@ -97,10 +97,10 @@ class QoS:
 
 
 DEFAULT = QoS()
-"""Quality of ROS 2 where none is given: reliable, the last ten messages."""
+"""Default quality of ROS 2: reliable, the last ten messages."""
 
 DRIVER = QoS(depth=5)
-"""Quality of drivers (REP-2003): reliable, the last five messages; consumers take SENSOR_DATA."""
+"""Quality of drivers (REP-2003): reliable, the last five messages; consumers use SENSOR_DATA."""
 
 SENSOR_DATA = QoS(reliable=False, depth=5)
 LATCHED = QoS(latched=True, depth=1)

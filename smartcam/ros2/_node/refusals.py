@@ -1,4 +1,4 @@
-"""Answer a call that is not carried out, so that its caller's wait ends.
+"""Answer a refused call, so that its caller does not wait forever.
 
 rmw_zenoh drops an error reply, so its clients would wait forever. They receive ordinary answers
 only. Many types have fields for that: ``success`` and a text, or an ``error``. Services of ROS that
@@ -38,7 +38,7 @@ def refusal(kind: ServiceType, why: str, types: RosTypes) -> Any:
 
     Args:
         kind: type of the service.
-        why: reason, for people.
+        why: reason as a text.
         types: types of the nested messages.
     """
     text = why[:MAX_REASON_CHARACTERS].replace("\0", "\ufffd").encode(errors="replace").decode()

@@ -22,7 +22,7 @@ ROSOUT: Final = QoS(latched=True, depth=1000, lifespan=10.0)
 """Quality of ``/rosout``, as ``rcl_qos_profile_rosout_default`` (``logging_rosout.h`` of rcl)."""
 
 MAX_WAITING_RECORDS = 1000
-"""Largest number of records that wait for the event loop; the oldest makes room."""
+"""Largest number of records that wait for the event loop; beyond it the oldest is dropped."""
 
 MAX_TEXT_CHARACTERS = 8000
 """Largest number of characters of a record's text."""
@@ -31,7 +31,7 @@ CLOSE_TIMEOUT = 1.0
 LOOK_INTERVAL = 0.005
 
 RECORDS_PER_TURN = 64
-"""Records that are published in one turn of the event loop."""
+"""Number of records that are published in one turn of the event loop."""
 
 DEBUG, WARN, FATAL = 10, 30, 50
 
@@ -40,13 +40,13 @@ class RosOut:
     """Publishes log records as ``rcl_interfaces/msg/Log``; from any thread, never waiting.
 
     Args:
-        node: node that publishes, whose name stands in the messages.
-        logger: logger whose records are published, with those of the loggers below.
-        level: lowest level of :mod:`logging` that is published.
+        node: node that publishes; the messages have its name.
+        logger: logger of the records; records of child loggers are published too.
+        level: lowest published level of :mod:`logging`.
         wanted: function that returns True for a record to publish; None: publish all.
 
     Attributes:
-        dropped: records for which there was no room.
+        dropped: number of records dropped for want of room.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class RosOut:
         self._waiting: collections.deque[dict[str, Any]] = collections.deque(
             maxlen=MAX_WAITING_RECORDS
         )
-        self._handed = 0  # to the publisher
+        self._handed = 0  # records passed to the publisher
         self._lock = threading.Lock()
         self._woken = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -85,7 +85,7 @@ class RosOut:
             self._logger.addHandler(self._handler)
 
     async def close(self) -> None:
-        """Publish what waits, within a second, and nothing more. Idempotent."""
+        """Publish waiting records within a second, and stop. Idempotent."""
         self._logger.removeHandler(self._handler)
         publisher = self._publisher
         if publisher is None:
@@ -96,21 +96,21 @@ class RosOut:
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 while publisher.published + publisher.dropped < self._handed:  # noqa: ASYNC110
-                    await asyncio.sleep(LOOK_INTERVAL)  # a thread says them
+                    await asyncio.sleep(LOOK_INTERVAL)  # a thread publishes them
         except TimeoutError:
-            pass  # the network does not take them
+            pass  # the network does not accept them
         finally:
             publisher.close()
 
     def _take(self, record: logging.LogRecord) -> None:
-        """Take a record in; in the thread that logs."""
+        """Queue a record; called in the thread that logs."""
         said = self._said(record)
-        with self._lock:  # for no longer than this
+        with self._lock:  # held only for a moment
             self.dropped += len(self._waiting) == MAX_WAITING_RECORDS
             self._waiting.append(said)
         if not self._woken and self._loop is not None:
             self._woken = True
-            with contextlib.suppress(RuntimeError):  # the loop is closed, and so is all
+            with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._publish)
 
     def _said(self, record: logging.LogRecord) -> dict[str, Any]:
@@ -127,14 +127,14 @@ class RosOut:
         }
 
     def _publish(self) -> None:
-        self._woken = False  # first: what comes now wakes again
+        self._woken = False  # first, so that a new record wakes the loop again
         publisher = self._publisher
         if publisher is None:
             self._waiting.clear()
             return
         with _inside():
             for _ in range(min(RECORDS_PER_TURN, len(self._waiting))):
-                with contextlib.suppress(RosError):  # which would be logged, and come here
+                with contextlib.suppress(RosError):  # logging it would bring it here again
                     publisher.publish(self._waiting.popleft())
                     self._handed += 1
         if self._waiting and not self._woken and self._loop is not None:
@@ -143,7 +143,7 @@ class RosOut:
 
 
 class _Handler(logging.Handler):
-    """Hands records on; one that is logged while one is handed on, in the same thread, is not."""
+    """Passes records on, except those that are logged by this in the same thread."""
 
     def __init__(self, take: Callable[[logging.LogRecord], None], level: int) -> None:
         super().__init__(level)
@@ -157,11 +157,11 @@ class _Handler(logging.Handler):
         return True
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand the log record on."""
+        """Pass the log record on."""
         with _inside():
             try:
                 self._take(record)
-            except Exception:  # noqa: BLE001 - as handlers of logging do
+            except Exception:  # noqa: BLE001 - like the handlers of logging
                 self.handleError(record)
 
 
@@ -184,11 +184,11 @@ _formatter: Final = logging.Formatter()
 def _text(record: logging.LogRecord) -> str:
     try:
         return _formatter.format(record)
-    except Exception as exc:  # noqa: BLE001 - what was logged is somebody else's
+    except Exception as exc:  # noqa: BLE001 - arguments of other programs may raise any error
         return f"{record.msg!s} ({type(exc).__name__}: {exc})"
 
 
 def _plain(text: str) -> str:
-    """Return text as a message can have it."""
+    """Return a text without characters that a message cannot have."""
     cut = text if len(text) <= MAX_TEXT_CHARACTERS else f"{text[:MAX_TEXT_CHARACTERS]} ..."
     return cut.replace("\0", "\\0").encode(errors="backslashreplace").decode()

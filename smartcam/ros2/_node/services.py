@@ -1,7 +1,7 @@
 """Serve and call services.
 
-As ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
-queryable, a reply repeats number and GID of its request.
+As in ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
+queryable, and a reply repeats number and GID of its request.
 """
 
 from __future__ import annotations
@@ -36,13 +36,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_CONCURRENT_CALLS = 64
-"""Largest number of calls of a service that are carried out at the same time; one beyond is
-refused, or waits."""
+"""Largest number of calls of a service that are carried out at the same time; further ones are
+refused, or wait."""
 
 MAX_WAITING_CALLS = 256
-"""Largest number of calls that wait for their turn, of a service whose answers cannot refuse
-one."""
-
+"""Largest number of waiting calls of a service whose answers have no fields for a refusal."""
 MAX_REQUEST_BYTES = 1 << 24
 """Largest number of bytes of a request."""
 
@@ -59,11 +57,11 @@ class _RequestedCall(NamedTuple):
 
 
 class RosService(RosEnd):
-    """A service that a node serves; made by :meth:`Node.serve`.
+    """A service of a node; created by :meth:`Node.serve`.
 
     Attributes:
         type: type of requests and replies.
-        calls: number of calls that came.
+        calls: number of received calls.
         failed: number of calls that were not carried out.
     """
 
@@ -106,7 +104,7 @@ class RosService(RosEnd):
         call = _RequestedCall(query, data, attachment)
         full = len(self._tasks) >= MAX_CONCURRENT_CALLS
         if self._closed:
-            self._refuse(call, RosError("it is not served any more"))
+            self._refuse(call, RosError("the service is closed"))
         elif len(data) > MAX_REQUEST_BYTES:
             why = f"a request of {len(data)} bytes: expected {MAX_REQUEST_BYTES} at most"
             self._refuse(call, RosMessageError(why))
@@ -115,7 +113,7 @@ class RosService(RosEnd):
         elif full:
             self._refuse(
                 call,
-                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most"),
+                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most"),
             )
         else:
             self._begin(call)
@@ -145,7 +143,7 @@ class RosService(RosEnd):
                 reply = await self._handler(request)
             data = self.type.response.encode(said(reply, {}))
         except asyncio.CancelledError:
-            self._refuse(call, RosError("the call was given up"))
+            self._refuse(call, RosError("the call was cancelled"))
             raise
         except TimeoutError as exc:
             why = exc if isinstance(exc, SmartCamError) else f"no answer in {self._timeout:g} s"
@@ -165,7 +163,7 @@ class RosService(RosEnd):
         self._context.zenoh.reply(call.query, [(self.entity.key, data)], attachment=attachment)
 
     def _refuse(self, call: _RequestedCall, why: SmartCamError) -> None:
-        """Answer by a response that says why, or by an error if the type has no such field."""
+        """Answer by a response with the reason, or by an error if the type has no field for it."""
         answer = refusal(self.type, f"{self.name}: {why}", self._context.types)
         if answer is None:
             self._fail(call.query, why)
@@ -180,7 +178,7 @@ class RosService(RosEnd):
         self._context.zenoh.refuse(query, f"{self.name}: {why}")
 
     def _on_graph(self, entity: Entity, present: bool) -> None:
-        """Give up the calls of a client that is gone."""
+        """Cancel the calls of a lost client."""
         if present:
             return
         left = [call for call in self._waiting if call.attachment.gid != entity.gid]
@@ -190,24 +188,24 @@ class RosService(RosEnd):
                 task.cancel()
 
     def close(self) -> None:
-        """Stop serving, and give up running calls. Idempotent."""
+        """Stop serving, and cancel running calls. Idempotent."""
         if not self._closed:
             super().close()
             self._stop_listening()
             waiting, self._waiting = self._waiting, collections.deque()
             for call in waiting:
-                self._refuse(call, RosError("it is not served any more"))
+                self._refuse(call, RosError("the service is closed"))
             for task in self._tasks:
                 task.cancel()
 
     async def wait_closed(self) -> None:
-        """Wait until the calls that were given up have ended."""
+        """Wait until the cancelled calls have ended."""
         if self._tasks:
             await asyncio.wait(tuple(self._tasks))
 
 
 class RosClient(RosEnd):
-    """Calls a service; made by :meth:`Node.client`.
+    """Calls a service; created by :meth:`Node.client`.
 
     Attributes:
         type: type of requests and replies.
@@ -232,7 +230,7 @@ class RosClient(RosEnd):
                 entity.key,
                 target=zenoh.QueryTarget.ALL_COMPLETE,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=86_400,  # this handler's result counts
+                timeout=86_400,  # the timeout of call() ends the wait earlier
                 express=True,
             )
             return self._querier
@@ -242,15 +240,15 @@ class RosClient(RosEnd):
 
     @property
     def served(self) -> bool:
-        """True if somebody serves the service, as far as is known."""
+        """True if there is a server, as far as is known."""
         ends = self._context.graph.ends(self.name, SERVICE)
         return not self._closed and any(one.key == self.entity.key for one in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
-        """Wait until somebody serves it.
+        """Wait until there is a server.
 
         Raises:
-            ServiceTimeoutError: nobody does within ``timeout`` seconds.
+            ServiceTimeoutError: no server is found within ``timeout`` seconds.
         """
         if self.served:
             return
@@ -261,9 +259,9 @@ class RosClient(RosEnd):
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
             others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
-            what = f", but somebody serves {', '.join(others)}" if others else ""
+            what = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
-                f"{self.name}: nobody serves {self.type.name} {self.type.hash} there within "
+                f"{self.name}: no server for {self.type.name} {self.type.hash} within "
                 f"{timeout:g} s{what}",
                 service=self.name,
             ) from exc
@@ -273,7 +271,7 @@ class RosClient(RosEnd):
             raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
 
     async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call the service, once somebody serves it; the first reply counts.
+        """Call the service, once there is a server; return the first reply.
 
         Args:
             request: a request of the type, or a mapping of its fields.
@@ -281,11 +279,11 @@ class RosClient(RosEnd):
             **fields: the fields, if no request is given.
 
         Raises:
-            RosMessageError: the value is no request of the type; or the reply cannot be read.
-            ServiceTimeoutError: nobody serves it, or no reply came in time.
-            ServiceCallError: the server refused, or went away.
+            RosMessageError: the value is not a request of the type, or the reply cannot be read.
+            ServiceTimeoutError: there is no server, or no reply came in time.
+            ServiceCallError: the server refused, or was lost.
 
-        Cancellation: leaves the client usable; whether the call is carried out is unknown.
+        Cancellation: the client stays usable; whether the call is carried out is unknown.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
@@ -323,7 +321,7 @@ class RosClient(RosEnd):
                 why = (
                     refused[0]
                     if refused
-                    else ("it ended without a reply; whether the call was carried out is unknown")
+                    else ("the call ended without a reply; whether it was carried out is unknown")
                 )
                 reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
 
@@ -339,7 +337,7 @@ class RosClient(RosEnd):
                 zenoh.in_loop(take, len(found), found)
 
         def on_end() -> None:
-            if not came:  # otherwise the loop is not woken again
+            if not came:  # after a reply the loop need not be woken again
                 zenoh.in_loop(end, 0)
 
         self._querier.get(
@@ -349,15 +347,15 @@ class RosClient(RosEnd):
         )
 
     def _is_for(self, wanted: Attachment, extra: bytes | None) -> bool:
-        """Return True if a reply answers this call; called in a thread of the engine's."""
+        """Return True if a reply answers this call; called in a thread of the engine."""
         try:
             got = Attachment.decode(extra)
         except RosMessageError as exc:
-            logger.warning("%s ! a reply was left out: %s", self.name, exc)
+            logger.warning("%s ! a reply was ignored: %s", self.name, exc)
             return False
         if (got.number, got.gid) == (wanted.number, wanted.gid):
             return True
-        logger.warning("%s ! a reply to another call was left out: %s", self.name, got)
+        logger.warning("%s ! a reply to another call was ignored: %s", self.name, got)
         return False
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Write and read rmw_zenoh's liveliness tokens, and the keys of topics and services.
 
-``rmw_zenoh_cpp/src/detail/liveliness_utils.cpp`` has their form: ``Entity::Entity`` joins the
-parts, and makes the GID of them; ``TopicInfo::TopicInfo`` has the key of a topic or a service.
+Source: ``rmw_zenoh_cpp/src/detail/liveliness_utils.cpp``: ``Entity::Entity`` joins the parts, and
+computes the GID from them; ``TopicInfo::TopicInfo`` has the key of a topic or a service.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SERVICE: Final = "SS"
 CLIENT: Final = "SC"
 KINDS: Final = (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT)
 
-_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may name backends of buffers, too
+_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may have backends of buffers, too
 
 
 def pattern(domain: int) -> str:
@@ -34,20 +34,20 @@ def pattern(domain: int) -> str:
 
 @dataclass(frozen=True)
 class Entity:
-    """A node, or an end of a topic or a service.
+    """A node, or an endpoint of a topic or a service.
 
     Attributes:
         kind: one of :data:`KINDS`.
-        domain: the number that keeps systems apart.
+        domain: number of the domain, which separates systems.
         zid: id of the node's Zenoh session.
         node_id, id: numbers within the session.
         namespace: namespace of the node, such as ``/`` or ``/line1``.
-        node: the node's name.
-        name: name of the topic or service, absolute; empty for a node.
-        type: type as DDS writes it, such as ``std_msgs::msg::dds_::String_``.
+        node: name of the node.
+        name: absolute name of the topic or service; empty for a node.
+        type: type in DDS' form, such as ``std_msgs::msg::dds_::String_``.
         hash: hash of the type.
-        qos: quality of service that was asked for.
-        enclave: enclave of security, which is not used here.
+        qos: requested quality of service.
+        enclave: enclave of security, which smartcam does not use.
     """
 
     kind: Kind
@@ -65,7 +65,7 @@ class Entity:
 
     @cached_property
     def token(self) -> str:
-        """Its liveliness token."""
+        """The entity's liveliness token."""
         parts = [ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.id), self.kind]
         parts += [_mangled(one) for one in (self.enclave, self.namespace, self.node)]
         if self.kind != NODE:
@@ -75,7 +75,7 @@ class Entity:
 
     @cached_property
     def gid(self) -> bytes:
-        """Its 16 bytes in attachments: a hash of the token."""
+        """The entity's 16 bytes in attachments: a hash of the token."""
         return gid_of(self.token)
 
     @property
@@ -85,12 +85,12 @@ class Entity:
 
     @property
     def full_node(self) -> str:
-        """The full name of its node."""
+        """The full name of the entity's node."""
         return full_name(self.namespace, self.node)
 
     @property
     def ros_type(self) -> str:
-        """The type as ROS writes it, such as ``std_msgs/msg/String``."""
+        """The type in ROS' form, such as ``std_msgs/msg/String``."""
         return self.type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
     @classmethod
@@ -98,7 +98,7 @@ class Entity:
         """Read a token.
 
         Raises:
-            ValueError: the token is not valid, with what was expected.
+            ValueError: the token is not valid; the text has the expected form.
         """
         parts = token.split("/")
         wanted = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS

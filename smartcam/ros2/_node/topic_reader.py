@@ -22,18 +22,18 @@ Item = TypeVar("Item")
 class TopicReader(ABC, Generic[Item]):
     """Subscription to a topic, read by ``async for``.
 
-    Messages wait in a queue; the oldest makes room for a new one. A message that cannot be read is
-    left out and counted, and the log has the first one.
+    Messages wait in a queue, which drops the oldest if it is full. A message that cannot be decoded
+    is left out and counted, and the first one is logged.
 
     Args:
         topic: absolute name of the topic.
         kind: type of the messages.
-        depth: number of messages that wait at most.
-        max_bytes: bytes of all messages that wait.
+        depth: largest number of waiting messages.
+        max_bytes: largest number of bytes of all waiting messages.
 
     Attributes:
         type: type of the messages.
-        rejected: count of what came and was no message.
+        rejected: number of messages that could not be decoded.
     """
 
     _logger: ClassVar[logging.Logger] = logging.getLogger("smartcam.ros2")
@@ -50,14 +50,14 @@ class TopicReader(ABC, Generic[Item]):
 
     @abstractmethod
     def _read(self, item: Item) -> Any:
-        """Return the message that an item of the queue is.
+        """Return the message of an item of the queue.
 
         Raises:
-            RosMessageError: the item is no message of the type.
+            RosMessageError: the item is not a message of the type.
         """
 
     def statistics(self) -> SubscriberStatistics:
-        """Return the queue's account."""
+        """Return the queue's counters."""
         return self._queue.statistics()
 
     def __aiter__(self) -> Self:

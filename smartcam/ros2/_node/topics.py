@@ -1,7 +1,7 @@
-"""The ends of topics: who publishes, and who hears.
+"""Publishers and subscriptions of topics.
 
-As ``rmw_publisher_data.cpp`` and ``rmw_subscription_data.cpp`` of rmw_zenoh: what is latched is
-kept by an advanced publisher, and asked for by an advanced subscriber.
+As in ``rmw_publisher_data.cpp`` and ``rmw_subscription_data.cpp`` of rmw_zenoh: an advanced
+publisher keeps latched messages, and an advanced subscriber asks for them.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_DIRECT_BYTES = 1 << 16
-"""Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
+"""Bytes beyond which a thread sends a message, and waits until the engine has taken it."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of a topic's messages that wait to be said, or to be read."""
+"""Largest number of bytes of a topic's messages that wait to be sent, or to be read."""
 
 
 def said(message: object, fields: dict[str, Any]) -> object:
-    """Return the message to send, or its fields where no message is given."""
+    """Return the message to send, or its fields if no message is given."""
     if message is not None and fields:
         raise RosMessageError("expected a message or its fields, got both")
     return fields if message is None else message
 
 
 MAX_SHORT_MESSAGES = 10_000
-"""Short messages of a topic that wait to be said; of long ones as many as its depth says."""
+"""Largest number of waiting short messages of a topic; for long ones it is the topic's depth."""
 
 HEARTBEAT = 0.5
-"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
+"""Seconds between two heartbeats of a latched topic (``rmw_publisher_data.cpp``)."""
 
 
 class RosEnd:
-    """An end of a topic or a service, with its token, until it is closed.
+    """An endpoint of a topic or a service, with its token.
 
     Args:
         context: context that the node shares with others.
-        entity: entry of this end in the graph.
-        on_close: function called with this end once it is closed.
+        entity: entry of this endpoint in the graph.
+        on_close: function called with this endpoint once it is closed.
     """
 
     def __init__(
@@ -79,13 +79,13 @@ class RosEnd:
         return declared
 
     def _appear(self) -> None:
-        """Be seen in the graph, when all else is there."""
+        """Declare the token, which makes the complete endpoint visible in the graph."""
         token = self.entity.token
         self._declare(lambda session: session.liveliness().declare_token(token))
         self._context.add(self.entity)
 
     def close(self) -> None:
-        """Be gone. Idempotent."""
+        """Undeclare the endpoint. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -102,12 +102,12 @@ class RosEnd:
 
 
 class RosPublisher(RosEnd):
-    """Publishes on a topic; made by :meth:`Node.publisher`.
+    """Publishes on a topic; created by :meth:`Node.publisher`.
 
     Attributes:
         type: type of the messages.
-        published: messages that were handed to the engine.
-        dropped: messages for which there was no room, the oldest of those that waited.
+        published: number of messages passed to the engine.
+        dropped: number of messages dropped for want of room, the oldest first.
     """
 
     def __init__(
@@ -126,10 +126,10 @@ class RosPublisher(RosEnd):
         self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
         self._bytes = 0
         self._publisher: Any = None
-        qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
+        qos = entity.qos  # a message that must not be dropped may block, which the loop cannot
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._patient: dict[str, Any] = {}  # messages that wait for room, by lane
-        self._hasty: Any = None  # leaves out to whom one is under way
+        self._patient: dict[str, Any] = {}  # publishers that wait for room, by lane
+        self._hasty: Any = None  # publisher that skips links with a message in transmission
         self._slot: NewestSlot | None = None
         self._lane = "latched" if qos.latched else "short"
         self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
@@ -165,13 +165,13 @@ class RosPublisher(RosEnd):
 
     @property
     def heard(self) -> bool:
-        """True if anybody hears the topic, as far as is known; a latched one counts as heard."""
+        """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed:
             return False
         return self.entity.qos.latched or bool(self._publisher.matching_status.matching)
 
     def watch(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Have ``call`` called when subscribers come and go; return what ends that.
+        """Call ``call`` when subscribers come and go; return a function that ends that.
 
         ``heard`` may change a moment later.
         """
@@ -181,17 +181,17 @@ class RosPublisher(RosEnd):
         """Publish a message; never waits.
 
         Args:
-            message: one of the type's own, or a mapping of its fields.
-            **fields: the fields, where no message is given.
+            message: a message of the type, or a mapping of its fields.
+            **fields: the fields, if no message is given.
 
         Raises:
-            RosMessageError: the value is no message of the type.
+            RosMessageError: the value is not a message of the type.
             RosError: the publisher is closed.
         """
         self.publish_encoded(self.type.encode(said(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
-        """Publish bytes that are a message of the type already; never waits.
+        """Publish an encoded message of the type; never waits.
 
         Raises:
             RosError: the publisher is closed.
@@ -200,7 +200,7 @@ class RosPublisher(RosEnd):
         attachment = self._attachment()
         waits = self._context.waits(self)
         if len(data) > MAX_DIRECT_BYTES and self._lane == "short" and not waits:
-            self._lane = "long"  # from now on: a short one would overtake it
+            self._lane = "long"  # from now on, since a short message would overtake it
         if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
@@ -214,16 +214,16 @@ class RosPublisher(RosEnd):
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
-        self._context.say_later(self, self._say_next, self._lane)
+        self._context.send_later(self, self._send_next, self._lane)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message; a long one except to whom one is under way already.
+        """Publish a message, a long one except on links where another is being sent.
 
-        For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
-        that is old. It returns when the engine has copied the message; a thread encodes it.
+        For pictures: for a slow subscriber they do not queue up, delay other subscribers, or get
+        old. Returns when the engine has copied the message; a thread encodes it.
 
         Raises:
-            RosMessageError: the value is no message of the type.
+            RosMessageError: the value is not a message of the type.
             RosError: the publisher is closed.
 
         Cancellation: the message is published or not.
@@ -239,20 +239,20 @@ class RosPublisher(RosEnd):
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._say_newest(self.type.encode(what))
-            except BaseException as exc:  # noqa: BLE001 - told to the waiter
+                self._send_newest(self.type.encode(what))
+            except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
                 done.set_exception(exc)
             else:
                 done.set_result(None)
 
-        self._context.say_later(self, say, self._lane)
+        self._context.send_later(self, say, self._lane)
         await asyncio.wrap_future(done)
 
-    def _say_newest(self, data: bytes) -> None:
-        """Say a message; in the thread for it.
+    def _send_newest(self, data: bytes) -> None:
+        """Send a message; called in the thread for it.
 
-        A long one by a publisher of its own, whose messages the engine leaves out for each link
-        that has one of the same priority under way; so they have a little time between them.
+        Long messages have their own publisher. The engine skips its message on each link that is
+        sending one of the same priority; so there is a short pause between messages.
         """
         slot, publisher = self._slot, self._publisher
         if self._closed or slot is None:
@@ -279,8 +279,8 @@ class RosPublisher(RosEnd):
         self._number += 1
         return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
-    def _say_next(self) -> None:
-        """Say the oldest that waits; in the thread for it."""
+    def _send_next(self) -> None:
+        """Send the oldest waiting message; called in the thread for it."""
         with self._lock:
             if not self._waiting or self._closed:
                 return
@@ -290,10 +290,10 @@ class RosPublisher(RosEnd):
         self.published += 1
 
     def _patiently(self) -> Any:
-        """Return the publisher that waits for room; a long message gets a lower priority there."""
+        """Return the publisher that waits for room, at a lower priority for long messages."""
         zenoh, lane = self._context.zenoh.engine, self._lane
         if self.entity.qos.latched:
-            return self._publisher  # which has to keep them
+            return self._publisher  # a latched topic's publisher has to keep the messages
         if lane not in self._patient:
             self._patient[lane] = self._context.zenoh.session.declare_publisher(
                 self.entity.key,
@@ -303,7 +303,7 @@ class RosPublisher(RosEnd):
         return self._patient[lane]
 
     def close(self) -> None:
-        """Be gone; what waits to be said is not said any more. Idempotent."""
+        """Undeclare the topic, and drop waiting messages. Idempotent."""
         if self._closed:
             return
         super().close()
@@ -311,8 +311,8 @@ class RosPublisher(RosEnd):
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
-        if self._context.waits(self):  # its thread may be at it, and does that when it is done
-            self._context.say_later(self, self._take_back, self._lane)
+        if self._context.waits(self):  # the thread undeclares it after a running send
+            self._context.send_later(self, self._take_back, self._lane)
         else:
             self._take_back()
 
@@ -331,10 +331,10 @@ class _FromTopic(NamedTuple):
 
 
 class RosSubscription(RosEnd, TopicReader[_FromTopic]):
-    """Subscription to a topic, made by :meth:`Node.subscribe` and read by ``async for``.
+    """Subscription to a topic, created by :meth:`Node.subscribe` and read by ``async for``.
 
     Attributes:
-        attachment: number, time and publisher of the message that was read last.
+        attachment: number, time and publisher of the last message that was read.
     """
 
     def __init__(
@@ -391,6 +391,6 @@ class RosSubscription(RosEnd, TopicReader[_FromTopic]):
         return message
 
     def close(self) -> None:
-        """Hear no more; iterating ends. Idempotent."""
+        """Stop receiving; iteration ends. Idempotent."""
         super().close()
         self._queue.close()

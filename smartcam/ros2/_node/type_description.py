@@ -1,7 +1,7 @@
-"""Describe a type to whoever knows its hash: the service ``~/get_type_description``.
+"""Serve descriptions of types by their hash: the service ``~/get_type_description``.
 
-As ``node.c`` of rcl has it: only the hash counts, and only types that the node uses are described.
-Nodes have it from Iron on, which is where types have hashes.
+As in ``node.c`` of rcl: only the hash is compared, and only types that the node uses are described.
+Nodes have the service from Iron on, the first distribution with hashes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TypeDescriptions:
 
     Args:
         node: node that uses the types.
-        entities: function that returns the node's present entries in the graph.
+        entities: function that returns the node's current entries in the graph.
     """
 
     def __init__(self, node: NodeOfRos, entities: Callable[[], Iterable[Entity]]) -> None:
@@ -44,7 +44,7 @@ class TypeDescriptions:
             )
 
     def open(self) -> None:
-        """Serve, where the distribution does."""
+        """Serve, if the distribution's nodes do."""
         if served(self._node.types):
             self._node.serve("~/get_type_description", TYPE, self._describe)
 
@@ -64,7 +64,7 @@ class TypeDescriptions:
         return {"successful": True, "type_description": made, "type_sources": sources}
 
     def _sources(self, described: Any) -> list[dict[str, str]]:
-        """Return the texts of the files of a type and of all types within."""
+        """Return the texts of the files of a type and of all nested types."""
         types = (described.type_description, *described.referenced_type_descriptions)
         return [self._source(one.type_name) for one in types]
 

@@ -1,1 +1,1 @@
-"""ROS messages without ROS: definitions, their bytes (CDR) and their hashes. No camera is known."""
+"""ROS messages without ROS: their definitions, bytes (CDR) and hashes; without cameras."""

@@ -1,8 +1,8 @@
-"""CDR: the functions that encode and decode a message, written for each type when it is needed.
+"""CDR: generate the functions that encode and decode messages of a type, when they are needed.
 
-Fields of fixed size that follow each other are packed at once. Where a run begins is known only
-when a message is there, so each run has eight forms, one for each place modulo 8; the four bytes
-of the encapsulation do not count for alignment.
+Consecutive fields of fixed size are packed at once. The position of such a run depends on the
+message, so each run has eight forms, one for each position modulo 8; the four bytes of the
+encapsulation do not count for alignment.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SIZES: Final = {code: struct.calcsize(f"<{code}") for code in "bBhHiIqQfd?"}
 
 
 class MisfitError(ValueError):
-    """Bytes or a value that do not fit; only within the room."""
+    """Bytes or a value do not fit; only within this package."""
 
 
 @functools.lru_cache(4096)
@@ -47,7 +47,7 @@ def _form(parts: tuple[tuple[str, int], ...], order: str, place: int) -> struct.
 
 
 class _Writer:
-    """Lines of a function: what fixed and variable sizes have in common."""
+    """Lines of a function: the common part of encoder and decoder."""
 
     def __init__(self, order: str) -> None:
         self.order = order
@@ -95,7 +95,7 @@ class _Writer:
 
 
 def packed(value: Any, code: str, least: int, most: int) -> Any:
-    """Return the bytes of numbers, of which there are ``least`` to ``most`` (0 is any)."""
+    """Return the bytes of ``least`` to ``most`` numbers (0 for any number of them)."""
     if isinstance(value, bytes | bytearray | memoryview):
         if code not in "bB":
             raise MisfitError(f"bytes are no numbers of {code}")
@@ -229,7 +229,7 @@ class _Encoder(_Writer):
 
 
 def encoder(kind: MessageType) -> Callable[[Any], bytes]:
-    """Return the function that makes bytes of a message; it raises MisfitError and others."""
+    """Return the function that encodes a message; it raises MisfitError and other errors."""
     writer = _Encoder()
     writer.names["HEAD"] = HEAD
     writer.line("parts = [HEAD]")
@@ -247,7 +247,7 @@ _FLAG_OF: Final = (False, True)
 
 
 def read_text(data: Any, start: int, size: int, limit: int) -> str:
-    """Return a string of ``size`` bytes, of which the last is its end."""
+    """Return a string of ``size`` bytes, whose last byte is NUL."""
     if not size:
         return ""
     end = start + size
@@ -264,7 +264,7 @@ def read_text(data: Any, start: int, size: int, limit: int) -> str:
 
 
 def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: int) -> Any:
-    """Return ``count`` numbers as a view of the bytes; of the other byte order, as a copy."""
+    """Return ``count`` numbers as a view of the bytes, or for another byte order as a copy."""
     if most and count > most:
         raise MisfitError(f"expected up to {most} numbers, got {count}")
     if count * kind.itemsize > len(data) - start:
@@ -277,14 +277,14 @@ def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: i
 
 
 def own_numbers(array: Numbers) -> Numbers:
-    """Return numbers in this machine's byte order; flags are looked at."""
+    """Return numbers in this machine's byte order, after checking flags."""
     if array.dtype.kind == "b" and array.view(np.uint8).max() > 1:
         raise MisfitError("a flag is neither 0 nor 1")
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def checked_count(count: int, most: int, left: int) -> int:
-    """Return the number of items that follow, after checking that a byte is left for each."""
+    """Return the number of following items, after checking that a byte is left for each."""
     if most and count > most:
         raise MisfitError(f"expected up to {most} items, got {count}")
     if count > left:
@@ -308,7 +308,7 @@ class _Decoder(_Writer):
         self.line(f"{values}, = s.unpack_from(data, pos)")
 
     def message(self, kind: MessageType) -> str:
-        """Write how a message is read; return the expression that makes it."""
+        """Write the lines that read a message; return the expression that creates it."""
         if not kind.fields:
             self.fixed("B", 1, self.name())
         parts = [self.field(kind, field) for field in kind.fields]
@@ -366,7 +366,7 @@ class _Decoder(_Writer):
 
 
 def decoder(kind: MessageType, order: str) -> Callable[[Any], tuple[Any, int]]:
-    """Return the function that makes a message of bytes, and says where it ends."""
+    """Return the function that decodes a message, and returns also the position of its end."""
     writer = _Decoder(order)
     writer.line(f"pos = {len(HEAD)}")
     made = writer.message(kind)

@@ -1,4 +1,4 @@
-"""Turn the texts of ``.msg`` and ``.srv`` into the fields of messages and services."""
+"""Read the fields of messages and services from the texts of ``.msg`` and ``.srv``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INTEGERS: Final = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "byte": "B",
 }  # fmt: skip
-"""The code of ``struct`` and numpy for each."""
+"""The codes of ``struct`` and numpy by the type."""
 
 NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
 BASES: Final = frozenset({*NUMBERS, "string"})
@@ -36,8 +36,8 @@ class MessageField(NamedTuple):
 
     Attributes:
         type: a basic type, or a message's full name.
-        limit: the most bytes of a string; 0 is any.
-        size: 0 is any for a sequence.
+        limit: largest number of bytes of a string; 0 for any.
+        size: number of elements of an array, largest number for a sequence; 0 for any.
         default: value where none is given; None is zero.
     """
 
@@ -133,7 +133,7 @@ def dds_name(name: str) -> str:
 
 
 def parse_message(name: str, text: str) -> Definition:
-    """Return the definition that the text of a ``.msg`` file gives.
+    """Return the definition from the text of a ``.msg`` file.
 
     Raises:
         ConfigurationError: the text defines no message.
@@ -163,7 +163,7 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     """Return request and response of a ``.srv``.
 
     Raises:
-        ConfigurationError: its text is no service.
+        ConfigurationError: the text defines no service.
     """
     parts = re.split(r"(?m)^---\s*$", text)
     if len(parts) != 2:

@@ -1,7 +1,7 @@
 """RIHS01: the hash of a type's description, by which nodes check that they use the same type.
 
 It is SHA-256 of JSON of the fields' names, types and order, and those of all nested types
-(REP-2016); neither constants nor defaults count.
+(REP-2016), without constants and defaults.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 NOT_SUPPORTED: Final = "TypeHashNotSupported"
-"""Text in place of a hash if the distribution has none."""
+"""Text instead of a hash if the distribution has none."""
 
 _NESTED: Final = 1
 _IDS: Final = {

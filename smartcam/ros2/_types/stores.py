@@ -1,4 +1,4 @@
-"""The distributions of ROS 2, and what each has: once in the process, made when it is asked for."""
+"""The distributions of ROS 2 and their types, each loaded once in the process when needed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DISTRIBUTIONS: Final = {
     "lyrical": "lyrical",
     "rolling": "lyrical",
 }
-"""The store of rosbags for each; rolling is as the newest."""
+"""The store of rosbags by the distribution; rolling uses the newest."""
 
 WITHOUT_HASHES: Final = frozenset({"humble"})
 
@@ -32,20 +32,20 @@ LACKING: Final = {
         }
     )
 }
-"""Names of the texts here that a distribution does not have, by the distribution."""
+"""Names of built-in texts that a distribution does not have, by the distribution."""
 
 _DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
 }
-"""Defaults that the stores leave out; a name is a constant's, or nothing where it has none."""
+"""Defaults that the stores leave out; a name is that of a constant, if the type has it."""
 
 _NAME, _ARRAY, _SEQUENCE = 2, 3, 4
 
 
 @functools.cache
 def stored(distribution: str) -> Mapping[str, Any]:
-    """Return the fields of a distribution's messages, as rosbags has them.
+    """Return the fields of a distribution's messages, from rosbags.
 
     Raises:
         ConfigurationError: there is no such distribution.

@@ -55,20 +55,20 @@ _MISFITS: Final = (
     OverflowError,
     AttributeError,
 )
-"""Errors that encoding and decoding raise where a message or its bytes do not fit."""
+"""Errors that encoding and decoding raise if a message or its bytes do not fit."""
 
 
 class MessageType:
-    """A type of message; made by ``RosTypes.message`` and ``RosTypes.service``.
+    """A type of message; created by ``RosTypes.message`` and ``RosTypes.service``.
 
     Attributes:
         name: name of the type, such as ``std_msgs/msg/String``.
         dds: name of the type in keys, such as ``std_msgs::msg::dds_::String_``.
         fields: name, type, shape, bounds and default of each field.
         constants: constants by name; they are attributes of ``cls``, too.
-        nested: the types of the messages within by name.
-        cls: the class of its messages, made with all fields in their order and looked at when they
-            are encoded: the fastest way.
+        nested: the nested types by name.
+        cls: the class of the messages, created with all fields in their order; values are checked
+            when they are encoded: the fastest way.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class MessageType:
 
     @cached_property
     def text(self) -> str:
-        """Its definition and those of all messages within, as recordings have it (``ros2msg``)."""
+        """The definition and those of all nested types, in recordings' form (``ros2msg``)."""
         within = description(self._definition, self._types.definition)
         parts = [self._definition.text()]
         for one in within["referenced_type_descriptions"]:
@@ -109,12 +109,12 @@ class MessageType:
 
     @cached_property
     def zero(self) -> Callable[[], RosMessage]:
-        """The function that makes a message of defaults and zeros."""
+        """The function that creates a message of defaults and zeros."""
         return zero_maker(self)
 
     @cached_property
     def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
-        """Each field by its name in Python, and what a value for it has to stand."""
+        """Each field by its name in Python, and the function that checks and converts a value."""
         return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
 
     @cached_property
@@ -126,9 +126,9 @@ class MessageType:
         return {}
 
     def new(self, /, **fields: Any) -> Any:
-        """Return a message of these fields; those not said have their default, or zero.
+        """Return a message of these fields; other fields have their default, or zero.
 
-        A message within may be given as a mapping of its fields.
+        A nested message may be given as a mapping of its fields.
 
         Raises:
             RosMessageError: there is no such field, or a value does not fit.
@@ -152,7 +152,7 @@ class MessageType:
             raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
 
     def _flat(self, data: object) -> memoryview:
-        """Return bytes of other kinds of buffers, one after the other."""
+        """Return the contents of other kinds of buffers as flat bytes."""
         if not isinstance(data, bytearray | memoryview):
             raise RosMessageError(f"{self.name}: expected bytes, got {type(data).__name__}")
         view = memoryview(data)
@@ -172,17 +172,17 @@ class MessageType:
         return ""
 
     def decode(self, data: bytes | bytearray | memoryview, *, whole: bool = True) -> Any:
-        """Return the message of CDR, little- or big-endian.
+        """Decode a message of CDR, little- or big-endian.
 
-        Sequences of numbers are views of ``data``, read only where that is bytes.
+        Sequences of numbers are views of ``data``, read-only if ``data`` is bytes.
 
         Args:
             data: bytes of the message.
-            whole: whether the message has to fill the bytes; those of ROS' own serializer may be
-                more, with anything in them.
+            whole: whether the message has to fill the bytes; ROS' own serializer may add further
+                bytes with any contents.
 
         Raises:
-            RosMessageError: the bytes are no such message, or too few, or too many.
+            RosMessageError: the bytes are not such a message, or too few, or too many.
         """
         if not isinstance(data, bytes):
             data = self._flat(data)
@@ -210,7 +210,7 @@ class MessageType:
 
 
 class ServiceType:
-    """A type of service; made by ``RosTypes.service``.
+    """A type of service; created by ``RosTypes.service``.
 
     Attributes:
         name: name of the type, such as ``std_srvs/srv/Trigger``.
@@ -250,10 +250,10 @@ class ServiceType:
 
 
 class RosTypes:
-    """The messages and services of a distribution of ROS 2, and those that are added.
+    """The messages and services of a distribution of ROS 2, and added ones.
 
-    Every object of the same distribution shares the distribution's own types; types added are in
-    the object that they were added to. It may be used from any thread.
+    All objects of a distribution share the distribution's own types; an added type is only in its
+    object. It may be used from any thread.
 
     Args:
         distribution: ``humble``, ``jazzy``, ``kilted``, ``lyrical`` or ``rolling``.
@@ -285,7 +285,7 @@ class RosTypes:
         """Return a type of message, such as ``std_msgs/msg/String``.
 
         Raises:
-            ConfigurationError: there is no message of this name, or one within it is not known.
+            ConfigurationError: there is no message of this name, or a nested one is not known.
         """
         if (made := self._messages.get(name)) is not None:
             return made
@@ -296,7 +296,7 @@ class RosTypes:
         """Return a type of service, such as ``std_srvs/srv/Trigger``.
 
         Raises:
-            ConfigurationError: there is no service of this name, or a message within it is not
+            ConfigurationError: there is no service of this name, or a nested message is not
                 known.
         """
         if (made := self._services.get(name)) is not None:
@@ -316,10 +316,10 @@ class RosTypes:
     def add(self, name: str, text: str) -> None:
         """Add a message (``pkg/msg/Name``) or service (``pkg/srv/Name``) by the text of its file.
 
-        What is there already may be added again with the same fields.
+        A known type may be added again with the same fields.
 
         Raises:
-            ConfigurationError: the text is none of a message or service, or another type has its
+            ConfigurationError: the text defines no message or service, or another type has the
                 name.
         """
         _, kind, _ = split_name(name)
@@ -360,7 +360,7 @@ class RosTypes:
         return made
 
     def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
-        """Return a message's type; for this module, as what follows."""
+        """Return a message's type; only for this module, like the methods below."""
         if (made := self._messages.get(name)) is not None:
             return made
         if self._shared is not None and name not in self._added and name not in self._definitions:
@@ -382,7 +382,7 @@ class RosTypes:
         return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
 
     def source(self, name: str) -> tuple[str, str]:
-        """Return the encoding and the text of the file that has a type.
+        """Return the encoding and the text of a type's file.
 
         A part of a service has no file: its encoding is ``implicit``.
 
@@ -410,7 +410,7 @@ class RosTypes:
 
 
 class _Shared(RosTypes):
-    """The types of a distribution itself; nothing is added to them."""
+    """The own types of a distribution, to which none are added."""
 
 
 @functools.cache

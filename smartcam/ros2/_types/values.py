@@ -1,4 +1,4 @@
-"""Messages as objects of Python: their classes, zero values, and what may stand in a field."""
+"""Messages as objects of Python: their classes, zero values, and the checks of fields."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 class RosMessage:
     """A message: one attribute for each field, constants on its class.
 
-    Numbers in sequences and arrays are numpy arrays (or what was put there); bytes may stand for
-    ``uint8[]``.
+    Sequences and arrays of numbers are numpy arrays (or the values that were assigned); ``uint8[]``
+    may be bytes.
     """
 
     __slots__: tuple[str, ...] = ()
     __msgtype__: ClassVar[str] = ""
-    __hash__: ClassVar[None]  # type: ignore[assignment]  # equal ones may change
+    __hash__: ClassVar[None]  # type: ignore[assignment]  # equal messages may change
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RosMessage) or other.__msgtype__ != self.__msgtype__:
@@ -41,7 +41,7 @@ class RosMessage:
 
 
 _MAX_SHOWN = 16
-"""Elements or bytes above which a value is not shown whole."""
+"""Number of elements or bytes above which a value is shown shortened."""
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -64,7 +64,7 @@ def _shown(value: Any) -> str:
 
 
 def message_class(definition: Definition) -> type[RosMessage]:
-    """Return the class of a message; made with its fields in order."""
+    """Return the class of a message, which is created with its fields in order."""
     names = tuple(field.attribute for field in definition.fields)
     made: type[RosMessage] = dataclasses.make_dataclass(
         definition.name.rpartition("/")[2],
@@ -84,7 +84,7 @@ def message_class(definition: Definition) -> type[RosMessage]:
 
 
 class LocatedError(MisfitError):
-    """A field's value does not fit; ``path`` says which, from the outermost message on."""
+    """A field's value does not fit; ``path`` is the field's, from the outermost message on."""
 
     def __init__(self, text: str, place: str) -> None:
         super().__init__(text)
@@ -95,7 +95,7 @@ class LocatedError(MisfitError):
 
 
 def _located(exc: Exception, field: MessageField, value: Any, place: str = "") -> LocatedError:
-    """Return the error of a field, or of one within it, with its place."""
+    """Return the error of a field or a nested field, with its place."""
     if not isinstance(exc, LocatedError):
         return LocatedError(f"expected {field}, got {_shown(value):.80} ({exc})", place)
     exc.path.append(place)
@@ -109,13 +109,13 @@ _MISFITS: Final = (MisfitError, struct.error, KeyError, TypeError, ValueError, O
 
 
 def zero_maker(kind: MessageType) -> Callable[[], RosMessage]:
-    """Return the function that makes a message of defaults and zeros."""
+    """Return the function that creates a message of defaults and zeros."""
     made, parts = kind.cls, [_zero(kind, field) for field in kind.fields]
     return lambda: made(*[part() for part in parts])
 
 
 def _zero(kind: MessageType, field: MessageField) -> Callable[[], Any]:
-    """Return the function that makes a field's value where none is given."""
+    """Return the function that creates a field's default value."""
     if field.shape:
         return _zeros(kind, field)
     if field.nested:
@@ -125,7 +125,7 @@ def _zero(kind: MessageType, field: MessageField) -> Callable[[], Any]:
 
 
 def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
-    """Return the function that makes the value of a field of many where none is given."""
+    """Return the function that creates the default value of an array or a sequence."""
     count = field.size if field.shape == "array" else 0
     if field.type in NUMBERS:
         dtype = np.dtype(f"={NUMBERS[field.type]}")
@@ -140,14 +140,14 @@ def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
 _ZERO: Final[dict[str, Any]] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 
-# -- values that are said -----------------------------------------------------------------------
+# -- given values -------------------------------------------------------------------------------
 
 
 def filled(kind: MessageType, fields: Mapping[str, Any]) -> Any:
     """Return a message of these fields, zero elsewhere.
 
     Raises:
-        LocatedError: a field is not of the type, or does not fit.
+        LocatedError: the type has no such field, or a value does not fit.
     """
     message = kind.zero()
     rules = kind.rules
@@ -166,9 +166,9 @@ def filled(kind: MessageType, fields: Mapping[str, Any]) -> Any:
 
 
 def rule_of(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
-    """Return the function that returns a field's value as it is kept: mappings become messages.
+    """Return the function that checks and converts a field's value: mappings become messages.
 
-    It raises one of ``_MISFITS`` for what does not fit.
+    It raises one of ``_MISFITS`` for a value that does not fit.
     """
     if not field.shape:
         return _rule_of_one(kind, field)
@@ -255,7 +255,7 @@ _RULES: Final[dict[str, Callable[[Any], Any]]] = {
 
 
 def check(kind: MessageType, message: Any) -> None:
-    """Look at every field of a message, to say what is wrong with it.
+    """Check every field of a message.
 
     Raises:
         LocatedError: a field is missing or does not fit.

@@ -1,4 +1,4 @@
-"""Other people's messages and services: their field lists, one field after the other."""
+"""The fields of messages and services of other packages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 
 def _texts(package: str, kind: str, said: dict[str, str]) -> dict[str, str]:
-    """Return texts of files; here ``;`` ends a line, and ``|`` a request."""
+    """Return texts of files from these, in which ``;`` ends a line, and ``|`` a request."""
     return {
         f"{package}/{kind}/{name}": "\n".join(
             "---" if part == "|" else part

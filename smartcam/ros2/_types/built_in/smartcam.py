@@ -1,4 +1,4 @@
-"""The package ``smartcam_msgs``; ``ros2/smartcam_msgs`` has each as a file with the same text."""
+"""The package ``smartcam_msgs``; ``ros2/smartcam_msgs`` has files with the same texts."""
 
 from __future__ import annotations
 
