@@ -190,14 +190,14 @@ async def _trigger(camera: SoftwareCamera[Any]) -> float:
 
 def _show_when_asked(camera: SoftwareCamera[Any], picture: NDArray[np.uint8]) -> None:
     """Hand the picture over as soon as a run waits for a frame."""
-    eyes = camera._device.eyes  # noqa: SLF001 - no public name says when a picture is shown
-    begin, loop = eyes.begin, asyncio.get_running_loop()
+    inspector = camera._device.inspector  # noqa: SLF001 - no public name says when a picture is shown
+    begin, loop = inspector.begin, asyncio.get_running_loop()
 
     def begin_and_show(*arguments: Any) -> None:
         begin(*arguments)
         loop.call_soon(_show, picture)
 
-    eyes.begin = begin_and_show  # type: ignore[assignment,method-assign]
+    inspector.begin = begin_and_show  # type: ignore[assignment,method-assign]
 
 
 async def _triggers(camera: SoftwareCamera[Any], count: int) -> float:

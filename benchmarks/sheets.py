@@ -20,7 +20,7 @@ from benchmarks.measure import Comparison, Goal, Series
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.projection import linearize
-from smartcam.calibration._lens.sheet_shape import as_meant
+from smartcam.calibration._lens.sheet_shape import moved_to_nominal
 from smartcam.calibration._stereo.calibration import calibrate_stereo
 from smartcam.calibration._stereo.triangulation import CameraPair, triangulate
 from smartcam.calibration.simulation import _scenes as scenes
@@ -164,7 +164,7 @@ def _height(height: Array) -> Array:
 
 def sheet(kind: str, board: Checkerboard, random: np.random.Generator) -> Array:
     """Return where the points (T, 3) of a sheet are, place, direction and size as meant."""
-    return as_meant(KINDS[kind](board.points, random), board.points)
+    return moved_to_nominal(KINDS[kind](board.points, random), board.points)
 
 
 def _released(views: Sequence[TargetView]) -> Any:

@@ -98,7 +98,7 @@ class Doorbell:
 
     def give(self, outcome: Outcome, value: object) -> None:
         """Give an outcome its result: its task goes on at once, unless another task runs."""
-        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
+        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self.loop) is not None:
             outcome.set_result(value)
             return
         due, self.due = self.due, []
@@ -107,7 +107,7 @@ class Doorbell:
         try:
             outcome.wake()
         except ENDS_PROGRAM as exc:
-            self._loop.call_soon(_raise, exc)
+            self.loop.call_soon(_raise, exc)
 
     # ------------------------------------------------------------------ for the task's machinery
 

@@ -1,4 +1,4 @@
-"""An agent that was stopped does not carry out waiting messages too late; its tasks for triggers."""
+"""An agent that was stopped carries no waiting message out too late; its tasks for triggers."""
 
 from __future__ import annotations
 
