@@ -137,7 +137,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
 
 @functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
 def _known_address(url: str, model: str | None, revision: int) -> Address:
-    """Return what a URL says; ``revision`` is that of the protocols it is read with."""
+    """Return the address that a URL says, by the protocols of this ``revision``."""
     return _read_address(url, model)
 
 
