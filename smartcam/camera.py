@@ -734,7 +734,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         return await self._query_application(self._limit(timeout, self.settings.request_timeout))
 
     @abc.abstractmethod
-    async def _query_application(self, timeout: float) -> int: ...
+    def _query_application(self, timeout: float) -> Coroutine[Any, Any, int]: ...
 
     async def query_status(self, *, timeout: float | None = None) -> Status:
         """Ask the camera for its status.

@@ -137,7 +137,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
 
 @functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
 def _known_address(url: str, model: str | None, revision: int) -> Address:
-    """Return the address of a URL; ``revision``: that of the protocols that read it."""
+    """Return the address of a URL, by the protocols of this ``revision``."""
     return _read_address(url, model)
 
 

@@ -153,7 +153,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
     "cell_file": (Teaching, "_check_written", lambda *_: 1 / 0),
     "gs1": (fuzz_cells, "elements", fuzz_cells.first_element),
-    "program_result": (fuzz_cells.EYES, "MAX_REASON_BYTES", 90),
+    "program_result": (fuzz_cells.INSPECTOR, "MAX_REASON_BYTES", 90),
     "spec": CUTS_TEXTS,
 }
 """A mistake for each target: what is replaced, and by what."""
