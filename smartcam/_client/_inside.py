@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
     from smartcam._client.deadline import DeadlineTimer
-    from smartcam._client.doorbell import Doorbell, Outcome, PlainDoorbell, make_doorbell
+    from smartcam._client.doorbell import Outcome, make_doorbell
     from smartcam._client.handshake import Session, attempt, names_of, remarks
     from smartcam._client.interpretation import (
         Interpretation,
@@ -35,12 +35,10 @@ __all__ = [
     "CameraState",
     "ClientCounters",
     "DeadlineTimer",
-    "Doorbell",
     "Interpretation",
     "Interpreted",
     "Listeners",
     "Outcome",
-    "PlainDoorbell",
     "Reason",
     "Session",
     "SessionRefusedError",
@@ -67,7 +65,7 @@ if not TYPE_CHECKING:
             "camera_state": "CameraState",
             "counters": "ClientCounters",
             "deadline": "DeadlineTimer",
-            "doorbell": "Doorbell Outcome PlainDoorbell make_doorbell",
+            "doorbell": "Outcome make_doorbell",
             "handshake": "Session attempt names_of remarks",
             "interpretation": "Interpretation Interpreted in_pixels localizations_of "
             "own_interpreter without_poses",

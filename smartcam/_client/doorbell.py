@@ -97,10 +97,7 @@ class Doorbell:
         return DirectFuture(self)
 
     def give(self, outcome: Outcome, value: object) -> None:
-        """Give an outcome its result: its task goes on at once, unless another task runs.
-
-        What ends the program is raised by the loop, as :meth:`deliver` does.
-        """
+        """Give an outcome its result: its task goes on at once, unless another task runs."""
         if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
             outcome.set_result(value)
             return

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from smartcam.fleet._agent import workers
 from smartcam.fleet._agent.agent import Agent
 from smartcam.fleet._agent.gate import Gate
-from smartcam.fleet._agent.workers import Workers
 from smartcam.fleet._bus import zenoh
 from smartcam.fleet._bus.bus import Data, Handle, MemoryEnd, Publisher
 from smartcam.fleet._bus.log import AgentLog
@@ -29,7 +27,6 @@ __all__ = [
     "ProgramName",
     "Publisher",
     "Standby",
-    "Workers",
     "decode",
     "decode_order",
     "decode_outcome",
@@ -37,6 +34,5 @@ __all__ = [
     "in_words",
     "plain",
     "renewal",
-    "workers",
     "zenoh",
 ]

@@ -1,16 +1,19 @@
-"""An agent that was stopped knows that what comes may have waited, and does nothing too late."""
+"""An agent that was stopped knows that what comes may have waited; its tasks for triggers."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import signal
+from functools import partial
 from typing import Any
 
 import pytest
 
 from smartcam.fleet._agent import pulse as _pulse
+from smartcam.fleet._agent import workers
 from smartcam.fleet._agent.pulse import Pulse
+from smartcam.fleet._agent.workers import Workers
 from smartcam.fleet._inside import Keys
 from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, until
 from tests.fleet.partner import partner
@@ -117,3 +120,95 @@ async def test_command_behind_a_stopped_agent_is_not_done_when_it_goes_on() -> N
             assert (await asyncio.to_thread(ask, 5.0))[0]["error"] == ""
         finally:
             await asyncio.to_thread(session.close)
+
+
+# ---------------------------------------------------------------------- workers
+
+
+async def turns(count: int = 3) -> None:
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+def in_the_loop(call: partial[None]) -> asyncio.Future[None]:
+    """Call something as the bus does: in the event loop, and in no task."""
+    loop = asyncio.get_running_loop()
+    called = loop.create_future()
+
+    def run() -> None:
+        call()
+        called.set_result(None)
+
+    loop.call_soon(run)
+    return called
+
+
+async def test_worker_that_waits_begins_its_work_at_once() -> None:
+    pool, said = Workers(), list[str]()
+
+    async def work(name: str) -> None:
+        said.append(f"{name} begins")
+        await asyncio.sleep(0)
+        said.append(f"{name} ends")
+
+    def begin(name: str) -> None:
+        pool.take().do(partial(work, name))
+        said.append(f"{name} was given")
+
+    await in_the_loop(partial(begin, "first"))
+    await turns()
+    assert said == ["first was given", "first begins", "first ends"]  # by the loop's next turn
+    await in_the_loop(partial(begin, "second"))
+    await turns()
+    assert said[3:] == ["second begins", "second was given", "second ends"]
+    tasks = pool.close()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert len(tasks) == 1  # one did both
+
+
+async def test_worker_that_is_cancelled_at_its_work_does_no_more() -> None:
+    pool = Workers()
+    never = asyncio.Event()
+    first = pool.take()
+    first.do(partial(wait, never))
+    await turns()
+    first.task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await first.task
+    second = pool.take()
+    assert second is not first
+    second.do(partial(asyncio.sleep, 0))
+    await turns()
+    assert pool.take() is second
+    second.task.cancel()
+    await asyncio.gather(second.task, return_exceptions=True)
+
+
+async def wait(event: asyncio.Event) -> None:
+    await event.wait()
+
+
+async def test_no_more_workers_are_kept_than_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "MAX_IDLE_WORKERS", 2)
+    pool, go = Workers(), asyncio.Event()
+    begun = [pool.take() for _ in range(5)]
+    for one in begun:
+        one.do(partial(wait, go))
+    await turns()
+    go.set()
+    await turns(6)
+    assert sum(one.task.done() for one in begun) == 3
+    idle = pool.close()
+    await asyncio.gather(*idle, return_exceptions=True)
+    assert len(idle) == 2
+    assert all(one.task.done() for one in begun)
+
+
+async def test_closed_workers_end_with_the_work_under_way() -> None:
+    pool, go = Workers(), asyncio.Event()
+    one = pool.take()
+    one.do(partial(wait, go))
+    await turns()
+    assert pool.close() == []
+    go.set()
+    await asyncio.wait_for(one.task, 1.0)

@@ -18,7 +18,7 @@ MAX_IDLE_WORKERS = 16
 """Largest number of workers that are kept for further work; others end with their work."""
 
 
-class Worker:
+class TriggerWorker:
     """A task that does one piece of work after another.
 
     Args:
@@ -55,13 +55,13 @@ class Workers:
     """The workers of an agent."""
 
     def __init__(self) -> None:
-        self._idle: list[Worker] | None = []  # None: closed
+        self._idle: list[TriggerWorker] | None = []  # None: closed
 
-    def take(self) -> Worker:
+    def take(self) -> TriggerWorker:
         """Return a worker that has nothing to do; give it work before the next turn of the loop."""
-        return self._idle.pop() if self._idle else Worker(self)
+        return self._idle.pop() if self._idle else TriggerWorker(self)
 
-    def keep(self, worker: Worker) -> bool:
+    def keep(self, worker: TriggerWorker) -> bool:
         """Keep a worker for further work; return False if it is not needed."""
         if self._idle is None or len(self._idle) >= MAX_IDLE_WORKERS:
             return False
