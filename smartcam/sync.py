@@ -554,18 +554,18 @@ class SyncFrameReader(SyncFrameReaderBase):
     """A reader of frames: ``for frame in frames``; as :class:`smartcam.frames.FrameReader`."""
 
     def statistics(self) -> ReaderStatistics:
-        """Return the account as it is now: :meth:`smartcam.frames.FrameReader.statistics`."""
+        """Return the current counts: :meth:`smartcam.frames.FrameReader.statistics`."""
         return self._do(self._reader.statistics)
 
     def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame, or wait for one that is not older than ``max_age``.
+        """Return the newest frame if it is not older than ``max_age``.
 
         As :meth:`smartcam.frames.FrameReader.newest`.
         """
         return self._wait(self._reader.newest, max_age=max_age, timeout=timeout)
 
     def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame, waiting or to come, whose exposure began after a moment.
+        """Return the first frame, from the waiting one on, whose exposure began after a moment.
 
         As :meth:`smartcam.frames.FrameReader.after`.
         """

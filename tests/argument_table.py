@@ -295,7 +295,6 @@ EmulatedFleet.__init__  scenarios: list, host: text, transport: choice or None,
 Recorder.__init__  path: text, overwrite: flag, pictures: flag
 CellCamera.program  application: application or name
 Inspection.payload  byte_order: choice, sequence: seed or None
-PartModel.bands_at  scale: not judged
 PartModel.from_outline  path: text, pixels_per_mm: number, name: text, bright: flag,
     unit: choice or None, layers: names
 PartModel.predicted_sigma  noise: number or None
@@ -383,6 +382,7 @@ ThreadedCamera.wait_received  what: integer, count: count, timeout: seconds
 What is "not judged" may be an odd value, or has a test of its own."""
 
 NOT_HERE: dict[str, str] = {
+    "only the search for parts calls it": "PartModel.bands_at",
     "the package makes these, or a function that is in the table": """
         ApplicationChanged CameraEvent Capabilities Connected Disconnected Histogram
         NoticeReceived Reconnected Statistics StatusChanged Quaternion AgentJoined AgentLeft

@@ -1,4 +1,4 @@
-"""An interpreter for a camera that names parts and gives their weights."""
+"""An interpreter for a camera that sends names and weights of parts."""
 
 from smartcam.interpreters import Reader
 

@@ -15,7 +15,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.messages import Request, Sender
 
 if TYPE_CHECKING:
-    from smartcam.conformance.client._runs import ClientRun, WireMessage
+    from smartcam.conformance.client._runs import ClientRun, RecordedMessage
 
 GRACE = 0.05
 """Seconds that a status may take to reach the client, which cannot know it earlier."""
@@ -111,7 +111,7 @@ def connects_first(run: ClientRun) -> str | None:
 
 def disconnects(run: ClientRun) -> str | None:
     """The client's last word is Disconnect."""
-    last: dict[str, WireMessage] = {}
+    last: dict[str, RecordedMessage] = {}
     for one in run.messages:
         if one.sender is Sender.CLIENT:
             last[one.peer] = one
@@ -181,7 +181,7 @@ def stops_first(run: ClientRun) -> str | None:
 
 def waits_for_switch(run: ClientRun) -> str | None:
     """The client gives no command between SwitchApplication and its answer."""
-    switching: WireMessage | None = None
+    switching: RecordedMessage | None = None
     for one in run.messages:
         if isinstance(one.message, m.SwitchApplication):
             switching = one
@@ -205,11 +205,11 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
     return None
 
 
-def _is_command(one: WireMessage) -> bool:
+def _is_command(one: RecordedMessage) -> bool:
     """Return True if a message is a command; queries and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 
 
-def _name(one: WireMessage) -> str:
+def _name(one: RecordedMessage) -> str:
     return one.hex if one.message is None else type(one.message).__name__

@@ -29,7 +29,7 @@ MAX_LINES = 40
 """Largest number of lines of the wire that a finding shows: the last ones."""
 
 
-class WireMessage(NamedTuple):
+class RecordedMessage(NamedTuple):
     """A message, or other bytes, on the wire."""
 
     time: float  # seconds since the scene began
@@ -66,11 +66,11 @@ class ClientRun:
     task: Task
     dialect: FramedDialect
     outcome: Outcome
-    messages: tuple[WireMessage, ...]
+    messages: tuple[RecordedMessage, ...]
     timeout: float
 
     @property
-    def requests(self) -> Iterator[tuple[int, WireMessage]]:
+    def requests(self) -> Iterator[tuple[int, RecordedMessage]]:
         """The client's messages, with their places in ``messages``."""
         return ((n, one) for n, one in enumerate(self.messages) if one.sender is Sender.CLIENT)
 
@@ -193,12 +193,12 @@ def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
     return merged
 
 
-def _message_of(dialect: FramedDialect, entry: LogEntry, began: float) -> WireMessage:
+def _message_of(dialect: FramedDialect, entry: LogEntry, began: float) -> RecordedMessage:
     data = entry.wire
     if data is None and entry.message_id is not None:
         payload = bytes.fromhex(entry.hex)
         data = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
-    return WireMessage(
+    return RecordedMessage(
         entry.time - began,
         Sender.CLIENT if entry.direction == "in" else Sender.CAMERA,
         entry.peer,
