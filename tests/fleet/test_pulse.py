@@ -184,6 +184,31 @@ async def test_worker_that_is_cancelled_at_its_work_does_no_more() -> None:
     await asyncio.gather(second.task, return_exceptions=True)
 
 
+async def test_worker_that_is_cancelled_as_its_work_ends_gets_no_other_work() -> None:
+    pool, done = Workers(), list[str]()
+    first = pool.take()
+
+    async def cancel_itself() -> None:
+        first.task.cancel()  # as a program's cancellation does that comes while the reply is sent
+
+    async def work() -> None:
+        done.append("second")
+
+    first.do(cancel_itself)
+    await turns(1)
+    pool.take().do(work)  # the first one waits, and has not noticed yet
+    await turns()
+    assert done == ["second"]
+    await asyncio.gather(first.task, return_exceptions=True)
+    third = pool.take()
+    third.task.cancel()
+    await asyncio.gather(third.task, return_exceptions=True)
+    pool.take().do(work)
+    await turns()
+    assert done == ["second", "second"]
+    await asyncio.gather(*pool.close(), return_exceptions=True)
+
+
 async def wait(event: asyncio.Event) -> None:
     await event.wait()
 

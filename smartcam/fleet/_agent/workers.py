@@ -58,8 +58,15 @@ class Workers:
         self._idle: list[TriggerWorker] | None = []  # None: closed
 
     def take(self) -> TriggerWorker:
-        """Return a worker that has nothing to do; give it work before the next turn of the loop."""
-        return self._idle.pop() if self._idle else TriggerWorker(self)
+        """Return a worker that has nothing to do; give it work before the next turn of the loop.
+
+        A worker that was cancelled after its work, or at its end, would never begin the next one.
+        """
+        while self._idle:
+            worker = self._idle.pop()
+            if not worker.task.done() and not worker.task.cancelling():
+                return worker
+        return TriggerWorker(self)
 
     def keep(self, worker: TriggerWorker) -> bool:
         """Keep a worker for further work; return False if it is not needed."""
