@@ -42,7 +42,7 @@ class Doorbell:
     __slots__ = ("_asyncio_future_blocking", "_context", "_wake", "due", "loop")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.loop = loop
+        self.loop: asyncio.AbstractEventLoop = loop
         # outcomes of the present delivery; None: outcomes wake by way of the loop
         self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class State(enum.Enum):
     """The state of a link."""
 
-    __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
+    if not TYPE_CHECKING:
+        __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
 
     IDLE = "idle"
     """Open, without a session."""

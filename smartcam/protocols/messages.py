@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 from smartcam.models import Status
 
@@ -66,7 +66,8 @@ __all__ = [
 class Sender(enum.Enum):
     """The side that sends a message."""
 
-    __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
+    if not TYPE_CHECKING:
+        __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
 
     CLIENT = "client"
     CAMERA = "camera"
