@@ -278,7 +278,7 @@ LIMITS = (
     "recording._recorder.CLOSE_TIMEOUT",
     "conformance.client._tasks.MAX_OUTPUT_BYTES",
     "conformance.client._runs.MAX_LINES",
-    "conformance.camera._wire.MAX_BODY",
+    "conformance.camera._wire.MAX_BODY_BYTES",
     "conformance.camera._raw_client.MAX_HEARD_BYTES",
     "conformance.camera._raw_client.MAX_TRAIL",
     "conformance.camera._raw_client.FAREWELL",

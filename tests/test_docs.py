@@ -295,7 +295,7 @@ def test_documents_build_without_warnings(tmp_path: Path) -> None:
 def test_reference_tells_the_fields_of_a_returned_class_that_no_module_exports() -> None:
     lines = ["Return the depth of a region."]
     module_of("conf")._tell_returned(None, "function", "", region_depth, None, lines)
-    assert "``RegionDepth``: The depth of a region, and its errors." in lines
+    assert "``RegionDepth``: The depth of a region, and its standard deviations." in lines
     assert any(line.startswith("    sigma: standard deviation of ``median``") for line in lines)
 
 

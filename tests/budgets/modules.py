@@ -78,7 +78,7 @@ PARSERS_OF: dict[str, str] = {
     "recording._mcap.form": "recordings",
     "recording._pcap": "recordings",
     "recording._mcap.records": "recordings",
-    "recording._pictures.messages": "recordings",
+    "recording._pictures.protobuf": "recordings",
     "recording._replays.lines": "recordings",
     "recording._replays.schedule": "recordings",
     "ros1._json_messages": "rosbridge: operations",

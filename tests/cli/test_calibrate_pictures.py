@@ -172,7 +172,7 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_reports_it(
     with emulators(tmp_path, ()) as urls:
         done = calibrating(tmp_path, lines, urls[0], "--wizard", "sheet", *files[:4])
     assert (
-        "its protocol sends no pictures; expected one that does, or --pictures FOLDER"
+        "its protocol sends no pictures; expected one with them, or --pictures FOLDER"
         in (done.lines[-2]["errors"]["base"])
     )
 
@@ -273,7 +273,11 @@ def test_calibrate_with_options_that_cannot_work_reports_it(
 
 @pytest.mark.parametrize(
     ("content", "text"),
-    [("{", "not valid JSON"), ("[]", "expected what smartcam sheet"), ("{}", "expected a kind of")],
+    [
+        ("{", "not valid JSON"),
+        ("[]", "expected a file of smartcam sheet"),
+        ("{}", "expected a kind of"),
+    ],
 )
 def test_calibrate_with_a_target_that_is_none_reports_it(
     tmp_path: Path, content: str, text: str

@@ -90,7 +90,7 @@ def test_nobody_is_told_if_nobody_wants_to_know(caplog: pytest.LogCaptureFixture
     gone.ready("")
     gone.stopping()
     gone.close()
-    assert caplog.text.count("systemd cannot be told") == 1
+    assert caplog.text.count("reports to systemd by NOTIFY_SOCKET fail") == 1
 
 
 def test_the_watchdog_is_for_the_process_that_systemd_means() -> None:
