@@ -73,6 +73,10 @@ GROWTH_SIGMA_PX: Final = 0.3
 """Standard deviation of what all edges lie nearer to their brighter side, pixels: too much light,
 or a camera that tells bright levels less well, makes what is bright larger."""
 
+CHANGE_SIGNIFICANCE: Final = 3.0
+"""Standard deviations by which the edges must show a change of the part, or there is none. With 1.0
+a bolt's errors were 1.32 times the bound, since each change that is fitted costs certainty."""
+
 FIRST_CHANGED_STEP: Final = 2
 """Number of the first step that fits what may differ from the taught part, too."""
 
@@ -433,7 +437,7 @@ def _changed(
         return None
     move, covariance = solved
     by_edges = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
-    beyond = (off + move[3:]) ** 2 - chi_square * by_edges
+    beyond = (off + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
     none = (beyond <= 0) & np.isfinite(sigmas)
     known = np.minimum(np.sqrt(np.maximum(beyond, 1e-12)), sigmas)
     known = np.where(np.isfinite(sigmas), known, sigmas)
