@@ -378,7 +378,7 @@ ThreadedCamera.received  what: integer, count: count, timeout: seconds
 ThreadedCamera.run  function: function
 ThreadedCamera.wait_received  what: integer, count: count, timeout: seconds
 """)
-"""Of each public callable what its arguments are; positional and keyword alike.
+"""The kinds of arguments of each public callable; positional and keyword alike.
 What is "not judged" may be an odd value, or has a test of its own."""
 
 NOT_HERE: dict[str, str] = {

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 SOON = "timeout=0.3"
 """Seconds of real time that a test waits for a silent server."""
 LATER = "timeout=2"
-"""The same for a server that answers at first, even on a slow machine."""
+"""Seconds for a server that answers at first and is silent then, even on a slow machine."""
 
 
 def threads() -> set[threading.Thread]:

@@ -86,7 +86,7 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @property
     def local_address(self) -> str:
-        """This host's address for the camera."""
+        """Address of this host, as the camera reaches it."""
         return str(self._name("sockname")[0])
 
     @property
