@@ -88,14 +88,14 @@ napoleon_custom_sections = ["Cancellation", "Source"]
 ROOT = Path(__file__).parents[1]
 
 DOES = {
-    "say": "puts",
-    "hear": "subscribes",
-    "ask": "queries",
+    "put": "puts",
+    "subscribe": "subscribes",
+    "query": "queries",
     "answer": "answers queries",
-    "appear": "has tokens",
-    "watch": "looks for tokens",
+    "hold_token": "has tokens",
+    "watch_tokens": "looks for tokens",
 }
-"""What a right of a role is, in the engine's words."""
+"""Kinds of use in Zenoh's words."""
 
 WORDS = {"I": "UINT32", "H": "UINT16"}
 """A dialect's ordinary integers."""

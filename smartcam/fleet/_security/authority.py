@@ -97,8 +97,8 @@ def make_certificates(
         for name in several:
             if check_word(name, role) == AUTHORITY or names.setdefault(name, role) != role:
                 raise ConfigurationError(f"certificates: {name} is taken: expected another name")
-    said = [*dict.fromkeys(hosts)]
-    for host in said:
+    unique_hosts = [*dict.fromkeys(hosts)]
+    for host in unique_hosts:
         if not HOST.fullmatch(host):
             raise ConfigurationError(f"certificates: {host!r:.80} is no name or address of a host")
     authority = _Authority.of(folder)
@@ -113,7 +113,7 @@ def make_certificates(
                 f"for the {role}, or delete {folder / name}"
             )
     return [
-        authority.make(role, name, said if name in names else [], lifetime)
+        authority.make(role, name, unique_hosts if name in names else [], lifetime)
         for name, role in sorted(known.items())
     ]
 

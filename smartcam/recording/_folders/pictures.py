@@ -90,7 +90,12 @@ class FleetPictures:
         delays, told = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
-            if host is None or host.frames.closed or host.frames.make is None or host.frames.told:
+            if (
+                host is None
+                or host.frames.closed
+                or host.frames.make is None
+                or host.frames.reports_pictures
+            ):
                 return
             why = "they ended"
             try:
