@@ -209,9 +209,9 @@ class BridgeLink:
 
     async def _tell_lost(self, reason: str) -> bool:
         """Log that the link is lost; return True if there was one."""
-        told_before = self.failure
+        previous_failure = self.failure
         was = await self.end(f"{self.url}: {reason}")
-        level = logging.DEBUG if told_before == self.failure else logging.WARNING
+        level = logging.DEBUG if previous_failure == self.failure else logging.WARNING
         logger.log(level, "%s: no rosbridge: %s", self.url, reason)
         return was
 

@@ -92,7 +92,7 @@ class RosbridgeNode(NamedNode):
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "publish": self._published,
-            "status": self._told,
+            "status": self._log_status,
             "service_response": self._answered,
         }
 
@@ -179,7 +179,7 @@ class RosbridgeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
         publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
-        if self._told_absent(publisher.exists, name, kind.name):
+        if self._log_if_absent(publisher.exists, name, kind.name):
             self._outbox.add(publisher.lane)
             self.say(encoded(publisher.advertisement()))
         return publisher
@@ -198,7 +198,7 @@ class RosbridgeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         heard = RosbridgeSubscription(self, name, kind, qos)
-        if self._told_absent(heard.exists, name, kind.name):
+        if self._log_if_absent(heard.exists, name, kind.name):
             self._subscriptions.append(heard)
             heard.ask()
         return heard
@@ -231,7 +231,7 @@ class RosbridgeNode(NamedNode):
         kind, name = self.types.service(type), self._new_name(service, "service", self._services)
         served = RosbridgeService(self, name, kind, handler, timeout)
         self._services[name] = served
-        if self._told_absent(served.exists, name, kind.name):
+        if self._log_if_absent(served.exists, name, kind.name):
             self._new.append(served)
             self._change()
         return served
@@ -242,7 +242,7 @@ class RosbridgeNode(NamedNode):
             raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
         return full
 
-    def _told_absent(self, exists: bool, name: str, kind: str) -> bool:
+    def _log_if_absent(self, exists: bool, name: str, kind: str) -> bool:
         if not exists:
             logger.info("%s: left out, ROS 1 has no %s", name, kind)
         return exists
@@ -418,8 +418,8 @@ class RosbridgeNode(NamedNode):
             if subscription.name == operation.get("topic"):
                 subscription.take(operation.get("msg"))
 
-    def _told(self, operation: dict[str, Any]) -> None:
+    def _log_status(self, operation: dict[str, Any]) -> None:
         level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)
         about = f" ({operation['id']})" if operation.get("id") else ""
-        said = operation.get("msg")
-        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, said)
+        text = operation.get("msg")
+        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, text)

@@ -53,9 +53,9 @@ class RosbridgeSubscription(TopicReader[object]):
         operation = {"op": "unsubscribe", "topic": self.name, "id": self._id}
         self._node.say(encoded(operation))
 
-    def take(self, said: object) -> None:
+    def take(self, message: object) -> None:
         """Handle a message from the bridge."""
-        self._queue.offer(said, 0.0, 0)
+        self._queue.offer(message, 0.0, 0)
 
     @property
     def _id(self) -> str:

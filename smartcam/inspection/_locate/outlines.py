@@ -156,14 +156,14 @@ def _dxf_lines(
         raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: expected DXF")
     try:
         drawing = ezdxf.readfile(path)
-        said = unit or DXF_UNITS.get(int(drawing.header.get("$INSUNITS", 0)))
-        if said is None:
+        unit_name = unit or DXF_UNITS.get(int(drawing.header.get("$INSUNITS", 0)))
+        if unit_name is None:
             raise TeachingError(
                 TeachingTrouble.UNIT,
                 f"{path}: its header says no unit that is known here: say unit, one of "
                 f"{', '.join(MM)}",
             )
-        scale = MM[said] * pixels_per_mm
+        scale = MM[unit_name] * pixels_per_mm
         for entity in disassemble.recursive_decompose(drawing.modelspace()):
             if layers and entity.dxf.layer not in layers:
                 continue

@@ -73,16 +73,16 @@ class Symmetry:
         """Return the sentence that people are told."""
         if self.fold == 0:
             return "round: it has no angle"
-        said = "has one angle"
+        sentence = "has one angle"
         if self.fold > 1:
-            said = f"the same every {360 / self.fold:g} degrees: its angle is told modulo that"
+            sentence = f"the same every {360 / self.fold:g} degrees: its angle is told modulo that"
         if self.alike:
             angle, share = self.alike[0]
-            said += (
+            sentence += (
                 f"; turned by {math.degrees(angle):.0f} degrees, {100 * share:.0f} % of it are "
                 "the same: what differs must be in sight"
             )
-        return said
+        return sentence
 
 
 def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Symmetry, Array]:

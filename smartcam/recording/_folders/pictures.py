@@ -87,7 +87,7 @@ class FleetPictures:
 
     async def _record(self, track: CameraTrack) -> None:
         """Record while the agent has the camera and pictures of it."""
-        delays, told = RETRY.delays(), ""
+        delays, logged = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
             if (
@@ -100,14 +100,14 @@ class FleetPictures:
             why = "they ended"
             try:
                 if await self._take_all(track, await host.frames.source()):
-                    delays, told = RETRY.delays(), ""
+                    delays, logged = RETRY.delays(), ""
             except (SmartCamError, OSError) as exc:
                 why = str(exc)
             except Exception as exc:  # a driver may be a plug-in's
                 logger.exception("%s ! its pictures are not recorded", track.camera)
                 why = repr(exc)
-            if why != told and not host.frames.closed:
-                told = why
+            if why != logged and not host.frames.closed:
+                logged = why
                 self._tell(track, why)
             await asyncio.sleep(next(delays))
 

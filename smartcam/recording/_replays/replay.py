@@ -117,7 +117,7 @@ class _Track:
     # place of the client's numbers in containers; None: containers keep their own numbers
     numbers: _Numbers | None = None
     # function that is called with each recorded container when it is sent
-    told: Callable[[bytes], None] = lambda _: None
+    on_picture: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
         """End the inspection: return its container; None if it sends nothing."""
@@ -126,7 +126,7 @@ class _Track:
             return None
         containers = take.containers
         for data in containers:
-            self.told(data)
+            self.on_picture(data)
         if self.numbers is not None:
             containers = [self.numbers.put(data, number, byte_order) for data in containers]
         first, *self.rest = containers
@@ -270,7 +270,7 @@ class ReplayedCamera(EmulatedCamera):
 
         shown = ReplayedPictures(recording, camera, self.plan.applications, self.speed)
         for number, track in self._tracks.items():
-            track.told = partial(shown.given, number)
+            track.on_picture = partial(shown.given, number)
         self._pictures = None if shown.first is None else shown
         return self._pictures
 
@@ -368,7 +368,7 @@ class ReplayedCamera(EmulatedCamera):
     def _begin_unasked(self, track: _Track, take: Take) -> None:
         if not track.waits:
             for data in take.containers:
-                track.told(data)
+                track.on_picture(data)
             self._send(take.containers)
         elif self.device.trigger():
             self._begin(track, take)

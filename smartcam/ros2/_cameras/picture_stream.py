@@ -51,7 +51,7 @@ class HeardPictures(Generic[Item]):
         self.frames: int = 0
         self._name, self._publishers = name, publishers
         self._read, self._publish = read, publish
-        self._told = ""
+        self._last_warning = ""
         self._woken = asyncio.Event()
         self._watches: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
@@ -143,12 +143,12 @@ class HeardPictures(Generic[Item]):
             self._tell(str(exc))
             return
         self.frames += 1
-        self._told = ""
+        self._last_warning = ""
 
     def _tell(self, text: str) -> None:
         """Log an error, once until pictures come again."""
-        if text != self._told:
-            self._told = text
+        if text != self._last_warning:
+            self._last_warning = text
             logger.warning("%s ! %s", self._name, text)
 
 

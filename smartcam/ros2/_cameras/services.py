@@ -137,7 +137,7 @@ class CameraServices:
             try:
                 return {"error": "", **await do(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
-                return {"error": self._told(exc)}
+                return {"error": self._error_text(exc)}
 
         return handler
 
@@ -150,11 +150,11 @@ class CameraServices:
             try:
                 return {"success": True, "message": await do(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
-                return {"success": False, "message": self._told(exc)}
+                return {"success": False, "message": self._error_text(exc)}
 
         return handler
 
-    def _told(self, error: Exception) -> str:
+    def _error_text(self, error: Exception) -> str:
         if not isinstance(error, SmartCamError):
             logger.error("%s ! a service failed", self._node.full_name, exc_info=error)
             return error_text(RuntimeError(f"{type(error).__name__}: {error}"))

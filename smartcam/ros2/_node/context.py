@@ -236,7 +236,7 @@ class RosContext:
         self._said_directly += 1
         return self._said_directly <= MAX_DIRECT
 
-    def send_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+    def send_later(self, owner: object, send: Callable[[], None], lane: str) -> None:
         """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:
@@ -244,9 +244,9 @@ class RosContext:
         with self._lock:
             self._long[owner] += 1
             self._in_lane[lane] += 1
-        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner, lane))
+        thread.submit(quietly, send).add_done_callback(lambda _: self._sent(owner, lane))
 
-    def _said(self, owner: object, lane: str) -> None:
+    def _sent(self, owner: object, lane: str) -> None:
         with self._lock:
             self._in_lane[lane] -= 1
             if lane == "short":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 
-def _texts(package: str, kind: str, said: dict[str, str]) -> dict[str, str]:
+def _texts(package: str, kind: str, short: dict[str, str]) -> dict[str, str]:
     """Return texts of files from these, in which ``;`` ends a line, and ``|`` a request."""
     return {
         f"{package}/{kind}/{name}": "\n".join(
@@ -13,7 +13,7 @@ def _texts(package: str, kind: str, said: dict[str, str]) -> dict[str, str]:
             for line in text.replace("|", ";|;").split(";")
             if (part := line.strip())
         )
-        for name, text in said.items()
+        for name, text in short.items()
     }
 
 
