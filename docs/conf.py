@@ -300,7 +300,7 @@ LIMITS = (
     "web._emulator.MAX_NAMES",
     "web._serialize.MAX_HEX_BYTES",
     "web._serialize.MAX_VALUES_BYTES",
-    "web._serialize.MAX_TOLD_BYTES",
+    "web._serialize.MAX_REPLY_BYTES",
     "web._serialize.MAX_LISTED",
     "web._feed.MAX_LOG_NEWS",
     "web._feed.MAX_FAULTS_TOLD",

@@ -31,7 +31,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 FLUSH_TIMEOUT = 1.0
 """Seconds to send waiting operations at the end."""
 ASK_TIMEOUT = 5.0
-"""Seconds of the timeout of a call by smartcam."""
+"""Seconds that the bridge may take to answer a call by smartcam."""
 REPEAT_INTERVAL = 10.0
 """Seconds between two repetitions of a latched message on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
@@ -162,7 +162,7 @@ class RosbridgeNode(NamedNode):
         while self._changing is not None:
             await asyncio.wait((self._changing,))
 
-    # ------------------------------------------------------------------ what it has
+    # ------------------------------------------------------------------ topics and services
 
     def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgePublisher:
         """Publish on a topic.
@@ -283,7 +283,7 @@ class RosbridgeNode(NamedNode):
         self._change()
 
     def say(self, parts: tuple[Part, ...]) -> None:
-        """Send an operation to the connected bridge; a later one gets all advertisements."""
+        """Send an operation, if the bridge is connected; a later bridge gets all advertisements."""
         if self.connected:
             self._outbox.say(parts)
 
@@ -332,7 +332,7 @@ class RosbridgeNode(NamedNode):
                     self._outbox.wake()
 
     def _change(self) -> None:
-        """Withdraw and advertise services one after another, those of this turn together."""
+        """Start to withdraw and advertise services, in one task for all of a turn of the loop."""
         if self.connected and self._changing is None and (self._new or self._leaving):
             self._changing = self.begin(self._change_services())
             self._changing.add_done_callback(self._changed)

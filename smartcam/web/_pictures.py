@@ -26,7 +26,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.web._sockets import PageSocket, check_websocket
-from smartcam.web._streams import SLOW
+from smartcam.web._streams import SHOW_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -298,13 +298,13 @@ class Viewer(PageSocket):
         """Send a picture after its JSON, and wait until it is shown; TimeoutError: too late."""
         head = json.dumps({"frame": frame, "account": account}).encode()
         self._shown.clear()
-        async with asyncio.timeout(SLOW):
+        async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_bytes(len(head).to_bytes(4, "little") + head + picture)
             self._sent += 1
             await self._shown.wait()
 
     async def _send(self, value: dict[str, Any]) -> None:
-        async with asyncio.timeout(SLOW):
+        async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_str(json.dumps(value))
 
 

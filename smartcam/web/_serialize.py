@@ -33,7 +33,7 @@ MAX_VALUES_BYTES = 2048
 """Largest number of bytes of a result that a list of log entries shows decoded; a single entry has
 no bound."""
 
-MAX_TOLD_BYTES = 1 << 18
+MAX_REPLY_BYTES = 1 << 18
 """Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
 faults: the list ends there, so an answer stays a few megabytes of JSON."""
 
@@ -120,14 +120,14 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 
 
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
-    """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_TOLD_BYTES.
+    """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_REPLY_BYTES.
 
     ``next`` is the serial to go on with, ``missed`` the number of dropped entries.
     """
     entries, count = emulator.log.since(since, limit)
     first = min(max(since, count - len(emulator.log)), count)
     listed: list[dict[str, Any]] = []
-    room = MAX_TOLD_BYTES
+    room = MAX_REPLY_BYTES
     for serial, entry in enumerate(entries, first):
         listed.append(camera_entry(serial, entry, emulator))
         room -= min(listed[-1]["size"], MAX_VALUES_BYTES)
@@ -236,8 +236,8 @@ def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any
 
 
 def _as_many(faults: Iterable[BaseFault], limit: int) -> int:
-    """Return the number of faults shown: ``limit``, or MAX_TOLD_BYTES of inserted data."""
-    count, room = 0, MAX_TOLD_BYTES
+    """Return the number of faults shown: ``limit``, or MAX_REPLY_BYTES of inserted data."""
+    count, room = 0, MAX_REPLY_BYTES
     for fault in faults:
         room -= len(getattr(fault, "data", None) or b"")
         if count == limit or room < 0:

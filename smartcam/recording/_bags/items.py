@@ -1,4 +1,4 @@
-"""Make a bag's messages from the items that a client received, or of a recording."""
+"""Make a bag's messages from a client's or a recording's items."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
-_CONTAINERS = 64
+_MAX_CONTAINERS = 64
 """Largest number of containers that are kept until their results come: many come in one burst."""
 
 UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
@@ -218,7 +218,7 @@ class _BagCamera:
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
         self._status = Topic(f"/{self.title}/status", STATUS_TYPE, LATCHED)
         self._last_health: object = None  # contents of the last diagnostics
-        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
+        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_MAX_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
         """Keep the state that an event reports."""

@@ -58,7 +58,7 @@ class ReplayedPictures:
         self.sinks: set[FrameSink] = set()
         self._speed, self._began = speed, 0.0
         self._given: collections.Counter[tuple[int, bytes]] = collections.Counter()
-        self._pictures = _told_apart(recording, camera, applications)
+        self._pictures = _by_application(recording, camera, applications)
         self.first: Frame | None = next(
             (one.frame for some in self._pictures.values() for one in some if one is not None), None
         )
@@ -91,7 +91,7 @@ class ReplayedPictures:
             sink.frame(self.shown)
 
 
-def _told_apart(
+def _by_application(
     recording: Recording, camera: str, applications: Mapping[int, TakeList]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
     """Return the pictures of results with the same bytes, if their order is certain."""

@@ -208,7 +208,7 @@ class _ReplayStep(NamedTuple):
     bits: Status = Status(0)  # bits of a status
     data: bytes = b""  # bytes of a container
     # time in the record, seconds since 1970; ``at`` may be later, since times never go back
-    told_at: float | None = None
+    recorded_at: float | None = None
 
 
 _PLAIN = {
@@ -226,7 +226,8 @@ def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
     return [
         step._replace(at=max(step.at, at))
         for step in steps
-        if (step.at if step.told_at is None else step.told_at) >= at or step.what not in single
+        if (step.at if step.recorded_at is None else step.recorded_at) >= at
+        or step.what not in single
     ]
 
 
@@ -289,7 +290,7 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
             ) from exc
         if step is None:
             continue
-        step = step._replace(told_at=item.at.timestamp())
+        step = step._replace(recorded_at=item.at.timestamp())
         size += len(step.data)
         if size > MAX_REPLAY_BYTES:
             raise RecordingError(
@@ -373,7 +374,7 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
         at = step.at + lacks if step.what in _BY_AGENT else step.at
         if step.what is not _What.TRIGGER:
             at = last = max(at, last)
-        found.append(step._replace(at=at, told_at=step.at))
+        found.append(step._replace(at=at, recorded_at=step.at))
     return found
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._client._inside import in_pixels
 from smartcam._json import object_text
-from smartcam._thesis import MAX_TIMEOUT, THESIS, said_spec
+from smartcam._thesis import MAX_TIMEOUT, THESIS, spec_of_text
 from smartcam._thesis_calibration import CALIBRATION
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, SmartCamError
@@ -187,7 +187,7 @@ class CameraServices:
 
     async def _trigger_results(self, request: Any) -> dict[str, Any]:
         camera = self._camera
-        wanted, spec = request.results_per_trigger or 1, said_spec(request.interpret_as)
+        wanted, spec = request.results_per_trigger or 1, spec_of_text(request.interpret_as)
         self._check(request, wanted, spec)
         results = await camera.trigger(
             request.application_id or None,

@@ -33,7 +33,7 @@ AFTER_ERROR = 0.05
 EXIT_TIMEOUT = 2.0
 """Seconds for which the end of the program waits for a node that was not closed."""
 
-MAX_TOLD = 100
+MAX_LOGGED_TEXTS = 100
 """Largest number of remembered errors of a spinning thread, each of which is logged once."""
 
 
@@ -254,7 +254,7 @@ class SpunNode:
     def _tell_error(self, error: Exception) -> None:
         text = f"{type(error).__name__}: {error!s:.300}"
         closed = type(error).__name__ == "InvalidHandle"
-        if text not in self._logged and len(self._logged) < MAX_TOLD:
+        if text not in self._logged and len(self._logged) < MAX_LOGGED_TEXTS:
             self._logged.add(text)
             level = logging.DEBUG if closed else logging.WARNING
             logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)

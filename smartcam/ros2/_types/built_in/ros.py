@@ -6,7 +6,7 @@ from typing import Final
 
 
 def _texts(package: str, kind: str, short: dict[str, str]) -> dict[str, str]:
-    """Return texts of files from these, in which ``;`` ends a line, and ``|`` a request."""
+    """Return texts of files; in short texts ``;`` ends a line, and ``|`` ends a request."""
     return {
         f"{package}/{kind}/{name}": "\n".join(
             "---" if part == "|" else part
