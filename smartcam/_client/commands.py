@@ -133,8 +133,8 @@ class Commands:
             ResponseTimeoutError: no answer, or the camera was busy all the time.
         """
         requests = self._requests
-        if requests.owes(m.SwitchAnswer):
-            await requests.await_owed(m.SwitchAnswer, _QUERY, deadline)
+        if requests.is_pending(m.SwitchAnswer):
+            await requests.await_pending(m.SwitchAnswer, _QUERY, deadline)
         while True:
             answer = await requests.ask(_QUERY, m.QueryAnswer, deadline)
             if requests.is_done(m.Query, answer):

@@ -306,7 +306,7 @@ class FleetCamera(Camera[ValueT]):
         loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
-        why: object = "there was none yet"
+        why: object = "none yet"
         try:
             async with asyncio.timeout_at(deadline + grace(timeout)):
                 while True:
@@ -329,7 +329,7 @@ class FleetCamera(Camera[ValueT]):
                         return
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"{self.name}: no session within {timeout:g} s; the last one: "
+                f"{self.name}: no session within {timeout:g} s; the last error: "
                 f"{self._trouble or why}",
                 waited=timeout,
             ) from exc
