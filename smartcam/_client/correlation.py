@@ -300,7 +300,7 @@ class Correlation:
         self.satisfied = self.doubted = False
         self._last = None
 
-    def heard(self) -> None:
+    def note_query_answered(self) -> None:
         """Note that all earlier messages are received, since a later Query is answered.
 
         A trigger without a sign by now was not taken: it will have no result.

@@ -295,12 +295,10 @@ class Requests:
             ResponseTimeoutError: the answer did not come; the link is given up if its own time is
                 over too.
         """
-        while self._waits.is_pending(
-            key
-        ):  # a trigger may have sent the next Query before this goes on
-            owed = self._waits.pending_answer(key)
+        while self._waits.is_pending(key):  # a trigger may send the next Query meanwhile
+            answer = self._waits.pending_answer(key)
             try:
-                await self._take_answer(owed, deadline)
+                await self._take_answer(answer, deadline)
             except TimeoutError as exc:
                 error = self._unsent(message)
                 self._give_up_overdue(key, error)

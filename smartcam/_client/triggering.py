@@ -214,7 +214,7 @@ class Triggers:
         features = connection.features
         if features.polled:
             await self._status.refresh(deadline)
-            correlation.heard()
+            correlation.note_query_answered()
         if state.bits & _SYSTEM_ERROR:
             raise self._fault()
         if request.input_data is not None and self._results.input_in_doubt:
@@ -230,14 +230,14 @@ class Triggers:
             await self._status.demand(deadline)
             await self._requests.fence(deadline)  # a status has come by then, or is lost again
             self._doubtful = None
-            correlation.heard()
+            correlation.note_query_answered()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
         # an older result shows by its number if each container has one
         decided = numbering is not None and numbering.always
         if correlation.doubted:  # the trigger before may not show in the status yet
             await self._requests.fence(deadline)
-            correlation.heard()
+            correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         waited = False  # in line with Queries, so that neither kind delays the other

@@ -181,7 +181,7 @@ class RosbridgeNode(NamedNode):
         publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
         if self._log_if_absent(publisher.exists, name, kind.name):
             self._outbox.add(publisher.lane)
-            self.say(encoded(publisher.advertisement()))
+            self.send(encoded(publisher.advertisement()))
         return publisher
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgeSubscription:
@@ -261,7 +261,7 @@ class RosbridgeNode(NamedNode):
             del self._publishers[end.name]
             if end.exists:
                 self._outbox.remove(end.lane)
-                self.say(encoded({"op": "unadvertise", "topic": end.name}))
+                self.send(encoded({"op": "unadvertise", "topic": end.name}))
             return
         del self._services[end.name]
         end.end_turn()
@@ -282,10 +282,10 @@ class RosbridgeNode(NamedNode):
         self._new.append(service)
         self._change()
 
-    def say(self, parts: tuple[Part, ...]) -> None:
+    def send(self, parts: tuple[Part, ...]) -> None:
         """Send an operation, if the bridge is connected; a later bridge gets all advertisements."""
         if self.connected:
-            self._outbox.say(parts)
+            self._outbox.add_operation(parts)
 
     def wake(self) -> None:
         """Wake the task that sends, since a message waits."""
@@ -300,13 +300,13 @@ class RosbridgeNode(NamedNode):
 
     # ------------------------------------------------------------------ events of the link
 
-    def came(self) -> None:
+    def on_connected(self) -> None:
         """Advertise everything to a new bridge."""
         self._tell_change()
         for publisher in self._publishers.values():
             if publisher.exists:
-                self.say(encoded(publisher.advertisement()))
-                publisher.lane.say_again()
+                self.send(encoded(publisher.advertisement()))
+                publisher.lane.repeat()
         for subscription in self._subscriptions:
             subscription.ask()
         self.begin(self._repeat_shared())
@@ -328,7 +328,7 @@ class RosbridgeNode(NamedNode):
             await asyncio.sleep(REPEAT_INTERVAL)
             for publisher in self._publishers.values():
                 if publisher.exists and not publisher.name.startswith(within):
-                    publisher.lane.say_again()
+                    publisher.lane.repeat()
                     self._outbox.wake()
 
     def _change(self) -> None:
@@ -364,7 +364,7 @@ class RosbridgeNode(NamedNode):
         self._asked[asked["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
-                self.say(encoded(asked))
+                self.send(encoded(asked))
                 return await answer
         except TimeoutError:
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
@@ -377,7 +377,7 @@ class RosbridgeNode(NamedNode):
         if answer is not None and not answer.done():
             answer.set_result(operation)
 
-    def heard(self, operation: dict[str, Any]) -> None:
+    def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation of the bridge."""
         hear = self._hears.get(operation["op"])
         if hear is None:
@@ -385,7 +385,7 @@ class RosbridgeNode(NamedNode):
         else:
             hear(operation)
 
-    async def lost(self, was: bool) -> None:
+    async def on_lost(self, was: bool) -> None:
         """End calls and tasks for a lost bridge."""
         if self._running is not None and was:
             self._tell_change()
@@ -409,7 +409,7 @@ class RosbridgeNode(NamedNode):
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
-            self.say(encoded(refusal))
+            self.send(encoded(refusal))
         elif service.ready:  # otherwise the bridge aborts the call
             service.call(identity, operation.get("args"))
 

@@ -164,10 +164,10 @@ class RosbridgeService:
     def _respond(self, turn: int, parts: tuple[Part, ...]) -> None:
         if turn == self._turn:
             self._responded = asyncio.get_running_loop().time()
-            self._node.say(parts)
+            self._node.send(parts)
 
     def _send(self, operation: dict[str, Any]) -> None:
-        self._node.say(encoded({**operation, "service": self.name}))
+        self._node.send(encoded({**operation, "service": self.name}))
 
 
 def error_field(kind: MessageType) -> str:
