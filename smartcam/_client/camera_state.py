@@ -122,7 +122,7 @@ class CameraState:
         return self.statuses_received < self._statuses_due
 
     def status_asked(self, now: float, count: int = 1) -> None:
-        """Note requests for the status: so many more answers are pending."""
+        """Note ``count`` requests for the status, whose answers are pending."""
         self.status_asked_at = now
         self._statuses_due = max(self._statuses_due, self.statuses_received) + count
 

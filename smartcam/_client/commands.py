@@ -220,8 +220,8 @@ class Commands:
         while requests.is_busy(answer):
             await self._status.pause(deadline, f"the busy camera to load {application}")
             answer = await requests.ask(request, m.SwitchAnswer, deadline)
-        told = answer.application in self._connection.dialect.application_ids
-        return answer.code, answer.application if told else self._state.active
+        is_known = answer.application in self._connection.dialect.application_ids
+        return answer.code, answer.application if is_known else self._state.active
 
     def load_request(self, application: int | str) -> m.Request:
         """Return the request that loads an application; send nothing.

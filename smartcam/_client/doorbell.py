@@ -168,7 +168,7 @@ class DirectFuture(Generic[T]):
         """Make the task go on with a result.
 
         Raises:
-            asyncio.InvalidStateError: it is done.
+            asyncio.InvalidStateError: the outcome is set already.
         """
         if self._done:
             raise asyncio.InvalidStateError("the outcome is set already")
@@ -183,7 +183,7 @@ class DirectFuture(Generic[T]):
         """Make the task go on with an error.
 
         Raises:
-            asyncio.InvalidStateError: it is done.
+            asyncio.InvalidStateError: the outcome is set already.
         """
         if self._done:
             raise asyncio.InvalidStateError("the outcome is set already")

@@ -125,14 +125,14 @@ class Requests:
         verdict = self._connection.dialect.code(code, request).verdict
         if verdict is Verdict.DONE:
             return
-        said = (
+        text = (
             f"{self.name}: {request.__name__}: "
             f"the camera answered {code_text(self._connection.dialect, code, request)}"
         )
         if verdict is Verdict.UNKNOWN:
-            raise UnsupportedError(said)
+            raise UnsupportedError(text)
         raise CommandRejectedError(
-            said,
+            text,
             message_id=self._connection.dialect.message_id(request),
             code=code,
             active_application=self._state.active,

@@ -192,7 +192,7 @@ class Supervisor:
         """Wait until there is a session, and its state is restored.
 
         Raises:
-            LinkError: there will be none.
+            LinkError: there will be no session.
             ResponseTimeoutError: at ``deadline`` (loop time).
         """
         try:

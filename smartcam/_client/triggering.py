@@ -526,8 +526,10 @@ def _is_not_overtriggered(status: Status) -> bool:
 def _evidence(features: Features) -> TriggerEvidence:
     """Return the evidence that a trigger needs before results count as its own."""
     if not features.fences:
-        told = features.acknowledged and features.ordered  # else an answer may be lost, or late
-        return EvidenceByAcknowledgement() if told else TriggerEvidence()
+        acknowledged = (
+            features.acknowledged and features.ordered
+        )  # else an answer may be lost, or late
+        return EvidenceByAcknowledgement() if acknowledged else TriggerEvidence()
     if not features.shows_triggers:
         return EvidenceByFence()
     return EvidenceByAnswer() if features.polled else EvidenceByStatus()

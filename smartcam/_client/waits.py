@@ -171,7 +171,7 @@ class Waits:
         self._fences_open = count
 
     def awaits_fences(self, count: int) -> bool:
-        """Return True if so many Queries of a trigger are open, and no task waits for anything."""
+        """Return True if ``count`` Queries of a trigger are open, and no task waits."""
         return self._fences_open == count and not self.answers and not self.statuses
 
     def take_fence(self) -> bool:

@@ -432,7 +432,7 @@ def _check_versions(path: Path) -> None:
     """Check the versions in the file's header: SQLite opens a file with a damaged one read-only.
 
     Raises:
-        sqlite3.DatabaseError: they are damaged.
+        sqlite3.DatabaseError: the entries are damaged.
     """
     with path.open("rb") as file:
         versions = file.read(20)[18:]
@@ -448,7 +448,7 @@ def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
     """Return the counts.
 
     Raises:
-        sqlite3.DatabaseError: they are damaged.
+        sqlite3.DatabaseError: the entries are damaged.
     """
     counts = dict(database.execute("SELECT name, value FROM counts"))
     if not all(isinstance(one, int) and one >= 0 for one in counts.values()):

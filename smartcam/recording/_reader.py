@@ -150,8 +150,7 @@ class Recording:
             )
         if name is None and len(self.cameras) != 1:
             raise ConfigurationError(
-                f"recording {self.path}: {len(self.cameras)} cameras are in it, say which one: "
-                f"{names}"
+                f"recording {self.path}: {len(self.cameras)} cameras are in it, choose one: {names}"
             )
         return self.cameras[next(iter(self.cameras)) if name is None else name]
 

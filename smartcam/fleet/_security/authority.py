@@ -33,7 +33,7 @@ ROUTER_FILE = "router.json5"
 LIFETIME = timedelta(days=365)
 AUTHORITY_LIFETIME = timedelta(days=3650)
 
-SOON = timedelta(days=30)
+RENEWAL_TIME = timedelta(days=30)
 """Time before its end, or a third of its lifetime if less, at which a certificate is renewed."""
 
 BEFORE = timedelta(days=1)
@@ -321,7 +321,7 @@ def _hosts_of(certificate: Any) -> list[str]:
 def _ends_soon(certificate: Any) -> bool:
     ends, begins = certificate.not_valid_after_utc, certificate.not_valid_before_utc
     lifetime = ends - begins - BEFORE
-    return bool(ends - datetime.now(UTC) <= min(SOON, lifetime / 3))
+    return bool(ends - datetime.now(UTC) <= min(RENEWAL_TIME, lifetime / 3))
 
 
 def _pem(certificate: Any) -> bytes:

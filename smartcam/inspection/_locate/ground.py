@@ -1,6 +1,6 @@
 """Fit steps whose sides are not of one level, such as edges of a part on a textured ground.
 
-What the light beside an edge does *along* the edge moves no step, so it can be told without one.
+What the light beside an edge does *along* the edge moves no step, so it can be measured alone.
 A texture does the same across the edge, where it does move the step: each side then has a slope
 that is unknown, but no larger than those along the edges around it.
 """

@@ -21,7 +21,7 @@ ALIKE: Final = 0.75
 """Part of the outline from which on a turned part may be taken for one that is not turned."""
 
 MAX_FOLD: Final = 24
-"""Turns of the full circle up to which a part is told from a round one."""
+"""Largest fold of a symmetry that is distinguished from a round part."""
 
 NEAR_PX: Final = 1.5
 """Pixels beside the outline that a turned point may be."""
@@ -44,7 +44,7 @@ COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
 MAX_POINTS: Final = 1000
 """Edge pixels that are turned, about."""
 
-TURNS: Final = 720
+ANGLE_COUNT: Final = 720
 """Turns of the full circle that are tried."""
 
 
@@ -66,16 +66,16 @@ class Symmetry:
 
     @property
     def period(self) -> float:
-        """Angle after which the part is the same, radians; an angle is told modulo this."""
+        """Angle after which the part is the same, radians; an angle is known modulo this."""
         return 2 * math.pi / max(self.fold, 1)
 
     def text(self) -> str:
-        """Return the sentence that people are told."""
+        """Return a sentence about the symmetry, for people."""
         if self.fold == 0:
             return "round: it has no angle"
         sentence = "has one angle"
         if self.fold > 1:
-            sentence = f"the same every {360 / self.fold:g} degrees: its angle is told modulo that"
+            sentence = f"the same every {360 / self.fold:g} degrees: its angle is known modulo that"
         if self.alike:
             angle, share = self.alike[0]
             sentence += (
@@ -89,7 +89,7 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
     """Return the turns at which a part's edges lie on themselves, and the place they turn about.
 
     ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
-    is told to a fraction of a pixel.
+    is measured to a fraction of a pixel.
 
     The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
     """
@@ -113,8 +113,8 @@ def _least(shares: Array, count: int) -> float:
     """Return the part of the outline that each turn of a fold brings onto itself at least."""
     if count == 0:
         return float(shares.min())
-    turns = np.rint(TURNS * np.arange(1, count) / count).astype(np.intp)
-    around = np.mod(turns[:, None] + np.arange(-1, 2, dtype=np.intp), TURNS)
+    turns = np.rint(ANGLE_COUNT * np.arange(1, count) / count).astype(np.intp)
+    around = np.mod(turns[:, None] + np.arange(-1, 2, dtype=np.intp), ANGLE_COUNT)
     return float(shares[around].max(axis=1).min())
 
 
@@ -144,7 +144,7 @@ def _centre(segments: Segments, count: int) -> Array:
 
 
 def _shares(points: Array, normals: Array) -> Array:
-    """Return the part of the edges that each turn brings onto others, (TURNS,)."""
+    """Return the part of the edges that each turn brings onto others, (ANGLE_COUNT,)."""
     cv2 = load("cv2", "inspection needs")
     radius = math.ceil(float(np.linalg.norm(points, axis=1).max())) + 3
     image = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
@@ -156,9 +156,9 @@ def _shares(points: Array, normals: Array) -> Array:
     point_of = np.zeros(int(nearest.max()) + 1, int)
     point_of[nearest[at[:, 1], at[:, 0]]] = np.arange(len(at))
     step = max(1, len(points) // MAX_POINTS)
-    shares = np.empty(TURNS)
-    for number in range(TURNS):
-        angle = 2 * math.pi * number / TURNS
+    shares = np.empty(ANGLE_COUNT)
+    for number in range(ANGLE_COUNT):
+        angle = 2 * math.pi * number / ANGLE_COUNT
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
         met = point_of[nearest[rows, columns]]
@@ -169,10 +169,10 @@ def _shares(points: Array, normals: Array) -> Array:
 
 def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
     """Return the turns within the period at which the part may be taken for itself."""
-    period = TURNS // fold
+    period = ANGLE_COUNT // fold
     inside = shares[:period]
     before, after = np.roll(inside, 1), np.roll(inside, -1)
     peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= ALIKE))
-    far = peaks[(peaks > TURNS // 36) & (peaks < period - TURNS // 36)]
+    far = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
     order = far[np.argsort(-inside[far], kind="stable")][:8]
-    return tuple((2 * math.pi * one / TURNS, float(shares[one])) for one in order.tolist())
+    return tuple((2 * math.pi * one / ANGLE_COUNT, float(shares[one])) for one in order.tolist())

@@ -68,7 +68,7 @@ class FleetPictures:
             matcher.results.append(result)
             self._settle(track, matcher)
 
-    def told(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
+    def add_reported(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
         """Record the picture of a result, as the camera names it."""
         made = 0, result.number, result.received_at
         self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *made))

@@ -224,7 +224,7 @@ class _Hooks(Observer):
         """Keep the picture of a software camera's result."""
         track = self._track(result.camera)
         if track is not None and self._pictures is not None:
-            self._pictures.told(track, result, frame)
+            self._pictures.add_reported(track, result, frame)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep an error."""

@@ -126,7 +126,7 @@ class RecordedDriver(TaskDriver):
 
     def _several(self, cameras: dict[str, None]) -> FrameFormatError:
         return FrameFormatError(
-            f"{self._path}: there are pictures of {', '.join(cameras)}: say which, such as "
+            f"{self._path}: there are pictures of {', '.join(cameras)}: choose one, such as "
             f"{self._path}#camera={next(iter(cameras))}",
             source=self.name,
             available=tuple(cameras),
