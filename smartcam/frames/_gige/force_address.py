@@ -182,7 +182,8 @@ async def _sent(
                 break
         else:
             raise FrameTimeoutError(
-                f"{camera.info.label}: no answer to FORCEIP in {MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s: "
+                f"{camera.info.label}: no answer to FORCEIP in "
+                f"{MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s: "
                 "a camera controlled by another application does not answer"
             )
     finally:
