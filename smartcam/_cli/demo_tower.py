@@ -16,7 +16,7 @@ import numpy as np
 from smartcam._cli.demo import Steps
 from smartcam._cli.texts import table_text
 from smartcam.depth import ColourRange, SpatialFilter, TemporalFilter, find_regions, region_depth
-from smartcam.depth._inside import AXES, BLOCK, FOCAL, laid, to_robot
+from smartcam.depth._inside import AXES, BLOCK, FOCAL, random_table, to_robot
 from smartcam.exceptions import FrameFormatError
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ async def tower(
         SystemExit: an error was larger than :data:`TOLERANCE`.
     """
     steps = Steps(options)
-    table = laid(seed, layers) if table is None else table
+    table = random_table(seed, layers) if table is None else table
     steps.step(
         "A camera at a robot's hand, a table with wooden and black blocks on it, and a tower of "
         f"two. The robot is to put {layers} black ones on top:",

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.fleet._frames.pace import (
+    MAX_WAIT_PERIODS,
     MAX_WAIT_SHARE,
     MIN_WAIT_SECONDS,
-    MAX_WAIT_PERIODS,
     FramePace,
 )
 from smartcam.frames import FrameSource
