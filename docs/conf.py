@@ -92,8 +92,8 @@ DOES = {
     "subscribe": "subscribes",
     "query": "queries",
     "answer": "answers queries",
-    "hold_token": "has tokens",
-    "watch_tokens": "looks for tokens",
+    "present": "has tokens",
+    "watch": "looks for tokens",
 }
 """Kinds of use in Zenoh's words."""
 

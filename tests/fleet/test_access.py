@@ -182,37 +182,35 @@ async def test_appear(ends: Ends) -> None:
     seen = Seen()
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.watch(pattern, seen)
-    for key in keys_of("hold_token"):
+    for key in keys_of("present"):
         end.be_present(key)
     end.be_present(KEYS.program(f"{role}-{MARK}"))
-    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "hold_token")
+    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "present")
 
 
 async def test_watch(ends: Ends) -> None:
     role, end, guard = ends
     mark = KEYS.agent(MARK)
-    for key in [*keys_of("watch_tokens"), mark]:
+    for key in [*keys_of("watch"), mark]:
         guard.be_present(key)
     seen = Seen()
-    for key in [*keys_of("watch_tokens"), mark]:
+    for key in [*keys_of("watch"), mark]:
         end.watch(key, seen)
-    assert await seen.mark(mark) == expected(role, "watch_tokens")
+    assert await seen.mark(mark) == expected(role, "watch")
 
 
 async def test_look_who_is_there(ends: Ends) -> None:
     role, end, guard = ends
     mark = KEYS.agent(MARK)
-    for key in [*keys_of("watch_tokens"), mark]:
+    for key in [*keys_of("watch"), mark]:
         guard.be_present(key)
-    asking = {
-        key: asyncio.ensure_future(end.present(key, PATIENCE)) for key in keys_of("watch_tokens")
-    }
+    asking = {key: asyncio.ensure_future(end.present(key, PATIENCE)) for key in keys_of("watch")}
     await asyncio.sleep(0)  # they ask
     assert await end.present(mark, PATIENCE) == [mark]
     for key, one in asking.items():
-        if allowed(role, "watch_tokens", key):
+        if allowed(role, "watch", key):
             assert await one == [key]
-        assert not one.done() or await one == ([key] if allowed(role, "watch_tokens", key) else [])
+        assert not one.done() or await one == ([key] if allowed(role, "watch", key) else [])
         one.cancel()
     await asyncio.gather(*asking.values(), return_exceptions=True)
 
@@ -362,7 +360,7 @@ async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends:
     allowed_to_ask = {one for one in WIDE if covered(role, "query", one)} | {KEYS.listing(MARK)}
     assert {*asked.keys} <= allowed_to_ask
     own = {KEYS.program(f"{role}-{MARK}")}
-    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "hold_token", one)}
+    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "present", one)}
     for key in (KEYS.service("line1/cam3", "trigger"), KEYS.summary("line1"), KEYS.reload("x")):
         forged = [(key, b"forged")] if allowed(role, "answer", key) else []
         assert await guard.ask(key, b"", 1.0) in ([], forged)

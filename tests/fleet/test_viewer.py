@@ -46,8 +46,8 @@ KEYS, ANY = Keys(FLEET), Keys("*")
 LOOKING = frozenset(name for name, one in SERVICES.items() if not one.command)
 
 VIEWER_DOES: dict[str, set[str]] = {
-    "agent": {"watch_tokens"},
-    "camera": {"watch_tokens"},
+    "agent": {"watch"},
+    "camera": {"watch"},
     "program": set(),
     "command": set(),
     "ask": set(),
@@ -102,7 +102,7 @@ def test_viewer_may_do_nothing_at_a_key_of_an_operator_but_hear_and_look() -> No
     assert found == VIEWER_DOES
 
 
-@pytest.mark.parametrize("does", ["put", "answer", "hold_token"])
+@pytest.mark.parametrize("does", ["put", "answer", "present"])
 def test_roles_share_no_key_under_which_anything_is_said_or_present(does: str) -> None:
     """Whoever could say it could say it in the place of another role's program."""
     of = [

@@ -45,14 +45,9 @@ class StreamCounts:
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
-    def since(self, answer: dict[str, Any], came: int = 1) -> tuple[int, int]:
+    def since(self, reply: dict[str, Any], came: int = 1) -> tuple[int, int]:
         """Return the numbers of skipped and lost frames since the last reply; ``came`` came."""
-        now = (
-            int(answer["stream"]),
-            int(answer["sent"]),
-            int(answer["skipped"]),
-            int(answer["lost"]),
-        )
+        now = int(reply["stream"]), int(reply["sent"]), int(reply["skipped"]), int(reply["lost"])
         last, self._last = self._last, now
         if last is None or last[0] != now[0]:  # the first reply, or of a new stream at the agent
             last = now[0], 0, 0, 0

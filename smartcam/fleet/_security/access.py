@@ -17,7 +17,7 @@ from smartcam.fleet._security.certificates import AGENT, OPERATOR, ROLES, ROUTER
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Does = Literal["put", "subscribe", "query", "answer", "hold_token", "watch_tokens"]
+Does = Literal["put", "subscribe", "query", "answer", "present", "watch"]
 Flow = Literal["ingress", "egress"]
 
 MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
@@ -25,8 +25,8 @@ MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
     "subscribe": (("declare_subscriber", "ingress"), ("put", "egress")),
     "query": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
     "answer": (("declare_queryable", "ingress"), ("query", "egress"), ("reply", "ingress")),
-    "hold_token": (("liveliness_token", "ingress"),),
-    "watch_tokens": (
+    "present": (("liveliness_token", "ingress"),),
+    "watch": (
         ("liveliness_query", "ingress"),
         ("declare_liveliness_subscriber", "ingress"),
         ("liveliness_token", "egress"),
@@ -58,41 +58,31 @@ _LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 RIGHTS: tuple[Right, ...] = (
     Right(
         "see which agents and cameras are present",
-        "watch_tokens",
+        "watch",
         (_ANY.agent("*"), _ANY.camera("*", "**")),
         _LOOKS,
     ),
     *(
         Right(
             "be present under a name of its role",
-            "hold_token",
+            "present",
             (_ANY.program(names_of(role)),),
             (role,),
         )
         for role in _LOOKS
     ),
-    Right(
-        "receive results and states", "subscribe", (_ANY.results("**"), _ANY.states("**")), _LOOKS
-    ),
+    Right("get results and states", "subscribe", (_ANY.results("**"), _ANY.states("**")), _LOOKS),
     *(
-        Right(
-            "send queries, which change nothing, as its role",
-            "put",
-            (_ANY.ask(role, "*", "**"),),
-            (role,),
-        )
+        Right("send queries as its role", "put", (_ANY.ask(role, "*", "**"),), (role,))
         for role in _LOOKS
     ),
-    Right("receive answers and frames", "subscribe", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
-    Right("receive results in bundles", "subscribe", (_ANY.bundle("*"),), _LOOKS),
+    Right("get answers and frames", "subscribe", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
+    Right("get results in bundles", "subscribe", (_ANY.bundle("*"),), _LOOKS),
     Right("request the state of all cameras", "query", (_ANY.summary("*"),), _LOOKS),
     Right("JSON: list the cameras", "query", (_ANY.listing("**"),), _LOOKS),
     Right("JSON: request the outlets' accounts", "query", (_ANY.outlets("*", "*"),), _LOOKS),
     Right(
-        "JSON: receive topics",
-        "subscribe",
-        (_ANY.topic("*", "**"), _ANY.thesis_topic("**")),
-        _LOOKS,
+        "JSON: get topics", "subscribe", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS
     ),
     Right(
         "JSON: services that change nothing",
@@ -104,16 +94,11 @@ RIGHTS: tuple[Right, ...] = (
     Right("JSON: all services", "query", (f"{_ANY.root}/service/**", _ANY.thesis("*")), _ACTS),
     Right("make an agent read its file again", "query", (_ANY.reload("*"),), _ACTS),
     Right("read its file again", "answer", (_ANY.reload("*"),), _SHARES),
-    Right("share cameras", "hold_token", (_ANY.agent("*"), _ANY.camera("*", "**")), _SHARES),
-    Right("reserve its own name", "hold_token", (_ANY.start("*", "*"),), _SHARES),
-    Right("see which agent has its name", "watch_tokens", (_ANY.start("*", "*"),), _SHARES),
-    Right("see which programs are present", "watch_tokens", (_ANY.program("*"),), _SHARES),
-    Right(
-        "receive calls",
-        "subscribe",
-        (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")),
-        _SHARES,
-    ),
+    Right("share cameras", "present", (_ANY.agent("*"), _ANY.camera("*", "**")), _SHARES),
+    Right("reserve its own name", "present", (_ANY.start("*", "*"),), _SHARES),
+    Right("see which agent has its name", "watch", (_ANY.start("*", "*"),), _SHARES),
+    Right("see which programs are present", "watch", (_ANY.program("*"),), _SHARES),
+    Right("get calls", "subscribe", (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")), _SHARES),
     Right("answer calls", "put", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
     Right("publish results and states", "put", (_ANY.results("**"), _ANY.states("**")), _SHARES),
     Right("publish results in bundles", "put", (_ANY.bundle("*"),), _SHARES),
