@@ -52,7 +52,7 @@ MAX_SPEED = 1000.0
 MIN_INSPECTION_TIME = 1e-6
 """Least seconds of a replayed inspection, whose take is chosen after its beginning."""
 
-NEVER = 0.0001
+FREE_RUN_RATE = 0.0001
 """Rate of a free-running application, per second; the replay itself sends its containers."""
 
 MAX_LOAD_TIME = 3600.0
@@ -440,7 +440,7 @@ def _application(found: ApplicationRuns, speed: float) -> _PlayedApplication:
     if found.waits:
         fields["processing_time"] = MIN_INSPECTION_TIME
     else:
-        fields["rate"] = NEVER
+        fields["rate"] = FREE_RUN_RATE
     return _PlayedApplication(**fields)
 
 
