@@ -60,7 +60,7 @@ MAX_LOAD_TIME = 3600.0
 
 
 @dataclass(slots=True, eq=False)
-class _Runs:
+class _PendingRuns:
     """A list of runs that is played once, or over and over."""
 
     _runs: list[RecordedRun]
@@ -109,8 +109,8 @@ class _Track:
     """The parts of a replay that belong to one application."""
 
     waits: bool  # whether the camera waits for triggers
-    triggered: _Runs  # takes for triggers
-    untriggered: _Runs  # runs without a trigger
+    triggered: _PendingRuns  # takes for triggers
+    untriggered: _PendingRuns  # runs without a trigger
     current: RecordedRun | None = None  # the take of the inspection under way
     # further containers to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
@@ -214,8 +214,8 @@ class ReplayedCamera(EmulatedCamera):
         self._tracks = {
             number: _Track(
                 found.waits,
-                _Runs(found.triggered, loop),
-                _Runs(found.untriggered, loop),
+                _PendingRuns(found.triggered, loop),
+                _PendingRuns(found.untriggered, loop),
             )
             for number, found in self.plan.applications.items()
         }
