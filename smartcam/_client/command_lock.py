@@ -77,7 +77,7 @@ class CommandLock:
         self._jobs: asyncio.TaskGroup | None = None
         self._to_restore: Before | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
-        self._in_line = 0  # commands that wait for the lock
+        self._waiting_commands = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
         self._failed: SmartCamError | None = None
 
@@ -150,18 +150,18 @@ class CommandLock:
         """
         self._connection.require_link()
         lock = self._lock
-        if lock.locked() or self._in_line or self._leaving:
-            return self._take_in_line(deadline, timeout)
+        if lock.locked() or self._waiting_commands or self._leaving:
+            return self._wait_for_turn(deadline, timeout)
         if self._failed is not None or self._commands.unconfirmed:
-            return self._take_in_line(deadline, timeout)
+            return self._wait_for_turn(deadline, timeout)
         return lock.acquire()  # the lock is free: no wait
 
     def give_back(self) -> None:
-        """Give the turn to the next in line."""
+        """Give the turn to the next waiting command."""
         self._lock.release()
 
-    async def _take_in_line(self, deadline: float, timeout: float) -> None:
-        self._in_line += 1
+    async def _wait_for_turn(self, deadline: float, timeout: float) -> None:
+        self._waiting_commands += 1
         try:
             async with asyncio.timeout_at(deadline):
                 await self._acquire()
@@ -171,7 +171,7 @@ class CommandLock:
                 waited=timeout,
             ) from exc
         finally:
-            self._in_line -= 1
+            self._waiting_commands -= 1
         try:
             self._connection.require_link()  # the link may have been lost meanwhile
             self._raise_failed()

@@ -84,7 +84,7 @@ class Doorbell:
                 loop.call_soon(_raise, exc)
 
     def wake_in_order(self) -> None:
-        """Make the callers of this delivery go on by way of the loop, after the tasks in line.
+        """Wake the callers of this delivery by way of the loop, after the tasks that are ready.
 
         Subscribers then have a result before its trigger's caller goes on.
         """

@@ -21,8 +21,8 @@ class OneBlasThread(ContextDecorator):
     """Limit BLAS to one thread inside of ``with`` or a function; restore the number afterwards.
 
     Whether the limit applies to the calling thread or to the process depends on the version of
-    threadpoolctl (extra ``calibration``). So each thread sets the limit, and the number that the
-    first one found is restored. Without threadpoolctl nothing changes.
+    threadpoolctl (extra ``calibration``). So each thread sets the limit, and
+    restores the number from before the first limit. Without threadpoolctl nothing changes.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class OneBlasThread(ContextDecorator):
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Reset the state in a fork, which may go on with one thread."""
+        """Reset the state in a fork; its BLAS may stay limited to one thread."""
         self._lock = threading.Lock()
         self._inside: Counter[int] = Counter()  # depth of nested uses, by thread
         self._before: Any = None
@@ -40,8 +40,8 @@ class OneBlasThread(ContextDecorator):
         with self._lock, suppress(MissingExtraError):
             self._inside[thread] += 1
             if self._inside[thread] == 1:
-                found = load("threadpoolctl").ThreadpoolController()
-                limits = found.limit(limits=1, user_api="blas")
+                controller = load("threadpoolctl").ThreadpoolController()
+                limits = controller.limit(limits=1, user_api="blas")
                 self._before = self._before or limits
 
     def __exit__(self, *_: object) -> None:

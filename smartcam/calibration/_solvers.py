@@ -409,16 +409,16 @@ class Chain:
                 ``camera_frame``; and the errors of the solvers.
         """
         if isinstance(localizations, Localization):
-            return self._found([localizations])[0]
-        return self._found(list(localizations))
+            return self._solved([localizations])[0]
+        return self._solved(list(localizations))
 
-    def _found(self, parts: list[Localization]) -> list[Localization]:
+    def _solved(self, parts: list[Localization]) -> list[Localization]:
         check_frames(parts, self.camera_frame, "chain: ")
-        found = []
+        solved = []
         for part in self.solve(Poses.of(parts)).put(parts):
             header = part.pose.header._replace(frame_id=self.frame)
-            found.append(part._replace(pose=part.pose._replace(header=header)))
-        return found
+            solved.append(part._replace(pose=part.pose._replace(header=header)))
+        return solved
 
 
 def check_frames(localizations: Sequence[Localization], frame: str | None, what: str = "") -> None:

@@ -49,6 +49,6 @@ def common_move(offsets: Array) -> Array | None:
     if len(offsets) < 2:
         return None
     middle: Array = offsets.mean(axis=0)
-    apart = np.linalg.norm(offsets - middle, axis=1)
-    alike = float(apart.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle))
+    distances = np.linalg.norm(offsets - middle, axis=1)
+    alike = float(distances.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle))
     return middle if alike else None

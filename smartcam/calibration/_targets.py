@@ -176,12 +176,12 @@ class CircleGrid:
         if self.origin_diameter is not None:
             _check_lengths(self.kind, origin_diameter=self.origin_diameter)
         between = (self.diameter + (self.origin_diameter or self.diameter)) / 2
-        apart = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
-        if between >= apart:
+        least = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
+        if between >= least:
             raise Code.SHAPE.refusal(
-                f"circles: expected dots that do not touch each other at a distance of {apart:g} "
-                f"m, got a mean diameter of two neighbours of {between:g} m",
-                apart,
+                f"circles: expected dots that do not touch each other at a distance of "
+                f"{least:g} m, got a mean diameter of two neighbours of {between:g} m",
+                least,
                 between,
             )
         if self.origin_diameter is not None and self.origin_diameter <= self.diameter:

@@ -80,9 +80,9 @@ class EmulatedFleet(Server):
         try:
             return self._cameras[name]
         except KeyError as exc:
-            there = ", ".join(self._cameras)
+            names = ", ".join(self._cameras)
             raise ConfigurationError(
-                f"the fleet has no camera {name!r}; there are {there}"
+                f"the fleet has no camera {name!r}; there are {names}"
             ) from exc
 
     def __iter__(self) -> Iterator[WireCamera]:

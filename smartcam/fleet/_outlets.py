@@ -108,8 +108,8 @@ class FleetOutlets(Server):
         """
         since = None if asked.since is None else datetime.fromisoformat(asked.since)
         question = self._question(since, asked.failed, asked.camera, asked.most)
-        found = await asyncio.to_thread(self.outlets.stored, question)
-        return {name: {"rows": one.rows, **one.summary} for name, one in found.items()}
+        answers = await asyncio.to_thread(self.outlets.stored, question)
+        return {name: {"rows": one.rows, **one.summary} for name, one in answers.items()}
 
     def reading(self, camera: str) -> Interpretation | None:
         """Return the interpretation of a camera's results; None for a camera that is not known."""

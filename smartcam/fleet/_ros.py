@@ -84,7 +84,7 @@ class RosFleet(Server):
             name.
         controls: functions that return the open source of a camera's frames, whose device has
             controls, by name.
-        places: hand-eye calibrations, the cameras' places, by name.
+        hand_eyes: hand-eye calibrations of the cameras, by name.
         wanted: function that returns whether a camera of an agent gets a node.
         desks: calibrations that are also on the agent's bus; None if there is no folder for them.
 
@@ -105,14 +105,14 @@ class RosFleet(Server):
         frames: Mapping[str, Mapping[str, Any]] | None = None,
         controls: Mapping[str, Callable[[], Awaitable[FrameSource]]] | None = None,
         calibrations: Mapping[str, Calibration] | None = None,
-        places: Mapping[str, HandEyeCalibration] | None = None,
+        hand_eyes: Mapping[str, HandEyeCalibration] | None = None,
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
         desks: CalibrationDesks | None = None,
     ) -> None:
         self._desks = desks
         self._section, self._camera_options, self._wanted = section, dict(cameras or {}), wanted
         self._settings, self._frames = settings or {}, frames or {}  # filled by other methods
-        self._places, self._controls = places or {}, controls or {}
+        self._hand_eyes, self._controls = hand_eyes or {}, controls or {}
         self.context: RosContext | NativeContext = _context(bus, section)
         self._fleet = _Cameras(
             bus, address, fleet, None, TIMEOUT, {}, calibrations=dict(calibrations or {})
@@ -187,7 +187,7 @@ class RosFleet(Server):
             frame_id=options.frame_id or as_name(name).replace("/", "_"),
             parent_frame=options.parent_frame or "",
             flange_frame=options.flange_frame or "",
-            place=self._places.get(name),
+            place=self._hand_eyes.get(name),
             calibrated_at=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),

@@ -135,7 +135,7 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     """
     rows = np.moveaxis(np.asarray(matrix, dtype=np.float64), (-2, -1), (0, 1))
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rows
-    # Four times q q^T: each column is q up to its length, and that of q's largest element is never
+    # Four times q q^T: each column is a multiple of q. The column of q's largest element is never
     # short, so no root of a small difference is taken.
     # Source: Markley, Unit Quaternion from Rotation Matrix (2008); Shepperd, Quaternion from
     # Rotation Matrix (1978).

@@ -132,21 +132,21 @@ class Compare(Tool[CompareSettings]):
         size = self._size
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         seen = cv2.warpAffine(patch, motion, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
-        there = cv2.warpAffine(np.full_like(patch, 255), motion, size, flags=how) == 255
+        covered = cv2.warpAffine(np.full_like(patch, 255), motion, size, flags=how) == 255
         taught, level = self._taught, float(self.settings.level)
-        hidden = np.zeros(there.shape, bool)
+        hidden = np.zeros(covered.shape, bool)
         too_light = True
         if self.settings.light:
-            gain, offset = _light(taught[there], seen[there])
+            gain, offset = _light(taught[covered], seen[covered])
             lit = (gain * taught + offset).astype(np.float32)
             taught = np.clip(np.rint(lit), 0, 255).astype(np.uint8)
             level *= min(gain, 1.0)
-            hidden = _saturated(lit, level) & there
+            hidden = _saturated(lit, level) & covered
             too_light = lit[hidden].mean() > 127 if hidden.any() else True
         # a residual shift is no difference: it changes levels at edges in proportion to their slope
         steep = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
         over = cv2.absdiff(taught, seen) - EDGE_TOLERANCE_PX * steep
-        differs = (over >= level) & there
+        differs = (over >= level) & covered
         kept, allowed = self._large(differs), self.settings.allowed
         differing = int(kept[:, cv2.CC_STAT_AREA].sum())
         unknown = int(self._large(hidden & ~differs)[:, cv2.CC_STAT_AREA].sum())

@@ -339,8 +339,8 @@ class Protocol:
         groups = self.detection.get(transport) or tuple((d,) for d in self.dialects.values())
         if dialect is not None:
             names = tuple(quirks)
-            found = [d for group in groups for d in group if d.name == dialect and not names]
-            groups = (tuple(found) or (self.dialects[dialect].with_quirks(names),),)
+            dialects = [d for group in groups for d in group if d.name == dialect and not names]
+            groups = (tuple(dialects) or (self.dialects[dialect].with_quirks(names),),)
         if not parameters:
             return list(groups)
         return [tuple(d.with_parameters(parameters) for d in group) for group in groups]

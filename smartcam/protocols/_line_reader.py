@@ -44,18 +44,18 @@ class LineReader:
 
         Raises FrameError: the line is too long; the stream cannot be read on.
         """
-        found = self._ends.search(self._buffer, self._searched)
-        size = found.start() if found is not None else len(self._buffer)
+        match = self._ends.search(self._buffer, self._searched)
+        size = match.start() if match is not None else len(self._buffer)
         # the last byte may be half of a line end
-        if size > self._max_line + (found is None):
+        if size > self._max_line + (match is None):
             raise FrameError(
                 f"a line of more than {self._max_line} bytes came", data=self._buffer[:64]
             )
-        if found is None:
+        if match is None:
             self._searched = max(0, size - 1)
             return None
         line = self._buffer[:size].decode(self._encoding, "replace")
-        del self._buffer[: found.end()]
+        del self._buffer[: match.end()]
         self._searched = 0
         return line
 

@@ -79,9 +79,9 @@ class LineRow(NamedTuple):
         answer: message type of the answer; None for a request without an answer.
         read: function that makes one or several messages of the answer's line; a ValueError
             or LookupError means that the line is no answer.
-        word: word that matches the answer, if the dialect splits answers. Default, and always after
-            the first line of a script: the first word of the line; "" for an answer without its
-            own word. A dialect with tickets needs it only for unasked lines.
+        word: word that matches the answer, if the dialect splits answers; "" for an answer without
+            a word; None: the first word of the request's line. Later lines of a script are always
+            matched by their first words. A dialect with tickets needs it only for unasked lines.
         echo: line that comes before the answer.
         until: first words that end an answer of several lines, which ``read`` gets joined by line
             feeds.
@@ -327,14 +327,14 @@ class LineDialect(Dialect):
 
 
 def _first_word(line: str) -> str:
-    found = _FIRST_WORD.match(line)
-    return "" if found is None else found[0]
+    match = _FIRST_WORD.match(line)
+    return "" if match is None else match[0]
 
 
 def _command_word(line: str) -> str:
     """Return the word of a command; "PROGRAM?" is another word than "PROGRAM"."""
-    found = _COMMAND_WORD.match(line)
-    return line if found is None else found[0]
+    match = _COMMAND_WORD.match(line)
+    return line if match is None else match[0]
 
 
 def _one_line(row: LineRow, line: str) -> Script:
@@ -349,12 +349,13 @@ class _OpenRequest:
         row: row of the request.
         script: rest of its lines and answers.
         line: line to send now.
-        known_by: word that the next answer is matched by once ``line`` is sent; None: its first.
+        known_by: word that the next answer is matched by once ``line`` is sent; None: the first
+            word of ``line``.
         word: word or ticket that the next answer is matched by.
         sent: whether ``line`` was sent.
         echoed: whether the echo before the answer has come.
         lines: received lines of an answer of several lines.
-        size: number of characters of these.
+        size: number of characters in ``lines``.
         question: number of a question for the application, which the machine asks by itself.
     """
 
@@ -473,8 +474,8 @@ class LineMachine:
         """Handle a line; FrameError if it is neither an answer nor an unasked line."""
         split = self.dialect.split
         if split is None:
-            asked = self._open[0] if self._open else None
-            begun = asked is not None and (asked.echoed or asked.lines)
+            request = self._open[0] if self._open else None
+            begun = request is not None and (request.echoed or request.lines)
             if not begun and self._report_unasked("", line):
                 return
             word, text = "", line
@@ -483,15 +484,15 @@ class LineMachine:
                 word, text = split(line)
             except (ValueError, LookupError) as exc:
                 raise FrameError(f"{line[:64]!r} came, no answer of this dialect") from exc
-            asked = self._known_by(word) if word else None
-            if asked is None and self._report_unasked(word, text, by_word=True):
+            request = self._known_by(word) if word else None
+            if request is None and self._report_unasked(word, text, by_word=True):
                 return
-            asked = asked or self._known_by("")
-            if asked is None and self._report_unasked(word, text):
+            request = request or self._known_by("")
+            if request is None and self._report_unasked(word, text):
                 return
-        if asked is None:
+        if request is None:
             raise FrameError(f"{line[:64]!r} came, nothing was asked")
-        self._take(asked, text)
+        self._take(request, text)
 
     def _known_by(self, word: str) -> _OpenRequest | None:
         """Return the request whose answer is matched by a word."""
@@ -516,24 +517,24 @@ class LineMachine:
             return True
         return False
 
-    def _take(self, asked: _OpenRequest, text: str) -> None:
+    def _take(self, request: _OpenRequest, text: str) -> None:
         """Handle a line of an answer; if the answer is complete, report its messages."""
-        row = asked.row
-        if row.echo and not asked.echoed and text == row.echo:
-            asked.echoed, asked.word = True, ""
+        row = request.row
+        if row.echo and not request.echoed and text == row.echo:
+            request.echoed, request.word = True, ""
             return
         if row.until:
-            asked.lines.append(text)
-            asked.size += len(text) + 1
-            if asked.size > self._max_length:
+            request.lines.append(text)
+            request.size += len(text) + 1
+            if request.size > self._max_length:
                 raise FrameError(f"an answer of more than {self._max_length} bytes came")
             if _first_word(text) not in row.until:
                 return
-            text = "\n".join(asked.lines)
-        elif row.echo and not asked.echoed and self.dialect.split is None:
+            text = "\n".join(request.lines)
+        elif row.echo and not request.echoed and self.dialect.split is None:
             raise FrameError(f"{text[:64]!r} came, the echo {row.echo!r} was expected")
         try:
-            asked.line = asked.script.send(text)
+            request.line = request.script.send(text)
         except StopIteration as done:
             reported: Reported = done.value
         except (ValueError, LookupError) as exc:
@@ -542,19 +543,19 @@ class LineMachine:
                 f"{text[:64]!r} came, {name} to {row.line[:32]!r} was expected"
             ) from exc
         else:
-            asked.sent = asked.echoed = False
-            asked.known_by = None
-            asked.lines, asked.size = [], 0
+            request.sent = request.echoed = False
+            request.known_by = None
+            request.lines, request.size = [], 0
             if self.state in {State.CONNECTING, State.CONNECTED}:
-                self._send_line(asked)
+                self._send_line(request)
             else:
-                self._open.remove(asked)  # Disconnect was the last request
+                self._open.remove(request)  # Disconnect was the last request
             return
-        self._open.remove(asked)
+        self._open.remove(request)
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
-        if asked.question:
-            self._name(reported, asked.question)
+        if request.question:
+            self._name(reported, request.question)
         else:
             self._add(reported, asked=row.request is m.Trigger)
         if self._open and not self._open[0].sent and self.state is State.CONNECTED:
@@ -576,7 +577,7 @@ class LineMachine:
         self._name(messages)
 
     def _name(self, reported: Reported, question: int = 0) -> None:
-        """Note which application is active, and ask again for results since the question."""
+        """Note which application is active; ask again if results came after the question."""
         for one in reported if isinstance(reported, tuple) else (reported,):
             if not isinstance(one, m.QueryAnswer | m.SwitchAnswer):
                 continue
@@ -604,7 +605,7 @@ class LineMachine:
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        """Send a request, or put it in line; write :meth:`data_to_send` next.
+        """Send a request, or queue it; write :meth:`data_to_send` next.
 
         A Get status whose answer is pending is not repeated: it is new enough. Disconnect sends
         nothing, it ends the connection. A request without an answer is sent at once.
@@ -636,23 +637,23 @@ class LineMachine:
             self.state = State.CONNECTING
 
     def _begin(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
-        """Send the first line of a request, or put the request in line."""
+        """Send the first line of a request, or queue the request."""
         script = self.dialect.script(row, message)
-        asked = _OpenRequest(row, script, next(script), row.word, question=question)
+        request = _OpenRequest(row, script, next(script), row.word, question=question)
         if row.answer is None or self.dialect.at_once or not self._open:
-            self._send_line(asked)
+            self._send_line(request)
         else:
-            self.dialect.pack(asked.line, "")  # if this raises, nothing has changed
+            self.dialect.pack(request.line, "")  # if this raises, nothing has changed
         if row.answer is not None:
-            self._open.append(asked)
+            self._open.append(request)
 
-    def _send_line(self, asked: _OpenRequest) -> None:
+    def _send_line(self, request: _OpenRequest) -> None:
         """Send the line of a request; its answer is matched by its ticket, or by its word."""
         ticket = self._next_ticket() if self.dialect.tickets else ""
-        data = self.dialect.pack(asked.line, ticket)
-        word = asked.known_by
-        asked.word = ticket or (_first_word(asked.line) if word is None else word)
-        asked.sent = True
+        data = self.dialect.pack(request.line, ticket)
+        word = request.known_by
+        request.word = ticket or (_first_word(request.line) if word is None else word)
+        request.sent = True
         self._outbox.append(data)
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)

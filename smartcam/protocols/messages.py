@@ -435,15 +435,15 @@ def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
 
     It has all fields of all dialects; a dialect's row lists those on its wire.
     """
-    found = _WIRE_FIELDS.get(message_type)
-    if found is None:
+    fields = _WIRE_FIELDS.get(message_type)
+    if fields is None:
         hints: dict[str, Any] = get_type_hints(message_type, include_extras=True)
-        found = _WIRE_FIELDS[message_type] = tuple(
+        fields = _WIRE_FIELDS[message_type] = tuple(
             (name, hint.__metadata__[0])
             for name, hint in hints.items()
             if hasattr(hint, "__metadata__") and isinstance(hint.__metadata__[0], Wire)
         )
-    return found
+    return fields
 
 
 _WIRE_FIELDS: dict[type[Message], tuple[tuple[str, Wire], ...]] = {}  # hints are slow to read

@@ -191,8 +191,8 @@ def completed(image: GreyImage, board: Board) -> Board | None:
 def _missing(board: Board, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the places (N, 2) from ``low`` to ``high`` where no corner has been found yet."""
     every = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
-    there = set(map(tuple, board.places.tolist()))
-    missing = [place for place in every if place not in there]
+    found_places = set(map(tuple, board.places.tolist()))
+    missing = [place for place in every if place not in found_places]
     return np.array(missing, dtype=np.intp).reshape(-1, 2)
 
 

@@ -228,7 +228,7 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sight
     kept = [quad for quad, fits in zip(quads, good, strict=True) if fits]
     quads, numbers, *_ = finder.refineDetectedMarkers(bytes_, board, kept, numbers[good], others)
     read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
-    ids, corners = _between(bytes_, board, read.some(agreeing(read, flat).good))
+    ids, corners = _between(bytes_, board, read.selected(agreeing(read, flat).good))
     if len(ids) <= len(best.ids):
         return best
     # OpenCV counts rows from the top

@@ -210,9 +210,9 @@ def _without_strays(
     flat = rows_of(target.columns, target.rows).astype(np.float64)
     good = corners.fitted
     expected = GridMap(flat[good], corners.points[good])(flat)
-    apart = np.linalg.norm(corners.points - expected, axis=1)
-    most = MAX_STRAY_PX + 4 * float(np.median(apart[good]))
-    stray = ~good | (apart > most)
+    distances = np.linalg.norm(corners.points - expected, axis=1)
+    most = MAX_STRAY_PX + 4 * float(np.median(distances[good]))
+    stray = ~good | (distances > most)
     if not stray.any():
         return corners
     expected = GridMap(flat[~stray], corners.points[~stray])(flat)

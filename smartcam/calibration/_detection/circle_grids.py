@@ -185,10 +185,10 @@ def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
     half = sum(_contrast(image, target, mapped)) / 2
     inside = _levels(image, mapped, next_to, target.diameter / 4)
     outside = _levels(image, mapped, next_to, (_apart(target) + target.diameter) / 4)
-    there = np.isfinite(inside).any(axis=1)
+    known = np.isfinite(inside).any(axis=1)
     darkest = np.where(np.isfinite(inside), inside, -np.inf).max(axis=1)
     lightest = np.where(np.isfinite(outside), outside, np.inf).min(axis=1)
-    beyond: NDArray[np.bool_] = there & (darkest < half) & (lightest > half)
+    beyond: NDArray[np.bool_] = known & (darkest < half) & (lightest > half)
     return not beyond.any()
 
 

@@ -86,7 +86,7 @@ def refine_corners(
     """
     reach = np.linalg.norm(ways, axis=2).min(axis=1)
     start = _start(image, points, reach if clear is None else reach * clear.min(axis=1))
-    windows = cut_windows(image, start, ways, MAX_REACH_PX, round_=False, clear=clear)
+    windows = cut_windows(image, start, ways, MAX_REACH_PX, round_=False, arm_widths=clear)
     if single:
         windows = windows.without(start, ROUNDED_PX)
     guess = _guess(start - windows.middle, ways)

@@ -174,16 +174,16 @@ class _Grown:
             for (here, dot, steps, like), sides in zip(wave, around, strict=True):
                 for side, fits in enumerate(sides):
                     column, row = _AROUND[side]
-                    there = (here[0] + column, here[1] + row)
+                    neighbour = (here[0] + column, here[1] + row)
                     free = next((one for one in fits if one not in taken), None)
-                    if free is None or there in places:
+                    if free is None or neighbour in places:
                         continue
-                    places[there] = free
+                    places[neighbour] = free
                     taken.add(free)
                     step = steps.copy()
                     step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
                     own = bool(self._alike(np.array(free), np.array(like)))
-                    reached.append((there, free, step, free if own else like))
+                    reached.append((neighbour, free, step, free if own else like))
         return places
 
     def complete(self, places: Lattice, most: int) -> None:

@@ -132,7 +132,7 @@ def _solve(
         damping[active] *= np.where(better, 0.1, 10.0)
         still = np.abs(step[:, moving]).max(axis=1) < MAX_LAST_MOVE_PX
         settled[active[still]] = True
-        windows, active = windows.some(~still), active[~still]
+        windows, active = windows.selected(~still), active[~still]
         if not len(active):
             break
     return best, settled

@@ -64,7 +64,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         good, contrary = agreeing(found, board)
         read, against = max(read, len(good)), max(against, contrary)
         if good.sum() > len(best.ids):
-            best = found.some(good)
+            best = found.selected(good)
             strays = tuple(sorted((found.ids[~good] + target.first_id).tolist()))
     check_one_board(len(best.ids), against, what)
     if len(best.ids) < MIN_AGREEING_MARKERS:

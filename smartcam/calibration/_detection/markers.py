@@ -68,7 +68,7 @@ class Markers(NamedTuple):
     quads: Array  # (N, 4, 2), corners in OpenCV's order, pixels
     ids: NDArray[np.intp]  # (N,), numbers of the markers
 
-    def some(self, which: NDArray[np.bool_]) -> Markers:
+    def selected(self, which: NDArray[np.bool_]) -> Markers:
         """Return some of the markers."""
         return Markers(self.quads[which], self.ids[which])
 
@@ -95,10 +95,10 @@ def marker_dictionary(name: str, needed: int, what: str) -> Any:
             name,
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
-    there = len(dictionary.bytesList)
-    if needed > there:
+    count = len(dictionary.bytesList)
+    if needed > count:
         raise Code.SHAPE.unexpected(
-            f"{what}: expected at least {needed} markers in {name}", needed, there
+            f"{what}: expected at least {needed} markers in {name}", needed, count
         )
     return dictionary
 
@@ -188,11 +188,11 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
     """
     slopes, seen, mapped = _slopes(quads, flat), quads.mean(axis=1), flat.mean(axis=1)
     ways = at[:, None] - mapped
-    apart = np.linalg.norm(ways, axis=2)
+    distances = np.linalg.norm(ways, axis=2)
     expected = seen + np.einsum("jkl,ijl->ijk", slopes, ways)
     # a corner of a square lies between the two next markers, and perspective beside one of them
     # is about the opposite of that beside the other
-    near = apart < 1.1 * apart.min(axis=1, keepdims=True)
+    near = distances < 1.1 * distances.min(axis=1, keepdims=True)
     shares = near / near.sum(axis=1, keepdims=True)
     places: Array = np.einsum("ij,ijk->ik", shares, expected)
     return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
@@ -220,21 +220,21 @@ def _slopes(quads: Array, flat: Array) -> Array:
 
 def _pitch(middles: Array) -> float:
     """Return the distance between a board's markers that are next to each other."""
-    apart = np.linalg.norm(middles - middles[0], axis=1)
-    return float(apart[1:].min()) if len(middles) > 1 else 0.0
+    distances = np.linalg.norm(middles - middles[0], axis=1)
+    return float(distances[1:].min()) if len(middles) > 1 else 0.0
 
 
 def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDArray[np.bool_]:
     """Return a mask (N, N) that is True for two markers that agree."""
     ways = mapped[None] - mapped[:, None]
-    apart = np.linalg.norm(ways, axis=2)
+    distances = np.linalg.norm(ways, axis=2)
     # the mean of both derivatives predicts one marker from the other exactly to second order
     both = (slopes[:, None] + slopes[None]) / 2
     expected = np.einsum("ijkl,ijl->ijk", both, ways)
     off = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
     return np.asarray(
-        (apart > 0)
-        & (apart <= reach)
+        (distances > 0)
+        & (distances <= reach)
         & (off < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
         & _alike(slopes[:, None], slopes[None])
     )

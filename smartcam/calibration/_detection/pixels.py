@@ -43,8 +43,8 @@ class Windows(NamedTuple):
         far = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
         return self._replace(levels=self.levels * far, weights=self.weights * far)
 
-    def some(self, which: NDArray[np.bool_]) -> Windows:
-        """Return the windows of some points."""
+    def selected(self, which: NDArray[np.bool_]) -> Windows:
+        """Return the windows of the selected points."""
         if which.all():
             return self
         return self._replace(
@@ -55,21 +55,23 @@ class Windows(NamedTuple):
 def cut_windows(
     image: GreyImage,
     points: Array,
-    ways: Array,
-    most: int,
+    half_sides: Array,
+    max_reach: int,
     *,
     round_: bool,
-    clear: Array | None = None,
+    arm_widths: Array | None = None,
 ) -> Windows:
     """Return the pixels around points (N, 2).
 
-    Two ``ways`` (N, 2, 2) from each point span the half sides of the parallelogram whose pixels
-    count, or the half axes of the ellipse (``round_``). A window reaches at most ``most`` pixels to
-    each side. ``clear`` (N, 2): only a cross along the two edges of the parallelogram counts, whose
-    half widths are these parts of the ways; None counts all of it.
+    ``half_sides`` (N, 2, 2): vectors from each point along the half sides of the parallelogram
+    whose pixels count, or along the half axes of an ellipse (``round_``). A window reaches at most
+    ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): count only a cross whose arms lie
+    along the half sides; its half widths are these shares of the half sides. None: count all.
     """
-    reach = np.hypot(ways[:, 0], ways[:, 1]) if round_ else np.abs(ways).sum(axis=1)
-    half = int(np.clip(np.ceil(reach.max()), MIN_REACH_PX, most))
+    reach = (
+        np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)
+    )
+    half = int(np.clip(np.ceil(reach.max()), MIN_REACH_PX, max_reach))
     span = np.arange(-half, half + 1)
     y, x = (side.ravel() for side in np.meshgrid(span, span, indexing="ij"))
     middle = np.rint(points).astype(np.intp)
@@ -77,11 +79,11 @@ def cut_windows(
     width, height = image.size
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     levels = image.levels[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-    # each pixel's place, as parts of the two ways
-    parts = np.linalg.inv(ways.transpose(0, 2, 1)) @ np.stack([x, y])
+    # coordinates of each pixel along the two half sides
+    parts = np.linalg.inv(half_sides.transpose(0, 2, 1)) @ np.stack([x, y])
     within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
-    if clear is not None:
-        within &= (np.abs(parts) <= clear[:, :, None]).any(axis=1)
+    if arm_widths is not None:
+        within &= (np.abs(parts) <= arm_widths[:, :, None]).any(axis=1)
     near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH_PX
     weights = (inside & (within | near)).astype(np.float32)
     return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)

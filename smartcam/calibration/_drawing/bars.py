@@ -52,12 +52,12 @@ class Chart(NamedTuple):
 
 def draw_bars(charts: Sequence[Chart], title: str) -> str:
     """Return charts, one below the other."""
-    tall = HEAD + HEIGHT + FOOT
+    height = HEAD + HEIGHT + FOOT
     parts = itertools.chain.from_iterable(
-        _chart(chart, 30 + number * tall) for number, chart in enumerate(charts)
+        _chart(chart, 30 + number * height) for number, chart in enumerate(charts)
     )
     head = [text((LEFT, 26), title, "title")] if title else []
-    return document(LEFT + WIDTH + GAP, 30 + len(charts) * tall, [*head, *parts])
+    return document(LEFT + WIDTH + GAP, 30 + len(charts) * height, [*head, *parts])
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -115,7 +115,7 @@ def _largest(chart: Chart) -> float:
 def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
     count = max(len(chart.names), 1)
     room = WIDTH / count
-    wide = min(0.8 * room / len(chart.series), 40.0)
+    width = min(0.8 * room / len(chart.series), 40.0)
     shorts = short_names(chart.names)
     longest = max((len(one) for one in shorts), default=1)
     # a name at each bar where there is room, else at each second, fifth, tenth, ...
@@ -127,12 +127,12 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
         for place, (one, kind) in enumerate(zip(chart.series, FILLS, strict=False)):
             value = one.values[number]
             if math.isfinite(value):
-                x = middle + (place - len(chart.series) / 2) * wide
+                x = middle + (place - len(chart.series) / 2) * width
                 label = f"{name}{left_out}: {one.name} {value:.3g} {chart.unit}"
                 fill = "off" if chart.off[number] else kind
-                tall = min(value * zoom, HEIGHT)
-                yield rectangle((x, foot - tall), (wide, tall), f'class="{fill}"', label)
-                if tall < value * zoom and place == 0:
+                height = min(value * zoom, HEIGHT)
+                yield rectangle((x, foot - height), (width, height), f'class="{fill}"', label)
+                if height < value * zoom and place == 0:
                     at = (middle, foot - HEIGHT - 6)
                     yield text(at, f"{value:.2g}", "small", ' text-anchor="middle"')
         if number % each == 0:

@@ -142,19 +142,19 @@ def _lens_chart(one: IntrinsicCalibration) -> list[Chart]:
 
 def _pair_charts(one: StereoCalibration) -> list[Chart]:
     names = _pair_names(one)
-    off = [not any(fit.used) for fit in one.pairs]
+    left_out = [not any(fit.used) for fit in one.pairs]
     sides = [
         Series(f"residuals, {side}", [fit.rms[number] for fit in one.pairs])
         for number, side in enumerate(("left", "right"))
     ]
     held_out = [MILLIMETRES * fit.held_out for fit in one.pairs]
     return [
-        Chart("px", sides, names, off),
+        Chart("px", sides, names, left_out),
         Chart(
             "mm",
             [Series("held out, lengths", held_out, MILLIMETRES * one.held_out)],
             names,
-            off,
+            left_out,
         ),
     ]
 

@@ -55,18 +55,18 @@ def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
     most = float(positive.max()) if len(positive) else 1.0
     least = float(positive.min()) if len(positive) else 0.1
     least = max(min(least, 0.999 * most), most / 10.0**MAX_DECADES)
-    tall = max(WIDTH * one.size[1] / one.size[0] for one in maps)
+    height = max(WIDTH * one.size[1] / one.size[0] for one in maps)
     parts = [text((BORDER, 28), title, "title")] if title else []
     for number, one in enumerate(maps):
         parts += _map(one, BORDER + number * (WIDTH + BORDER), least, most)
-    parts += _legend(HEAD + tall + 44, least, most, unit)
-    return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + tall + FOOT, parts)
+    parts += _legend(HEAD + height + 44, least, most, unit)
+    return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + height + FOOT, parts)
 
 
 def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
-    tall = WIDTH * one.size[1] / one.size[0]
+    height = WIDTH * one.size[1] / one.size[0]
     rows, columns = one.values.shape
-    cell = np.array([WIDTH / columns, tall / rows])
+    cell = np.array([WIDTH / columns, height / rows])
     yield text((left, HEAD - 12), one.title)
     levels = _levels(one.values, least, most)
     yield '<g shape-rendering="crispEdges">'
@@ -82,16 +82,16 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
     places = [left, HEAD] + (one.points + 0.5) * WIDTH / one.size[0]
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in places.tolist())
     yield f'<path d="{dots}" class="seen"/>'
-    yield rectangle((left, HEAD), (WIDTH, tall), 'class="axis"')
-    yield from _numbers(one.values, left, tall)
+    yield rectangle((left, HEAD), (WIDTH, height), 'class="axis"')
+    yield from _numbers(one.values, left, height)
     if one.caption:
-        yield text((left, HEAD + tall + 20), one.caption)
+        yield text((left, HEAD + height + 20), one.caption)
 
 
-def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
+def _numbers(values: Array, left: float, height: float) -> Iterator[str]:
     """Yield the values at the corners and the centre, and a cross at the largest value."""
     rows, columns = values.shape
-    for row, y in ((0, 20.0), (rows // 2, tall / 2 + 5), (rows - 1, tall - 10)):
+    for row, y in ((0, 20.0), (rows // 2, height / 2 + 5), (rows - 1, height - 10)):
         ends = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
         for column, x, anchor in (
             ends if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
@@ -101,7 +101,7 @@ def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
             yield text((left + x, HEAD + y), label, "on-map", f' text-anchor="{anchor}"')
     if np.isfinite(values).any():
         row, column = np.unravel_index(np.nanargmax(values), values.shape)
-        at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * tall / rows])
+        at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * height / rows])
         # the cross must not cover a number
         if row not in {0, rows - 1} or column not in {0, columns - 1}:
             for kind in ("mark-rim", "mark"):
@@ -114,8 +114,8 @@ def _levels(values: Array, least: float, most: float) -> Array:
     safe = np.where(np.isfinite(values), np.clip(values, least, most), least)
     parts = np.log(safe / least) / math.log(most / least)
     levels = np.clip(np.round(parts * (COLOUR_COUNT - 1)), 0, COLOUR_COUNT - 1)
-    found: Array = np.where(np.isfinite(values), levels, -1)
-    return found
+    numbers: Array = np.where(np.isfinite(values), levels, -1)
+    return numbers
 
 
 def _colour(part: float) -> str:
@@ -127,11 +127,11 @@ def _colour(part: float) -> str:
 
 
 def _legend(y: float, least: float, most: float, unit: str) -> Iterator[str]:
-    wide = WIDTH / COLOUR_COUNT
+    width = WIDTH / COLOUR_COUNT
     yield '<g shape-rendering="crispEdges">'
     for step in range(COLOUR_COUNT):
         fill = f'fill="{_colour(step / (COLOUR_COUNT - 1))}"'
-        yield rectangle((BORDER + step * wide, y - 12), (wide, 12), fill)
+        yield rectangle((BORDER + step * width, y - 12), (width, 12), fill)
     yield "</g>"
     for tick in range(TICKS):
         part = tick / (TICKS - 1)

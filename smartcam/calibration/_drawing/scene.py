@@ -84,27 +84,27 @@ class DrawnScene(NamedTuple):
 
 class _Drawn(NamedTuple):
     depth: float
-    drawn: str
+    svg: str
     label: str
     at: Array  # (2,), pixels
 
 
-class _Outlook:
+class _Projection:
     """The projection from points of a scene to pixels of the drawing."""
 
     def __init__(self, scene: DrawnScene, points: Array) -> None:
-        # upright first, z up; then turned about the vertical and looked at from above
+        # make the scene upright (z up), turn it about the vertical, and tilt it towards the viewer
         up = np.array(scene.up)
         ahead = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
         side = np.cross(ahead, up)
-        room = np.array([side, ahead, up])
+        upright = np.array([side, ahead, up])
         turn, rise = (
             (math.cos(AZIMUTH), math.sin(AZIMUTH)),
             (math.cos(ELEVATION), math.sin(ELEVATION)),
         )
         around = np.array([[turn[0], -turn[1], 0.0], [turn[1], turn[0], 0.0], [0.0, 0.0, 1.0]])
         tilted = np.array([[1.0, 0.0, 0.0], [0.0, rise[0], -rise[1]], [0.0, rise[1], rise[0]]])
-        self.axes: Array = tilted @ around @ room  # axes of the viewer: right, away, up
+        self.axes: Array = tilted @ around @ upright  # axes of the viewer: right, away, up
         seen = points @ self.axes.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         span = np.maximum(high - low, 1e-9)
@@ -133,10 +133,10 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         ]
     )
     extent = float(np.ptp(places, axis=0).max()) or 1.0
-    long = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
-    shapes = [_frustum(one, long) for one in scene.cameras]
+    length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
+    shapes = [_frustum(one, length) for one in scene.cameras]
     ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
-    sight = _Outlook(scene, np.concatenate([places, *shapes, *ends]))
+    sight = _Projection(scene, np.concatenate([places, *shapes, *ends]))
     items = [
         _Drawn(
             sight.depth(one.corners),
@@ -149,7 +149,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
     items.sort(key=lambda one: -one.depth)  # draw far objects first
     parts = [text((BORDER, 28), title, "title")] if title else []
-    parts += [one.drawn for one in items]
+    parts += [one.svg for one in items]
     for one, tips in zip(scene.axes, ends, strict=True):
         start = sight.pixels(one.pose.translation)
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
@@ -161,20 +161,20 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
 
 
-def _frustum(camera: DrawnCamera, long: float) -> Array:
-    """Return a camera's centre, and the corners of its field of view at a distance, (5, 3)."""
-    wide, high = 0.5, 0.375
+def _frustum(camera: DrawnCamera, length: float) -> Array:
+    """Return a camera's centre, and the corners of its field of view at a depth, (5, 3)."""
+    x, y = 0.5, 0.375  # of a corner at depth 1
     if camera.model is not None:
-        wide, high = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
-    rim = [[-wide, -high, 1], [wide, -high, 1], [wide, high, 1], [-wide, high, 1]]
-    return camera.pose.apply(long * np.array([[0.0, 0.0, 0.0], *rim]))
+        x, y = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
+    rim = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
+    return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *rim]))
 
 
-def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
+def _camera(sight: _Projection, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
     sides = [line(centre, one, "camera") for one in rim]
-    drawn = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
-    return _Drawn(sight.depth(shape), drawn, camera.name, centre + LABEL_OFFSET_PX)
+    svg = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
+    return _Drawn(sight.depth(shape), svg, camera.name, centre + LABEL_OFFSET_PX)
 
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
@@ -183,10 +183,10 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
-        wide, tall = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
+        width, height = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
         for offset in LABEL_OFFSETS_PX:
             x, y = at + offset
-            box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
+            box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
             if not outside and not any(_overlap(box, one) for one in occupied):
                 occupied.append(box)
@@ -200,7 +200,7 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
-def _scale(sight: _Outlook) -> Iterator[str]:
+def _scale(sight: _Projection) -> Iterator[str]:
     metres = round_down(0.2 * WIDTH / sight.zoom)
     start = np.array([BORDER, HEAD + HEIGHT + 30])
     end = start + np.array([metres * sight.zoom, 0.0])

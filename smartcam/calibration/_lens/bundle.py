@@ -403,14 +403,14 @@ class BundleEquations:
         number, rig, pose = group.camera, bundle.from_first(group.camera), bundle.poses
         points, rotation = self._meant if bundle.points is None else bundle.points, pose.rotation
         turned = np.einsum("nij,nj->ni", rotation[group.pose], points[group.ids])
-        there = (turned + pose.translation[group.pose]) @ rig.rotation.T
-        seen = linearize(there + rig.translation, bundle.cameras[number])
+        rotated = (turned + pose.translation[group.pose]) @ rig.rotation.T
+        seen = linearize(rotated + rig.translation, bundle.cameras[number])
         by_near = seen.by_point @ rig.rotation
         own = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
         parts = [pose_changes(by_near, turned), seen.by_lens @ bundle.basis[number]]
         if number and not bundle.rigid:
             own.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
-            parts.append(pose_changes(seen.by_point, there))
+            parts.append(pose_changes(seen.by_point, rotated))
         parts.append((group.pixels - seen.pixels)[..., None])
         by_point = group.white @ (by_near @ rotation[group.pose]) if bundle.free else by_near
         return np.concatenate(own), group.white @ np.concatenate(parts, axis=2), by_point

@@ -192,9 +192,9 @@ def compare_lenses(
     difference = _project(second, moved) - pixels.reshape(-1, 2)
     expected, ratio, chance = None, None, None
     if a.covariance is not None and b.covariance is not None:
-        there = gauge @ motion.rotation.T + motion.translation
+        aligned = gauge @ motion.rotation.T + motion.translation
         of_a = sensitivity(first, points, far=far).freed(sensitivity(first, gauge))
-        of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, there))
+        of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, aligned))
         spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
         difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
         ratio, chance = _judged(difference, spread, a.views + b.views - 2)

@@ -105,9 +105,9 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
     ``far``: the points, in the camera's frame, are directions to points at infinity.
     """
     finite = np.isfinite(points).all(axis=1, keepdims=True)
-    there = np.where(finite, points, [0.0, 0.0, 1.0])
-    at = linearize(there, camera)
-    motion = pose_changes(at.by_point, there)
+    safe = np.where(finite, points, [0.0, 0.0, 1.0])
+    at = linearize(safe, camera)
+    motion = pose_changes(at.by_point, safe)
     if far:
         motion[:, :, 3:] = 0.0
     missing = np.where(finite, 0.0, np.nan)[:, :, None]

@@ -199,8 +199,8 @@ def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array
     # The pose is unknown, too, so that B^T B becomes B^T B - B^T A (A^T A)^-1 A^T B.
     shape = (poses.size, 2 * len(points), -1)
     turned = points @ poses.rotation.swapaxes(1, 2)
-    there = (turned + poses.translation[:, None]).reshape(-1, 3)
-    at = sensitivity(camera, there)
+    in_camera = (turned + poses.translation[:, None]).reshape(-1, 3)
+    at = sensitivity(camera, in_camera)
     by_lens = (at.by_lens @ basis).reshape(shape)
     by_pose = pose_changes(at.by_point, turned.reshape(-1, 3)).reshape(shape)
     both = by_pose.swapaxes(1, 2) @ by_lens

@@ -647,9 +647,10 @@ def fit_plane(
         *_moved_remark(missed[off], 1 + once.first[off]),
         *(_left_out(found, index, parts[index]) for index in found.outliers),
     ]
-    apart = np.linalg.norm(beside, axis=1)
-    if apart.max() > MAX_TOUCH_SIGMAS * most:
-        text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"
+    distances = np.linalg.norm(beside, axis=1)
+    if distances.max() > MAX_TOUCH_SIGMAS * most:
+        number, worst = 1 + int(distances.argmax()), 1e3 * float(distances.max())
+        text = f"point {number} was touched {worst:.3g} mm from"
         remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
 

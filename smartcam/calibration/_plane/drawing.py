@@ -105,12 +105,12 @@ def draw(
     """
     found = list(parts)
     counted = calibration.weights > 0.0
-    points, off = calibration.camera_points[counted], calibration.camera_points[~counted]
+    points, left_out = calibration.camera_points[counted], calibration.camera_points[~counted]
     places = np.array([part.pose.position[:2] for part in found]).reshape(-1, 2)
     both = np.concatenate([points, places])
     low, high = both.min(axis=0), both.max(axis=0)
-    near = (np.abs(off - (low + high) / 2) < high - low).all(axis=1)
-    field = _DrawnPlane(np.concatenate([both, off[near]]))
+    near = (np.abs(left_out - (low + high) / 2) < high - low).all(axis=1)
+    field = _DrawnPlane(np.concatenate([both, left_out[near]]))
     residuals = calibration.inverse(calibration.robot_points[counted]) - points
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
@@ -163,16 +163,16 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
         return
     cell = FIELD_WIDTH_PX / MAX_COLUMNS
     rows = min(2 * MAX_COLUMNS, max(1, round(field.height / cell)))
-    tall = field.height / rows
-    corners = [[x * cell, y * tall] for y in range(rows) for x in range(MAX_COLUMNS)]
-    middles = np.array(corners) + np.array([cell / 2, tall / 2])
+    height = field.height / rows
+    corners = [[x * cell, y * height] for y in range(rows) for x in range(MAX_COLUMNS)]
+    middles = np.array(corners) + np.array([cell / 2, height / 2])
     seen = field.low + np.column_stack([middles[:, 0], field.height - middles[:, 1]]) / field.zoom
     errors = calibration.predicted_error(seen)
     low, high = float(errors.min()), float(errors.max())
     parts = (errors - low) / (high - low) if high > low else np.zeros_like(errors)
     yield '<g shape-rendering="crispEdges">'
     for (x, y), part in zip(corners, parts.tolist(), strict=True):
-        yield _cell(BORDER_PX + x, BORDER_PX + y, cell, tall, part)
+        yield _cell(BORDER_PX + x, BORDER_PX + y, cell, height, part)
     yield "</g>"
     for step in range(11):
         yield _cell(BORDER_PX + 20 * step, field.foot + 45, 20, 14, step / 10)
@@ -180,12 +180,12 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     yield _text((BORDER_PX + 232, field.foot + 57), label)
 
 
-def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
+def _cell(x: float, y: float, width: float, height: float, part: float) -> str:
     """Return a cell, in one of 21 colours: tiny differences of an error do not change it."""
     level = round(20 * part) / 20
     channels = (round(a + level * (b - a)) for a, b in zip(LOW_COLOUR, HIGH_COLOUR, strict=True))
     colour = "".join(f"{channel:02x}" for channel in channels)
-    return rectangle((x, y), (wide, tall), f'fill="#{colour}"')
+    return rectangle((x, y), (width, height), f'fill="#{colour}"')
 
 
 def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:

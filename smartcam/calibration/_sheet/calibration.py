@@ -148,7 +148,7 @@ class SheetCalibration(storage.SavedCalibration):
         """Return the verdict for the area that the target covers in the image, and the advice."""
         if any(one.code == Code.POOR_FIT for one in self.remarks):
             lens = "another lens" if self.camera else "a lens: --lens"
-            text = f"Not good enough: the picture wants {lens}, or a flat sheet"
+            text = f"Not good enough: the picture needs {lens}, or a flat sheet"
             return Judgement(CalibrationVerdict("poor", text), option="more")
         predicted = None
         if self.plane.touch_sigma is not None:
@@ -176,9 +176,10 @@ class SheetCalibration(storage.SavedCalibration):
         """
         if self.camera is None or self.lens_covariance is None:
             return ()
-        values, off = lens_values(self.camera), independent_parts(self.lens_covariance)
+        values, deviations = lens_values(self.camera), independent_parts(self.lens_covariance)
         return tuple(
-            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane for one in off
+            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane
+            for one in deviations
         )
 
     def transform(self, pixels: ArrayLike) -> Array:
@@ -232,10 +233,10 @@ class SheetCalibration(storage.SavedCalibration):
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
         """
         if isinstance(localizations, Localization):
-            return self._found([localizations], tool_flip)[0]
-        return self._found(list(localizations), tool_flip)
+            return self._to_robot([localizations], tool_flip)[0]
+        return self._to_robot(list(localizations), tool_flip)
 
-    def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
+    def _to_robot(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
         flat = self.sheet.solve(Poses.of(parts)).put(parts)
         rows = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
@@ -245,7 +246,7 @@ class SheetCalibration(storage.SavedCalibration):
         return self.plane.to_robot(flat, tool_flip=flip)
 
     def _sigmas(self, parts: list[Localization]) -> list[PoseSigma]:
-        """Return the errors of poses on the sheet: the camera's, the view's and the lens'."""
+        """Return the sigmas of poses on the sheet: errors of localizations, view and lens."""
         lenses = self.lens_planes
         y_up = np.array([1.0, -1.0])
 
@@ -253,10 +254,10 @@ class SheetCalibration(storage.SavedCalibration):
             flat = self.sheet.near_sheet(points * y_up)
             return np.column_stack([flat, np.zeros(len(flat))])
 
-        def by_values(points: Array) -> Array:
+        def value_derivatives(points: Array) -> Array:
             flat = self.sheet.near_sheet(points * y_up)
             rows = np.zeros((len(flat), 3, 9 + len(lenses)))
-            rows[:, :2, :9] = self.sheet.by_elements(flat)
+            rows[:, :2, :9] = self.sheet.element_slopes(flat)
             for number, one in enumerate(lenses, start=9):
                 rows[:, :2, number] = one.near_sheet(points * y_up) - flat
             return rows
@@ -264,7 +265,9 @@ class SheetCalibration(storage.SavedCalibration):
         covariance = np.eye(9 + len(lenses))
         covariance[:9, :9] = self.sheet.covariance
         normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
-        return robot_sigmas(parts, on_sheet, normal, by_values, covariance, size, flip=False)
+        return robot_sigmas(
+            parts, on_sheet, normal, value_derivatives, covariance, size, flip=False
+        )
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
@@ -285,8 +288,8 @@ class SheetCalibration(storage.SavedCalibration):
         slopes = derivatives(self.plane.matrix, flat)
         on_sheet = self.sheet.covariance_at(pixels)
         for one in self.lens_planes:
-            off = one.on_sheet(pixels) - flat
-            on_sheet = on_sheet + off[:, :, None] * off[:, None, :]
+            deviation = one.on_sheet(pixels) - flat
+            on_sheet = on_sheet + deviation[:, :, None] * deviation[:, None, :]
         seen = slopes @ on_sheet @ slopes.swapaxes(1, 2)
         covariance: Array = self.plane.covariance_at(flat) + seen
         return covariance
@@ -342,7 +345,7 @@ def calibrate_sheet(
     if lens_covariance is not None:
         lens_covariance = storage.as_array(lens_covariance)
         _check_lens(lens_covariance, camera, "calibrate_sheet")
-    found = look_at_sheet(view, camera)
+    fit = look_at_sheet(view, camera)
     remarks: list[Remark] = []
     if camera is None:
         remarks.append(
@@ -351,20 +354,20 @@ def calibrate_sheet(
                 "lens is not, and grows outside of the target's points"
             )
         )
-    if found.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
+    if fit.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
         whose = "the lens distorts" if camera is None else "the lens is another one"
         remarks.append(
             Code.POOR_FIT.remark(
-                f"the target's points lie {found.rms:.2g} px beside a plane, of which noise does "
-                f"not explain {found.unexplained:.2g} px: {whose}, or the sheet is not flat"
+                f"the target's points lie {fit.rms:.2g} px beside a plane, of which noise does "
+                f"not explain {fit.unexplained:.2g} px: {whose}, or the sheet is not flat"
             )
         )
     return SheetCalibration(
         view=view,
-        sheet=found.plane,
+        sheet=fit.plane,
         plane=plane,
         lens_covariance=lens_covariance,
-        rms=found.rms,
+        rms=fit.rms,
         camera_frame=camera_frame,
         remarks=tuple(remarks),
     )
@@ -390,7 +393,8 @@ def fit_corners(
 
     A sheet that lies flat keeps its shape. If touches do not fit that shape, a warning says so
     (NOT_SIMILAR), and the shape is kept. If the scale is not the target's, a warning says so, too
-    (SCALE_MISMATCH), and the scale is used: the rulers were measured wrong, or not at all.
+    (SCALE_MISMATCH), and the touches' scale is used: the printed rulers were measured wrong, or
+    not at all.
 
     Args:
         target: target with its lengths as they are on paper.
@@ -429,5 +433,5 @@ def fit_corners(
             robot_frame=robot_frame,
         )
 
-    found = fitted("auto")
-    return found if found.model in ONE_SCALE_MODELS else fitted("similarity")
+    plane = fitted("auto")
+    return plane if plane.model in ONE_SCALE_MODELS else fitted("similarity")

@@ -110,11 +110,11 @@ class SheetPlane:
         Raises:
             CalibrationError: as :meth:`on_sheet`.
         """
-        moves = self.by_elements(self.on_sheet(pixels))
+        moves = self.element_slopes(self.on_sheet(pixels))
         covariance: Array = moves @ self.covariance @ moves.swapaxes(1, 2)
         return covariance
 
-    def by_elements(self, flat: Array) -> Array:
+    def element_slopes(self, flat: Array) -> Array:
         """Return the derivatives (N, 2, 9) of points (N, 2) of the sheet by the matrix' elements.
 
         Each pixel stays fixed.

@@ -59,9 +59,9 @@ def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
     flat, points = target.points[ids[seen]], points[seen]
     if len(flat) < 2:
         return np.zeros(0)
-    apart = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
+    spacing = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
     tree = load("scipy.spatial").cKDTree(flat)
-    one, two = tree.query_pairs(NEIGHBOUR_DISTANCE_RATIO * apart, output_type="ndarray").T
+    one, two = tree.query_pairs(NEIGHBOUR_DISTANCE_RATIO * spacing, output_type="ndarray").T
     true = np.linalg.norm(flat[one] - flat[two], axis=1)
     errors: Array = np.linalg.norm(points[one] - points[two], axis=1) - true
     return errors

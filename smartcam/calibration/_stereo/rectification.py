@@ -216,8 +216,8 @@ def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
 def _kept(camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]) -> float:
     """Return the part of the source pixels that are in the output."""
     width, height = camera.size
-    apart = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))
-    u, v = np.meshgrid(np.arange(apart // 2, width, apart), np.arange(apart // 2, height, apart))
+    step = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))
+    u, v = np.meshgrid(np.arange(step // 2, width, step), np.arange(step // 2, height, step))
     rays = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     # from pixel to ray to the rectified camera's ray to its pixel: P (R K^-1 u)
     turned = np.column_stack([rays, np.ones(len(rays))]) @ turn.T

@@ -255,18 +255,18 @@ def _charuco(target: Charuco, sheet: _Samples) -> Floats:
     numbers = np.full((target.rows, target.columns), -1)
     numbers[rows, columns] = np.asarray(board.getIds()).ravel()
     inside = (column >= 0) & (column < target.columns) & (row >= 0) & (row < target.rows)
-    there = np.nonzero(inside)
-    number = numbers[row[there], column[there]]
+    cells = np.nonzero(inside)
+    number = numbers[row[cells], column[cells]]
     part = target.marker / target.square / modules
-    across = np.floor((x[there] - column[there] - 0.5) / part + modules / 2).astype(np.intp)
-    down = np.floor(modules / 2 - (y[there] - row[there] - 0.5) / part).astype(np.intp)
+    across = np.floor((x[cells] - column[cells] - 0.5) / part + modules / 2).astype(np.intp)
+    down = np.floor(modules / 2 - (y[cells] - row[cells] - 0.5) / part).astype(np.intp)
     marked = (number >= 0) & (across >= 0) & (across < modules) & (down >= 0) & (down < modules)
     patterns = np.zeros((number.max() + 1, modules, modules), dtype=np.bool_)
     for one in np.unique(number[marked]):
         patterns[one] = dictionary.generateImageMarker(int(one), modules) == 0
     dark = np.zeros(len(number), dtype=np.bool_)
     dark[marked] = patterns[number[marked], down[marked], across[marked]]
-    black[there] = np.maximum(black[there], dark)
+    black[cells] = np.maximum(black[cells], dark)
     return black
 
 

@@ -117,12 +117,12 @@ def hand_eye_wizard(
 
     async def script(parameters: Mapping[str, Any]) -> Any:
         setup, robot, allowed = await _ask_setup(parameters, typed=read_robot is None)
-        there = target
-        if there is None:
-            there = await ask_target(
+        shown = target
+        if shown is None:
+            shown = await ask_target(
                 suggested, known=parameters.get("target"), square=parameters.get("square")
             )
-        views = _Views(there, setup, taker(take_picture), read_robot or robot, camera, awaited)
+        views = _Views(shown, setup, taker(take_picture), read_robot or robot, camera, awaited)
         views.allowed = allowed
         calibration = await views.run()
         name = str(parameters.get("name", KIND))

@@ -249,8 +249,8 @@ class _SheetSource(PointSource):
             outermost = int(ids[int(np.argmax(places @ direction))])
             if outermost not in self._touched():
                 return outermost
-        apart = places[:, None] - self._target.points[self._touched(), :2]
-        nearest = (apart**2).sum(axis=2).min(axis=1).round(12)
+        offsets = places[:, None] - self._target.points[self._touched(), :2]
+        nearest = (offsets**2).sum(axis=2).min(axis=1).round(12)
         return int(ids[int(np.argmax(nearest))])
 
     def _touched(self) -> list[int]:

@@ -199,10 +199,10 @@ class _Canvas:
 
     def covered(self, counts: NDArray[np.intp]) -> Iterator[str]:
         rows, columns = counts.shape
-        wide, high = WIDTH / columns, self.height / rows
+        width, height = WIDTH / columns, self.height / rows
         for row, column in np.argwhere(counts).tolist():
-            place = (BORDER + column * wide, HEAD + row * high)
-            yield rectangle(place, (wide, high), 'class="covered"')
+            place = (BORDER + column * width, HEAD + row * height)
+            yield rectangle(place, (width, height), 'class="covered"')
 
     def points(self, view: TargetView) -> Iterator[str]:
         for number, place in zip(view.ids.tolist(), self.place(view.points), strict=True):
@@ -210,10 +210,10 @@ class _Canvas:
 
     def residuals(self, view: TargetView, predicted: Array) -> tuple[list[str], str]:
         """Return the lines, and their text in the legend."""
-        apart = predicted - view.points
-        lengths = np.linalg.norm(apart, axis=1)
+        residuals = predicted - view.points
+        lengths = np.linalg.norm(residuals, axis=1)
         larger = _enlargement(float(lengths.max(initial=0.0)) * self.zoom)
-        ends = self.place(view.points + larger * apart)
+        ends = self.place(view.points + larger * residuals)
         lines = [
             line(start, end, "residual")
             for start, end in zip(self.place(view.points), ends, strict=True)

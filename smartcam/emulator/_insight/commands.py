@@ -85,8 +85,8 @@ class InSightCommands:
         self._at_once: Mapping[str, Callable[[str], bytes]] = {
             "GO": lambda _: _line(str(int(device.online))),
             "SO": self._set_online,
-            "GF": lambda _: _found(None if device.job is None else device.job.file),
-            "GJ": lambda _: _found(None if device.job is None else device.job.id),
+            "GF": lambda _: _value_answer(None if device.job is None else device.job.file),
+            "GJ": lambda _: _value_answer(None if device.job is None else device.job.id),
             "GV": self._get_value,
             "SI": lambda argument: self._set_value(argument, "int", _integer),
             "SF": lambda argument: self._set_value(argument, "float", _number),
@@ -157,7 +157,7 @@ class InSightCommands:
         key = self._named(argument) if cell is None else cell[0].wire
         if key is None or (cell is not None and cell[1]):
             return _coded(StatusCode.INVALID_ARGUMENT)
-        return _found(self._device.cells.get(key))
+        return _value_answer(self._device.cells.get(key))
 
     def _set_value(
         self, argument: str, kind: str, read: Callable[[str], int | float | str | None]
@@ -214,7 +214,7 @@ class InSightCommands:
             respond(_coded(StatusCode.FAILED))
             return
         digits = self.quirks.image_size == "digits"
-        respond(_found(image.digits if digits else image.size), more=True)
+        respond(_value_answer(image.digits if digits else image.size), more=True)
         self._device.after(self.quirks.transfer_pause, lambda: respond(image.lines))
 
 
@@ -263,7 +263,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]{1,20}(\.[0-9]{0,20})?|\.[0-9]{1,20})([eE][+-]
 def image_answer(image: NDArray[np.uint8]) -> bytes:
     """Return the whole answer to ``RI`` for a picture, (H, W)."""
     digits, lines = words.hex_lines(bitmap(image))
-    return _found(digits) + lines
+    return _value_answer(digits) + lines
 
 
 def _line(text: str) -> bytes:
@@ -274,7 +274,7 @@ def _coded(code: StatusCode) -> bytes:
     return _line(str(int(code)))
 
 
-def _found(value: str | int | None) -> bytes:
+def _value_answer(value: str | int | None) -> bytes:
     """Return the answer with a value; None: not possible."""
     if value is None:
         return _coded(StatusCode.FAILED)
@@ -282,7 +282,7 @@ def _found(value: str | int | None) -> bytes:
 
 
 def _sized(text: str) -> bytes:
-    return _found(len(text)) + _line(text)
+    return _value_answer(len(text)) + _line(text)
 
 
 def _check_sendable(where: str, text: str) -> None:

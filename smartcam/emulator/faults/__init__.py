@@ -18,10 +18,10 @@ handles: a Connect, and the messages of the session.
 
 Nothing depends on chance: the same list and the same messages give the same bytes.
 
-A fault that is new is a class here, with a ``kind``, in ``__all__`` and in one of the unions below.
-The effect is a row: of ``_CHANGES`` (of one message) or ``_REBUILDS`` (of all that go
-together) in ``_wire_effects.py``, or of ``_ACTIONS`` in ``_device_effects.py``. The tests then ask
-for the schema (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the docstrings.
+To add a fault, write a class here, with a ``kind``, and list it in ``__all__`` and in one of the
+unions below. Add its effect as a row to ``_CHANGES`` (of one transmission) or ``_REBUILDS`` (of all
+transmissions of a message) in ``_wire_effects.py``, or to ``_ACTIONS`` in ``_device_effects.py``. Then
+write the schema again (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the docstrings.
 """
 
 from __future__ import annotations
@@ -159,13 +159,15 @@ class Truncate(CameraWireFault):
 
     kind: Literal["truncate"] = "truncate"
     keep: int = Field(
-        ge=0, le=MAX_BYTES, description="Bytes that come, header included. A shorter one is whole."
+        ge=0,
+        le=MAX_BYTES,
+        description="Bytes that come, header included. A shorter message comes whole.",
     )
     then: Literal["close", "reset", "stall", "continue"] = Field(
         default="close",
         description=(
             "What follows: `close` and `reset` end the connection as the faults of that name do; "
-            "`stall`: nothing more is said on it, while the camera goes on listening; "
+            "`stall`: nothing more is sent on it, while the camera goes on reading; "
             "`continue`: the next message as if nothing was missing."
         ),
     )
@@ -183,8 +185,8 @@ class Corrupt(WireFault):
             "A message without that byte stays as it is."
         ),
     )
-    xor: int | None = Field(default=None, ge=1, le=255, description="Bits that are turned over.")
-    value: int | None = Field(default=None, ge=0, le=255, description="What stands there instead.")
+    xor: int | None = Field(default=None, ge=1, le=255, description="Bits to invert.")
+    value: int | None = Field(default=None, ge=0, le=255, description="New value of the byte.")
 
     @model_validator(mode="after")
     def _check_change(self) -> Corrupt:
@@ -409,7 +411,7 @@ class Condition(DeviceFault):
 
     kind: Literal["condition"] = "condition"
     condition: Literal["system_error", "overheat"] = Field(description="Bit of the status.")
-    active: bool = Field(default=True, description="Whether it comes or goes.")
+    active: bool = Field(default=True, description="True sets the bit, false clears it.")
 
 
 class LateResult(DeviceFault):

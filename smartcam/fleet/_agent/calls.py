@@ -172,9 +172,9 @@ async def _enter(call: ProgramCall) -> Answer:
 
 
 async def _leave(call: ProgramCall) -> Answer:
-    found = call.entered.pop((call.host.name, call.wanted("entered", check_integer, 0)), None)
-    if found is not None:
-        camera, before = found
+    entered = call.entered.pop((call.host.name, call.wanted("entered", check_integer, 0)), None)
+    if entered is not None:
+        camera, before = entered
         if call.argument("wait", check_flag) is False:
             camera.leave(before)  # the next command reports a failure
         else:

@@ -198,30 +198,30 @@ class Claims:
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
         ports = {one.address.port for one in cameras.values()}
-        there: list[tuple[str, str, Address]] = []
+        listed_cameras: list[tuple[str, str, Address]] = []
         for _, payload in answers:
             try:
                 listed = json.loads(payload)
                 address = parse_address(str(listed["url"]))
                 if address.port in ports:
-                    there.append((str(listed["camera"]), str(listed["agent"]), address))
+                    listed_cameras.append((str(listed["camera"]), str(listed["agent"]), address))
             except (ValueError, TypeError, KeyError, SmartCamError) as exc:
                 logger.warning("! an agent's message about a camera cannot be read: %s", exc)
         hosts = {one.address.host for one in cameras.values()}
-        hosts |= {address.host for _, _, address in there}
+        hosts |= {address.host for _, _, address in listed_cameras}
         hosts |= {one.settings.address.host for one in self._agent.hosts.values()}
-        found = await _places_of(hosts)
-        there += [
+        addresses = await _places_of(hosts)
+        listed_cameras += [
             (name, self._agent.name, one.settings.address)
             for name, one in self._agent.hosts.items()
         ]
         taken: dict[tuple[str, int], list[tuple[str, str]]] = {}
-        for camera, agent, address in there:
-            for place in found.get(address.host, {address.host}):
+        for camera, agent, address in listed_cameras:
+            for place in addresses.get(address.host, {address.host}):
                 taken.setdefault((place, address.port), []).append((camera, agent))
         for name, settings in cameras.items():
             address = settings.address
-            for place in found[address.host]:
+            for place in addresses[address.host]:
                 for camera, agent in taken.get((place, address.port), ()):
                     if camera != name:
                         raise ConfigurationError(
@@ -256,20 +256,20 @@ class Claims:
         loop = asyncio.get_running_loop()
         patience = loop.time() + LEASE_TIME + 1.0
         while True:
-            there = {(name, other) for name, others in self._others.items() for other in others}
-            if not there:
+            contested = {(name, other) for name, others in self._others.items() for other in others}
+            if not contested:
                 return
             standby_of = {
                 (one.summary.camera, one.summary.agent): one.standby
-                for agent in sorted({agent for _, agent in there})
+                for agent in sorted({agent for _, agent in contested})
                 for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
-            if all(standby_of.get(one) for one in there):
+            if all(standby_of.get(one) for one in contested):
                 return
-            silent = not there & standby_of.keys()
+            silent = not contested & standby_of.keys()
             if not silent or loop.time() > patience:
-                name, agent = min(one for one in there if not standby_of.get(one))
-                more = f", and {len(there) - 1} more cameras" if len(there) > 1 else ""
+                name, agent = min(one for one in contested if not standby_of.get(one))
+                more = f", and {len(contested) - 1} more cameras" if len(contested) > 1 else ""
                 says = ", which does not answer" if silent else ""
                 raise ConfigurationError(
                     f"{name}: the agent {agent} of fleet {self._keys.fleet}{says} has this camera "

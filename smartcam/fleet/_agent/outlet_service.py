@@ -174,8 +174,8 @@ class OutletService:
             if error is not None:
                 raise error
             request = validated(StoredRequest, given or {}, "outlets: results")
-            found = await self._stored(request)
-            outcome = {"error": "", "stores": {name: _bounded(one) for name, one in found.items()}}
+            stored = await self._stored(request)
+            outcome = {"error": "", "stores": {name: _bounded(one) for name, one in stored.items()}}
         except SmartCamError as exc:
             outcome = failure(exc)
         finally:
@@ -219,13 +219,13 @@ async def ask_stores(
 async def _ask(
     bus: Bus, key: str, payload: bytes, timeout: float, read: Callable[[bytes], list[T]]
 ) -> list[T]:
-    found: list[T] = []
+    answers: list[T] = []
     for _, answer in await bus.ask(key, payload, timeout):
         try:
-            found += await asyncio.to_thread(read, answer)
+            answers += await asyncio.to_thread(read, answer)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as exc:
             logger.warning("%s ! an agent's answer cannot be read: %r", key, exc)
-    return sorted(found, key=lambda one: one[:2])
+    return sorted(answers, key=lambda one: one[:2])
 
 
 def _accounts(answer: bytes) -> list[ReportedOutlet]:

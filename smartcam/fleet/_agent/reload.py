@@ -257,11 +257,11 @@ class Reloader:
         old = self.now
 
         def read() -> tuple[LoadedFleet, FleetChanges]:
-            found = file if isinstance(file, FleetFile) else load_fleet(file)
+            contents = file if isinstance(file, FleetFile) else load_fleet(file)
             try:
-                new = loaded(found, folder)
+                new = loaded(contents, folder)
             except ValueError as exc:
-                raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
+                raise ConfigurationError(f"fleet {contents.fleet}: {exc}") from exc
             return new, changes_of(old, new, agent)
 
         self._reading = asyncio.get_running_loop().run_in_executor(None, read)

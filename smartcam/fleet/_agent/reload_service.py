@@ -76,19 +76,19 @@ async def reload_agents(
     bus: Bus, keys: Keys, agents: list[str], timeout: float
 ) -> dict[str, FleetChanges | SmartCamError]:
     """Reload the files of agents; return the answer of each, by its name."""
-    found: dict[str, FleetChanges | SmartCamError] = {}
+    outcomes: dict[str, FleetChanges | SmartCamError] = {}
     pattern = keys.reload(agents[0] if len(agents) == 1 else "*")
     for key, payload in await bus.ask(pattern, b"", timeout):
         agent = key.split("/")[-2]
-        found[agent] = _read(agent, payload)
+        outcomes[agent] = _read(agent, payload)
     for agent in agents:
-        if agent not in found:
-            found[agent] = ResponseTimeoutError(
+        if agent not in outcomes:
+            outcomes[agent] = ResponseTimeoutError(
                 f"reload: no answer of the agent {agent} within {timeout:.3g} s: it may be gone, "
                 "busy, or this program may not ask; whether it was done is unknown",
                 waited=timeout,
             )
-    return {name: found[name] for name in sorted(found)}
+    return {name: outcomes[name] for name in sorted(outcomes)}
 
 
 def _read(agent: str, payload: bytes) -> FleetChanges | SmartCamError:

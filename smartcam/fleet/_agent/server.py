@@ -66,7 +66,7 @@ class FleetServer(Server):
 
     Args:
         file: path of a fleet file, or the contents of one.
-        bus: end of another bus than that of the file.
+        bus: end of a bus to use instead of the one that the file describes.
         folder: folder of the file's relative paths, if ``file`` is not a path itself.
         restore: whether application and run state of a camera are restored after a reconnect, if
             its entry does not set that; None: if ``ros2`` in the file has nodes that become active
@@ -101,13 +101,13 @@ class FleetServer(Server):
         self.observers: list[Observer] = []
         self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
         self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = _nothing
-        found = file if isinstance(file, FleetFile) else load_fleet(file)
+        contents = file if isinstance(file, FleetFile) else load_fleet(file)
         self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
-            now = loaded(found, self.folder)
+            loaded_file = loaded(contents, self.folder)
         except ValueError as exc:
-            raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
-        self.reloads: Reloader = Reloader(self.folder, now, self._source)
+            raise ConfigurationError(f"fleet {contents.fleet}: {exc}") from exc
+        self.reloads: Reloader = Reloader(self.folder, loaded_file, self._source)
         listen, connect = self.file.endpoints
         for _, mistake in access_mistakes(self.file.access, listen):
             raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
@@ -115,7 +115,7 @@ class FleetServer(Server):
         # with certificates all connections must come through the router
         peer = self.file.ros2 is not None and self.file.certificates is None
         link = BusLink(listen, connect, self.file.certificates, peer)
-        self._bus = bus or ZenohEnd(link, self._more())
+        self._bus = bus or ZenohEnd(link, self._engine_settings())
         self._ros: RosFleet | None = None
         section = self.file.ros2
         self._restore = (section is not None and section.autostart) if restore is None else restore
@@ -148,7 +148,7 @@ class FleetServer(Server):
             stack.push_async_callback(_end_emulators, sources)
             for name, planned in self.reloads.now.plan.items():
                 sources[name] = await self._source(planned, self.folder)
-            self.calibrations = self._desks(stack)
+            self.calibrations = self._open_calibrations(stack)
             history = (file.history.results, file.history.bytes)
             agent = Agent(
                 file.agent_name,
@@ -156,7 +156,7 @@ class FleetServer(Server):
                 self._bus,
                 {name: source.settings for name, source in sources.items()},
                 history=history,
-                on_event=self._tell,
+                on_event=self._publish,
                 frames={name: source.frames for name, source in sources.items() if source.frames},
                 standby=file.standby,
                 observers=self.observers,
@@ -191,7 +191,7 @@ class FleetServer(Server):
                 stack.push_async_callback(_end, watching)
             self._agent, self._stack = agent, stack.pop_all()
 
-    def _desks(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
+    def _open_calibrations(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
         """Return the calibrations of the cameras, in the folder of the file.
 
         Raises:
@@ -203,13 +203,13 @@ class FleetServer(Server):
             from smartcam.calibration._inside import CalibrationDesks
         place = self.folder / self.file.calibrations
         try:
-            found = CalibrationDesks(place)
+            calibrations = CalibrationDesks(place)
         except OSError as exc:
             raise ConfigurationError(
                 f"calibrations: {place}: expected a folder, or a place for one: {exc.strerror}"
             ) from exc
-        stack.callback(found.close)
-        return found
+        stack.callback(calibrations.close)
+        return calibrations
 
     def _retire(self, why: ConfigurationError) -> None:
         """End the streams of the cameras' events with the error: another agent has the name."""
@@ -219,20 +219,20 @@ class FleetServer(Server):
     def _forget_hosts(self) -> None:
         self._hosts = {}
 
-    def _more(self) -> dict[str, Any]:
+    def _engine_settings(self) -> dict[str, Any]:
         """Return further settings of the engine."""
-        found: dict[str, Any] = {}
+        settings: dict[str, Any] = {}
         domain: int | None = None
         if self.file.ros2 is not None:
             with from_part("ros2", '"ros2:" in a fleet file needs'):
                 from smartcam.ros2 import RosContext
                 from smartcam.ros2._inside import SETTINGS
 
-            found |= SETTINGS
+            settings |= SETTINGS
             domain = RosContext(domain=self.file.ros2.domain).domain
         if self._access == "roles":
-            found["access_control"] = access_control(domain)
-        return found
+            settings["access_control"] = access_control(domain)
+        return settings
 
     @property
     def _access(self) -> Access | None:
@@ -264,7 +264,7 @@ class FleetServer(Server):
 
     async def _enter_ros(self) -> None:
         if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-            self._ros = self._seen_in_ros(self._bus)
+            self._ros = self._ros_fleet(self._bus)
             await self._ros.start()
 
     async def _leave_ros(self) -> None:
@@ -287,13 +287,13 @@ class FleetServer(Server):
             else:
                 return
 
-    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+    def _ros_fleet(self, bus: ZenohEnd) -> RosFleet:
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
         file, own = self.file, self.file.agent_name
         cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        found = {name: one.load_calibration(self.folder) for name, one in cameras.items()}
-        places = {name: one.load_hand_eye(self.folder) for name, one in cameras.items()}
+        calibrations = {name: one.load_calibration(self.folder) for name, one in cameras.items()}
+        hand_eyes = {name: one.load_hand_eye(self.folder) for name, one in cameras.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -303,8 +303,8 @@ class FleetServer(Server):
             settings=self._settings,
             frames=self._ros_frames,
             controls=self._controls,
-            calibrations={name: one for name, one in found.items() if one is not None},
-            places={name: one for name, one in places.items() if one is not None},
+            calibrations={name: one for name, one in calibrations.items() if one is not None},
+            hand_eyes={name: one for name, one in hand_eyes.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
             desks=self.calibrations,
         )
@@ -317,7 +317,7 @@ class FleetServer(Server):
             stream.end(None)
 
     def __del__(self) -> None:
-        # the event loop refers to it until it is stopped; so it is collected only after the loop
+        # the event loop refers to a started server, so it is collected only together with the loop
         if vars(self).get("_agent") is not None:
             text = f"agent {self.file.agent_name} of fleet {self.file.fleet} was not stopped"
             warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
@@ -357,11 +357,11 @@ class FleetServer(Server):
             given = self._given_frames.get(planned.name)
             frames = None if given is None else FramesOf(given, "replayed")
             if entry.software is not None:
-                device, frames = await self._see(planned, folder, stack)
+                device, frames = await self._start_software_camera(planned, folder, stack)
                 url = device.url
                 names = {one.name: number for number, one in device.camera.programs.items()}
-                usual = {"interpret_as": device.interpret_as, "application_names": names}
-                update = {name: one for name, one in usual.items() if not getattr(entry, name)}
+                defaults = {"interpret_as": device.interpret_as, "application_names": names}
+                update = {name: one for name, one in defaults.items() if not getattr(entry, name)}
                 entry = entry.model_copy(update=update)
             else:
                 url = entry.url or await self._emulate(planned, stack)
@@ -389,7 +389,7 @@ class FleetServer(Server):
             raise ConfigurationError(f"{name}: the agent does not have it")
         return await host.frames.source()
 
-    async def _see(
+    async def _start_software_camera(
         self, planned: Planned, folder: Path, stack: contextlib.AsyncExitStack
     ) -> tuple[SoftwareDevice, FramesOf]:
         """Start a software camera; return it, and the frames that it has judged."""
@@ -453,7 +453,7 @@ class FleetServer(Server):
             stream.end(self._agent.retired_by)
         return stream
 
-    def _tell(self, event: CameraEvent) -> None:
+    def _publish(self, event: CameraEvent) -> None:
         for stream in self._events:
             stream.offer(event, 0.0)
 
@@ -518,10 +518,10 @@ def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
     """Return the address and lens of a frame source as parameters of v4l2_camera."""
     if entry is None:
         return {}
-    found: dict[str, Any] = {"video_device": masked(entry.url)}
+    parameters: dict[str, Any] = {"video_device": masked(entry.url)}
     if url := entry.camera_info_url(folder):
-        found["camera_info_url"] = url
-    return found
+        parameters["camera_info_url"] = url
+    return parameters
 
 
 async def _nothing(_asked: StoredRequest) -> dict[str, Any]:
@@ -547,7 +547,7 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    # with roles each program has its own certificate: the agent's own may not command
+    # with roles each program needs a certificate of its own: that of the agent may not command
     own = scheme == "fleet+tls" and file.access == "any-certificate"
     certificates = file.certificates if own else None
     # a router of several agents may have several fleets

@@ -143,25 +143,25 @@ async def ask_cameras(
         timeout: seconds to wait for the answers.
     """
     answers = await bus.ask(keys.summary(agent), pattern.encode(), timeout)
-    found: list[ReportedCamera] = []
+    cameras: list[ReportedCamera] = []
     for _, payload in answers:
         try:
-            found += _read(payload)
+            cameras += _read(payload)
         except (ValueError, TypeError, KeyError, SmartCamError) as exc:
             logger.warning("%s ! an agent's cameras cannot be read: %s", keys.fleet, exc)
         await asyncio.sleep(0)
-    return found
+    return cameras
 
 
 def _read(payload: bytes) -> Iterable[ReportedCamera]:
     listed: Any = json.loads(payload)
     agent, standby = str(listed["agent"]), bool(listed.get("standby"))
-    found: list[ReportedCamera] = []
+    cameras: list[ReportedCamera] = []
     for name, connected, status, application, holder, reason, epoch, following in listed["cameras"]:
         word = None if status is None else Status(status)
         summary = CameraSummary(name, agent, bool(connected), word, application, holder, reason)
-        found.append(ReportedCamera(summary, int(epoch), int(following), standby))
-    return found
+        cameras.append(ReportedCamera(summary, int(epoch), int(following), standby))
+    return cameras
 
 
 def by_name(

@@ -133,8 +133,8 @@ class FleetAddress(NamedTuple):
         if not _HOST.fullmatch(parts.hostname):
             raise ConfigurationError(f"{what}: {parts.hostname!r:.80} is no host")
         wrong = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
-        for part, there in wrong.items():
-            if there:
+        for part, present in wrong.items():
+            if present:
                 raise ConfigurationError(f"{what} has {part}, which means nothing")
         query: dict[str, str] = {}
         for key, value in parse_qsl(parts.query, keep_blank_values=True):

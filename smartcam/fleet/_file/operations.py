@@ -15,8 +15,8 @@ _PLACE = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 
 
 def _place(text: str) -> str:
-    found = _PLACE.fullmatch(text)
-    if found is None or int(found[2]) > 0xFFFF:
+    match = _PLACE.fullmatch(text)
+    if match is None or int(match[2]) > 0xFFFF:
         raise ValueError(f"expected HOST:PORT such as {DEFAULT_PLACE}, got {text!r:.80}")
     return text
 

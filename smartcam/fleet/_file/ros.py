@@ -129,10 +129,10 @@ def node_names(cameras: list[str]) -> dict[str, str]:
     Raises:
         ValueError: two cameras have the same name.
     """
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for camera in cameras:
         name = as_name(camera)
-        other = found.setdefault(name, camera)
+        other = names.setdefault(name, camera)
         if other != camera:
             raise ValueError(f"{other} and {camera} would both be /{name} in ROS")
-    return {camera: name for name, camera in found.items()}
+    return {camera: name for name, camera in names.items()}

@@ -249,10 +249,10 @@ class FrameCaller:
             reply = await self._caller.call("lens", deadline, {"lens": number})
             data = reply.fields["answer"]["lens"]
             try:
-                found = None if data is None else CameraModel.from_data(data)
+                lens = None if data is None else CameraModel.from_data(data)
             except CalibrationError as exc:
                 raise RemoteProtocolError(f"{self.name}: invalid lens of the agent: {exc}") from exc
-            self._lenses[key] = found
+            self._lenses[key] = lens
             if len(self._lenses) > MAX_LENSES:
                 del self._lenses[next(iter(self._lenses))]
         return self._lenses[key]

@@ -377,8 +377,8 @@ class SharedFrames:
 
     def lens(self, number: int) -> dict[str, Any]:
         """Return the lens with a number from a frame; None if it is not known."""
-        found = self._lenses.get(number)
-        return {"lens": None if found is None else found.to_data()}
+        lens = self._lenses.get(number)
+        return {"lens": None if lens is None else lens.to_data()}
 
     # ------------------------------------------------------------------ a frame
 

@@ -105,7 +105,7 @@ class FrameCollector:
         if self._handle is None:
             program = self._program
             key = program.keys.frames(program.name)
-            self._handle = program.bus.subscribe_parts(key, self._hear)
+            self._handle = program.bus.subscribe_parts(key, self._take_part)
         incoming = self._incoming[call] = Incoming(self, caller, call)
         return incoming
 
@@ -119,7 +119,7 @@ class FrameCollector:
         if handle is not None:
             handle.close()
 
-    def _hear(self, key: str, head: bytes, data: Data) -> None:
+    def _take_part(self, key: str, head: bytes, data: Data) -> None:
         try:
             part = decode_part(head)
         except ProtocolError as exc:

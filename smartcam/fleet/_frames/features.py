@@ -99,10 +99,10 @@ class FleetFeatures(DeviceFeatures):
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
-        found = await self._described(name=name)
-        if len(found) != 1:
-            raise RemoteProtocolError(f"{self._name}: expected one feature, got {len(found)}")
-        return found[0]
+        features = await self._described(name=name)
+        if len(features) != 1:
+            raise RemoteProtocolError(f"{self._name}: expected one feature, got {len(features)}")
+        return features[0]
 
     async def _described(self, **arguments: Any) -> list[Feature]:
         answer = await self._call("features", **arguments)

@@ -125,13 +125,13 @@ class SharedVideo:
         if not kept or kept[-1].number == have:
             return []
         fresh = asyncio.get_running_loop().time() - LATE_SECONDS
-        found: list[VideoUnit] = []
+        units: list[VideoUnit] = []
         for unit in reversed(kept):
-            if unit.made < fresh and found:
+            if unit.made < fresh and units:
                 break  # the reader is too late for all of these
-            found.append(unit)
+            units.append(unit)
             if unit.key or unit.number == have + 1:
-                return found[::-1]
+                return units[::-1]
         self._key_wanted = True
         return []
 

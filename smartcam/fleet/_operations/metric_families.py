@@ -136,9 +136,9 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         yield family
     labels = ["agent", "state"]
     family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
-    there = sum(one.connected for one in numbers.cameras)
-    family.add_metric([*own, "connected"], there)
-    family.add_metric([*own, "not_connected"], len(numbers.cameras) - there)
+    connected = sum(one.connected for one in numbers.cameras)
+    family.add_metric([*own, "connected"], connected)
+    family.add_metric([*own, "not_connected"], len(numbers.cameras) - connected)
     yield family
     labels = ["agent", "outcome"]
     family = core.CounterMetricFamily("smartcam_reloads", "Readings of the file", labels=labels)

@@ -130,11 +130,11 @@ class Exchange(Bus):
     def drop(self, place: _BusPlace) -> None:
         """Drop a receiver that is no longer used."""
         kind, name = self._kind(place.key), self._name(place.key)
-        there = self._places[kind]
-        there[name].remove(place)
-        if not there[name]:
-            del there[name]
-        if kind == "results" and not there and kind in self._covers:
+        places = self._places[kind]
+        places[name].remove(place)
+        if not places[name]:
+            del places[name]
+        if kind == "results" and not places and kind in self._covers:
             self._uncover(kind)
 
     # ------------------------------------------------------------------ what comes
@@ -145,8 +145,8 @@ class Exchange(Bus):
 
     def _on_presence(self, key: str, present: bool) -> None:
         name = self._name(key)
-        there = self._present.setdefault(name, set())
-        (there.add if present else there.discard)(key)
+        presences = self._present.setdefault(name, set())
+        (presences.add if present else presences.discard)(key)
         for see in self._seers:
             see(key, present)
         for place in tuple(self._places.get("presence/camera", {}).get(name, ())):
@@ -182,9 +182,9 @@ class Exchange(Bus):
             self._asking[agent] = asyncio.get_running_loop().create_task(
                 self._ask_numbers(agent), name=f"smartcam.fleet.{agent}.numbers"
             )
-            self._asking[agent].add_done_callback(partial(self._asked, agent))
+            self._asking[agent].add_done_callback(partial(self._end_asking, agent))
 
-    def _asked(self, agent: str, task: asyncio.Task[None]) -> None:
+    def _end_asking(self, agent: str, task: asyncio.Task[None]) -> None:
         if self._asking.get(agent) is task:
             del self._asking[agent]
 

@@ -58,11 +58,11 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Largest number of cameras of a fleet that are met when it is opened; in a larger fleet each
-camera is met when it is used."""
+"""Largest number of cameras of a fleet that are met when it is opened: their agents are asked for
+their state. In a larger fleet each camera is met when it is used."""
 
-AT_ONCE = 100
-"""Number of cameras that are met, or closed, at a time."""
+MAX_CAMERAS_AT_ONCE = 100
+"""Largest number of cameras that are met, or closed, at a time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
 """Largest number of cameras with a subscription each; for more, if they are most of the fleet,
@@ -146,12 +146,11 @@ class FleetResults(Generic[ValueT]):
         self, subscribe: Callable[[FleetCamera[Any]], Subscription[Result[ValueT]]]
     ) -> None:
         self._subscribe = subscribe
-        # subscriptions of each camera; earlier ones in a list ended with a camera that was given
-        # up
+        # subscriptions of each camera; only the last one of a list may still be open
         self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
         # subscriptions that have results
-        self._line: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
-        self._in_line: set[Subscription[Result[ValueT]]] = set()
+        self._ready_streams: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
+        self._queued: set[Subscription[Result[ValueT]]] = set()
         self._ready = asyncio.Event()
         self._ended = False
 
@@ -165,9 +164,9 @@ class FleetResults(Generic[ValueT]):
         stream.share(_QueueBell(functools.partial(self._queue, stream)))
 
     def _queue(self, stream: Subscription[Result[ValueT]]) -> None:
-        if stream not in self._in_line:
-            self._in_line.add(stream)
-            self._line.append(stream)
+        if stream not in self._queued:
+            self._queued.add(stream)
+            self._ready_streams.append(stream)
         self._ready.set()
 
     def statistics(self) -> dict[str, SubscriberStatistics]:
@@ -204,9 +203,9 @@ class FleetResults(Generic[ValueT]):
             StopAsyncIteration: the stream or the fleet was closed.
         """
         while True:
-            while self._line:
-                stream = self._line.popleft()
-                self._in_line.discard(stream)
+            while self._ready_streams:
+                stream = self._ready_streams.popleft()
+                self._queued.discard(stream)
                 if not stream.waiting:
                     if not stream.ended:
                         continue
@@ -285,7 +284,7 @@ class Fleet:
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
         self._meets = True  # whether every camera is met at once, since there are few
-        self._turn = asyncio.Semaphore(AT_ONCE)
+        self._meeting_slots = asyncio.Semaphore(MAX_CAMERAS_AT_ONCE)
         self._make("camera")  # raises for wrong options now
 
     # ------------------------------------------------------------------ life
@@ -309,9 +308,11 @@ class Fleet:
             deadline = loop.time() + self._timeout
             await self._program.open(self._timeout)
             keys, bus = self._program.keys, self._program.bus
-            there = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
-            self._meets = len(there) <= MAX_CAMERAS_MET
-            for key in there:
+            camera_keys = await bus.present(
+                keys.camera("*", "**"), max(0.0, deadline - loop.time())
+            )
+            self._meets = len(camera_keys) <= MAX_CAMERAS_MET
+            for key in camera_keys:
                 self._on_camera(key, True)
             if self._meets:
                 self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))
@@ -337,8 +338,8 @@ class Fleet:
             task.cancel()
         await asyncio.gather(*self._opening.values(), return_exceptions=True)
         cameras = [*self._cameras.values()]
-        for begin in range(0, len(cameras), AT_ONCE):
-            await close_all(one.close for one in cameras[begin : begin + AT_ONCE])
+        for begin in range(0, len(cameras), MAX_CAMERAS_AT_ONCE):
+            await close_all(one.close for one in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
         for results in self._subscribed("**"):
             results.end()
         for stream in self._events:
@@ -356,7 +357,7 @@ class Fleet:
         await self.close()
 
     def __del__(self) -> None:
-        # its bus refers to it until it is closed; so it is collected only after the bus
+        # an open bus refers to its fleet, so a fleet is collected only together with the bus
         if vars(self).get("_state") == "open":
             warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
 
@@ -391,8 +392,8 @@ class Fleet:
             ConfigurationError: the pattern is not valid.
         """
         pattern = check_pattern(pattern)
-        there = self._agents.items()
-        return sorted(name for name, agents in there if agents and meets(pattern, name))
+        shared = (name for name, agents in self._agents.items() if agents)
+        return sorted(name for name in shared if meets(pattern, name))
 
     def url_of(self, name: str) -> str:
         """Return the URL of a single camera, for :func:`smartcam.connect`.
@@ -431,9 +432,9 @@ class Fleet:
         """
         name = check_text(name, "camera", self.url)
         if name not in self._agents:
-            there = ", ".join(sorted(self._agents)[:20]) or "none"
+            names = ", ".join(sorted(self._agents)[:20]) or "none"
             raise ConfigurationError(
-                f"the fleet has no camera {name!r}; there are {there}"
+                f"the fleet has no camera {name!r}; there are {names}"
                 f"{did_you_mean(name, self._agents)}"
             )
         return self._known(name)
@@ -467,7 +468,7 @@ class Fleet:
         return cameras
 
     async def _met(self, meeting: Iterable[asyncio.Task[None]]) -> None:
-        """Wait until cameras were met; a cancellation does not end that."""
+        """Wait until cameras were met; after a cancellation the meeting goes on."""
         if left := {*meeting}:
             await asyncio.wait(left)
 
@@ -526,7 +527,7 @@ class Fleet:
 
         Args:
             pattern: pattern of the cameras' names.
-            since: least time of the rows, with its zone; None: all rows.
+            since: time of the oldest rows to return, with its zone; None: all rows.
             failed: whether rows are only errors, gaps, and results that did not pass.
             most: largest number of rows of each store, which are the newest.
             timeout: seconds for the answers of all agents; those that do not answer are left out.
@@ -573,7 +574,7 @@ class Fleet:
         self._events.add(stream)
         return stream
 
-    def _tell(self, kind: type[FleetEvent], *names: str) -> None:
+    def _publish(self, kind: type[FleetEvent], *names: str) -> None:
         for stream in self._events:
             stream.offer(kind(self._name, datetime.now(UTC), *names), 0.0)
 
@@ -587,12 +588,12 @@ class Fleet:
             return
         if present:
             self._present.add(agent)
-            self._tell(AgentJoined, agent)
+            self._publish(AgentJoined, agent)
             return
         for name in sorted(name for name, agents in self._agents.items() if agent in agents):
             self._leave(agent, name)
         self._present.discard(agent)
-        self._tell(AgentLeft, agent)
+        self._publish(AgentLeft, agent)
 
     def _on_camera(self, key: str, present: bool) -> None:
         keys = self._program.keys
@@ -610,14 +611,14 @@ class Fleet:
         wanted = self._meets or bool(self._subscribed(name))
         if (known is None and wanted) or (known is not None and known.ended):
             self._meet(name)
-        self._tell(CameraJoined, agent, name)
+        self._publish(CameraJoined, agent, name)
 
     def _leave(self, agent: str, name: str) -> None:
         self._agents[name].discard(agent)
         camera = self._cameras.get(name)
         if camera is not None:
             camera.agent_left(agent)  # before the event is read
-        self._tell(CameraLeft, agent, name)
+        self._publish(CameraLeft, agent, name)
 
     # ------------------------------------------------------------------ cameras
 
@@ -650,7 +651,7 @@ class Fleet:
     async def _attend(self, camera: FleetCamera[Any], before: FleetCamera[Any] | None) -> None:
         if before is not None:
             await before.close()
-        async with self._turn:
+        async with self._meeting_slots:
             await camera.attend(self._timeout)
 
     # ------------------------------------------------------------------ several cameras
@@ -700,14 +701,14 @@ class Fleet:
         if agent is not None:
             agent = check_text(agent, "agent", "reload")
         self._require_open()
-        there = sorted(self._present)
-        if agent is not None and agent not in there:
+        agents = sorted(self._present)
+        if agent is not None and agent not in agents:
             raise ConfigurationError(
-                f"the fleet has no agent {agent!r}; there are {', '.join(there[:20]) or 'none'}"
-                f"{did_you_mean(agent, there)}"
+                f"the fleet has no agent {agent!r}; there are {', '.join(agents[:20]) or 'none'}"
+                f"{did_you_mean(agent, agents)}"
             )
         program = self._program
-        wanted = there if agent is None else [agent]
+        wanted = agents if agent is None else [agent]
         return await reload_agents(program.bus, program.keys, wanted, timeout)
 
     async def _each(
@@ -717,8 +718,8 @@ class Fleet:
         self._require_open()
         cameras = await self.meet(pattern)
         if not cameras:
-            there = ", ".join(self.names()[:20]) or "none"
-            raise ConfigurationError(f"no camera of the fleet is {pattern!r}; there are {there}")
+            names = ", ".join(self.names()[:20]) or "none"
+            raise ConfigurationError(f"no camera of the fleet is {pattern!r}; there are {names}")
 
         async def outcome(doing: Coroutine[Any, Any, Any]) -> Any:
             try:
@@ -782,5 +783,5 @@ class Fleet:
 
     def _subscribed(self, name: str) -> list[FleetResults[Any]]:
         """Return the streams whose pattern has a name in common with a name or pattern."""
-        found = [results() for pattern, results in self._results if meets(pattern, name)]
-        return [one for one in found if one is not None]
+        streams = [results() for pattern, results in self._results if meets(pattern, name)]
+        return [one for one in streams if one is not None]

@@ -169,13 +169,13 @@ class _Authority:
 
     def read(self, place: Path) -> Any:
         """Return the identity in the certificate of a folder."""
-        found = read_identity(place)
-        if found.role not in ROLES:
+        identity = read_identity(place)
+        if identity.role not in ROLES:
             raise ConfigurationError(
-                f"certificates: {place} has one with the role {found.role!r:.40}: expected one of "
-                f"{', '.join(ROLES)}"
+                f"certificates: {place} has one with the role {identity.role!r:.40}: expected one "
+                f"of {', '.join(ROLES)}"
             )
-        return found
+        return identity
 
     def make(self, role: str, name: str, hosts: list[str], lifetime: timedelta) -> MadeCertificate:
         """Return the certificate of a name; it is made, or renewed, if needed."""
@@ -204,15 +204,15 @@ class _Authority:
 
         if not (place / CERT_FILE).is_file():
             return None
-        found = x509.load_pem_x509_certificate((place / CERT_FILE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((place / CERT_FILE).read_bytes())
         try:
-            found.verify_directly_issued_by(self._certificate)
+            certificate.verify_directly_issued_by(self._certificate)
         except Exception as exc:  # InvalidSignature, ValueError, TypeError: another authority's
             raise ConfigurationError(
                 f"certificates: {place / CERT_FILE} is of another authority than "
                 f"{self._folder / AUTHORITY}: expected one of it, or none"
             ) from exc
-        return found
+        return certificate
 
     def _sign(
         self, role: str, name: str, hosts: list[str], lifetime: timedelta, place: Path
@@ -263,10 +263,10 @@ def _key_in(place: Path) -> Any:
 def _subject(common: str, unit: str) -> Any:
     from cryptography import x509
 
-    found = [x509.NameAttribute(x509.NameOID.COMMON_NAME, common)]
+    attributes = [x509.NameAttribute(x509.NameOID.COMMON_NAME, common)]
     if unit:
-        found.append(x509.NameAttribute(x509.NameOID.ORGANIZATIONAL_UNIT_NAME, unit))
-    return x509.Name(found)
+        attributes.append(x509.NameAttribute(x509.NameOID.ORGANIZATIONAL_UNIT_NAME, unit))
+    return x509.Name(attributes)
 
 
 def _builder(subject: Any, issuer: Any, key: Any, ends: datetime) -> Any:
@@ -312,10 +312,10 @@ def _hosts_of(certificate: Any) -> list[str]:
     from cryptography import x509
 
     try:
-        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
     except x509.ExtensionNotFound:
         return []
-    return [str(one.value) for one in found.value]
+    return [str(one.value) for one in extension.value]
 
 
 def _ends_soon(certificate: Any) -> bool:

@@ -191,8 +191,8 @@ def read_identity(folder: Path) -> Identity:
 
 
 def _named(own: x509.Certificate, oid: Any) -> str:
-    found = own.subject.get_attributes_for_oid(oid)
-    return str(found[0].value) if found else ""
+    attributes = own.subject.get_attributes_for_oid(oid)
+    return str(attributes[0].value) if attributes else ""
 
 
 def context(folder: Path) -> ssl.SSLContext:

@@ -275,13 +275,13 @@ class Door:
 
     def _connected(self) -> set[Place]:
         """Return the other ends of all connections of the ports."""
-        found: set[Place] = set()
+        ends: set[Place] = set()
         for one in _sockets():
             with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
                 if one.getsockname()[1] in self._ports and not _listens(one):
                     host, port, *_ = one.getpeername()
-                    found.add((plain_host(host), port))
-        return found
+                    ends.add((plain_host(host), port))
+        return ends
 
     # ------------------------------------------------------------------ filters
 
@@ -301,37 +301,37 @@ class Door:
         """Return True if all listening sockets are still the same."""
         for number in self._listeners:
             try:
-                found = socket.socket(fileno=number)
+                listener = socket.socket(fileno=number)
             except OSError:
                 return False
             try:
-                if not self._is_ours(found):
+                if not self._is_ours(listener):
                     return False
             finally:
-                found.detach()
+                listener.detach()
         return bool(self._listeners)
 
     def _filter(self, number: int) -> bool:
         """Set the filter of one listening socket; return False if it is not the engine's."""
         try:
-            found = socket.socket(fileno=number)
+            listener = socket.socket(fileno=number)
         except OSError:
             return False
         try:
-            if not self._is_ours(found):
+            if not self._is_ours(listener):
                 return False
             steps = packet_filter(shut=self.shut, blocked=sorted(self.blocked))
             if steps == [_PASS]:
                 with contextlib.suppress(FileNotFoundError):  # the socket has no filter
-                    found.setsockopt(socket.SOL_SOCKET, DETACH_FILTER, 0)
+                    listener.setsockopt(socket.SOL_SOCKET, DETACH_FILTER, 0)
             else:
-                attach(found, steps)
+                attach(listener, steps)
         except OSError:
             return False
         else:
             return True
         finally:
-            found.detach()
+            listener.detach()
 
     def _find(self) -> list[int]:
         """Return the descriptors of the engine's listening sockets."""
@@ -374,13 +374,13 @@ def _sockets() -> Iterator[socket.socket]:
     """Yield this process' sockets in turn, without taking ownership."""
     for name in os.listdir("/dev/fd"):  # noqa: PTH208 - names are enough
         try:
-            found = socket.socket(fileno=int(name))
+            sock = socket.socket(fileno=int(name))
         except OSError:
             continue
         try:
-            yield found
+            yield sock
         finally:
-            found.detach()
+            sock.detach()
 
 
 def _lowest_free(most: int) -> int:

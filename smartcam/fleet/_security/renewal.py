@@ -67,24 +67,26 @@ class CertificateWatch:
 
     async def _follow(self, seen: Identity | None) -> Identity | None:
         """Use the current certificates; return their identity."""
-        found = await self._look()
-        if found is not None and seen is not None and found.digest != seen.digest:
+        identity = await self._look()
+        if identity is not None and seen is not None and identity.digest != seen.digest:
             if self._listens:
                 await self._reopen()
-            logger.info("certificates ! those of %s were renewed: until %s", found, found.ends)
-        return found or seen
+            logger.info(
+                "certificates ! those of %s were renewed: until %s", identity, identity.ends
+            )
+        return identity or seen
 
     async def _look(self) -> Identity | None:
         """Return the identity in the certificates; None, logged once, if they are not valid."""
         try:
-            found = await self._end.look_at_certificates()
+            identity = await self._end.look_at_certificates()
         except SmartCamError as exc:
             if str(exc) != self._trouble:
                 logger.error("certificates ! not taken; all goes on as it was: %s", exc)  # noqa: TRY400 - the text says it
             self._trouble = str(exc)
             return None
         self._trouble = ""
-        return found
+        return identity
 
     async def _reopen(self) -> None:
         with contextlib.suppress(TimeoutError):

@@ -200,10 +200,10 @@ def find_camera(url: str) -> CellCamera:
         return cameras[name]
     if not mark and len(cameras) == 1:
         return next(iter(cameras.values()))
-    there = ", ".join(cameras)
+    names = ", ".join(cameras)
     if mark:
         raise ConfigurationError(
-            f"{path} has no software camera {name!r:.80}; it has {there}"
+            f"{path} has no software camera {name!r:.80}; it has {names}"
             f"{did_you_mean(name, cameras)}"
         )
-    raise ConfigurationError(f"{path} has several software cameras: name one of {there} after #")
+    raise ConfigurationError(f"{path} has several software cameras: name one of {names} after #")

@@ -47,7 +47,7 @@ CUT: Final = 4.0
 """Standard deviations beside its place from which on a segment is another edge."""
 
 EDGE_SIGNIFICANCE: Final = 4.0
-"""Standard deviations of its height that an edge has at least."""
+"""Least height of an edge, standard deviations of the height."""
 
 SEEN_PX: Final = 1.0
 """Pixels beside its place, besides the noise, from which on a segment counts nothing as seen."""
@@ -251,11 +251,11 @@ def _equations(
 
 def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
     """Return a mask of the steps that are edges (N,), and the noise of their pixels."""
-    there = np.isfinite(fit.sigmas)
-    noise = _noise(fit, there)
+    finite = np.isfinite(fit.sigmas)
+    noise = _noise(fit, finite)
     heights = np.abs(fit.heights) if use.any_polarity else fit.heights
     tall = heights >= np.maximum(use.contrast, EDGE_SIGNIFICANCE * noise * fit.height_sigmas)
-    return there & tall & (_misfits(fit, use) <= 1), noise
+    return finite & tall & (_misfits(fit, use) <= 1), noise
 
 
 def _misfits(fit: StepFit, use: FineSettings) -> Array:
@@ -267,12 +267,12 @@ def _misfits(fit: StepFit, use: FineSettings) -> Array:
     return misfits
 
 
-def _noise(fit: StepFit, there: NDArray[np.bool_]) -> float:
+def _noise(fit: StepFit, finite: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the bands' pixels; most of the bands have nothing else."""
-    if not there.any():
+    if not finite.any():
         return ROUNDING
-    freedom = float(np.median(fit.freedoms[there]))
-    median = float(np.median(fit.variances[there])) / (1 - 2 / (9 * freedom)) ** 3
+    freedom = float(np.median(fit.freedoms[finite]))
+    median = float(np.median(fit.variances[finite])) / (1 - 2 / (9 * freedom)) ** 3
     return max(math.sqrt(median), ROUNDING)
 
 

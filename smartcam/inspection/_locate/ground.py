@@ -32,7 +32,7 @@ GROUND_SQUARE: Final = 4.0
 have at least where the ground is not of one level; by noise alone it is 1.3."""
 
 MIN_BANDS: Final = 12
-"""Bands that tell what the ground is like at least."""
+"""Least number of bands from which the light on the ground is computed."""
 
 NEAR_PX: Final = 10.0
 """Standard deviation of the distance of the bands from which the ground beside a band is measured,

@@ -223,11 +223,11 @@ def find_edges(
         )
         for _ in range(number)
     ]
-    there = np.flatnonzero(fits)
-    if not len(there):
+    crossed = np.flatnonzero(fits)
+    if not len(crossed):
         return found
-    part = strips.some(there)
-    samples = len(there) * steps_of(strips.length) * steps_of(strips.width)
+    part = strips.selected(crossed)
+    samples = len(crossed) * steps_of(strips.length) * steps_of(strips.width)
     if samples > MAX_SAMPLES or strips.width > MAX_WIDTH_PX:
         text = (
             f"{samples} pixels in strips {strips.width:.0f} wide, {MAX_SAMPLES} and "
@@ -239,7 +239,7 @@ def find_edges(
     noise = noise_of(_around(image, part))
     candidates, counts = _candidates(profiles(image, part), part, settings, noise)
     steps = _steps(image, part, candidates, settings, noise, tilted=tilted)
-    for index, owner in enumerate(there.tolist()):
+    for index, owner in enumerate(crossed.tolist()):
         mine = [one for one in steps if one.owner == index]
         crowded = sum(map(len, candidates[index : index + 1])) > len(mine)
         found[owner] = _of_strip(mine, settings, noise, crowded=crowded, count=counts[index])
@@ -253,19 +253,19 @@ def _of_strip(
     if crowded:
         text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be separated"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
-    there = [one for one in steps if wanted(one.edge, settings) or not one.settled]
+    judged = [one for one in steps if wanted(one.edge, settings) or not one.settled]
     too_many = None
     # if a fitted edge has too little contrast, the weaker edges have, too
     if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
         text = f"{count} edges in one strip, {MAX_EDGES} at most can be separated"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
-    if not there and too_many is not None:
+    if not judged and too_many is not None:
         return StripEdges((), too_many)
-    if not there:
+    if not judged:
         kind = {"any": "", "rising": " from dark to light", "falling": " from light to dark"}
         text = f"no edge{kind[settings.polarity]} of {settings.contrast:g} grey levels"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_EDGE, text))
-    edges = tuple(JudgedEdge(one.edge, _trouble(one, settings, noise)) for one in there)
+    edges = tuple(JudgedEdge(one.edge, _trouble(one, settings, noise)) for one in judged)
     return StripEdges(edges, too_many=too_many)
 
 
@@ -418,7 +418,7 @@ def _fit_groups(
         some = [one for one in groups if len(one.places) == count]
         owners = np.array([one.owner for one in some])
         low, high = (np.array([one[end] for one in some]) for end in (2, 3))
-        pixels = cut(image, strips.some(owners), low, high)
+        pixels = cut(image, strips.selected(owners), low, high)
         if count > MAX_GROUP_EDGES:
             continue
         places = np.array([one.places for one in some])
@@ -428,7 +428,7 @@ def _fit_groups(
         if blurs is not None and not settings.cut_off:
             cut_off = _cut_off(pixels, settings)
             if settings.clipped is not None:
-                masks = cut(settings.clipped, strips.some(owners), low, high)
+                masks = cut(settings.clipped, strips.selected(owners), low, high)
                 cut_off[:, 1] = np.maximum(cut_off[:, 1], _part(masks.levels > 0, pixels))
             cut_off[:, 1] = np.maximum(cut_off[:, 1], _plateaus(pixels, fits))
         found += _steps_of(some, fits, pixels, cut_off, strips.length / 2, noise)
@@ -495,21 +495,21 @@ def _plateaus(pixels: StripPixels, fits: StepFits) -> Array:
     levels = np.where(pixels.weights > 0, pixels.levels, -np.inf)
     parts = _part(levels == levels.max(axis=1, keepdims=True), pixels)
     for i in np.flatnonzero(parts > MAX_SATURATED_SHARE).tolist():
-        if not _is_plateau(pixels.some(np.array([i])), fits, i):
+        if not _is_plateau(pixels.selected(np.array([i])), fits, i):
             parts[i] = 0.0
     return np.where(parts > MAX_SATURATED_SHARE, parts, 0.0)
 
 
 def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
     """Return True if the dark side's noise does not explain so many pixels at the largest level."""
-    there = pixels.weights[0] > 0
-    levels, beside = pixels.levels[0][there], pixels.beside[0][there]
-    along = pixels.along[0][there] - float(fits.tilts[strip]) * beside
+    used = pixels.weights[0] > 0
+    levels, beside = pixels.levels[0][used], pixels.beside[0][used]
+    along = pixels.along[0][used] - float(fits.tilts[strip]) * beside
     order = np.argsort(fits.places[strip])
     places = fits.places[strip][order]
     heights = np.cumsum([0.0, *fits.heights[strip][order]])
-    apart = 2 * _seen_blur(float(fits.blurs[strip])) + 0.5
-    flat = np.abs(along[:, None] - places).min(axis=1) > apart
+    distance = 2 * _seen_blur(float(fits.blurs[strip])) + 0.5
+    flat = np.abs(along[:, None] - places).min(axis=1) > distance
     level = np.searchsorted(places, along)
     dark, bright = (flat & (level == one) for one in (heights.argmin(), heights.argmax()))
     noise = MIN_BRIGHT_NOISE_SHARE * _noise_in_steps(levels[dark], along[dark], beside[dark])

@@ -169,7 +169,7 @@ def _collected(
     noise = float(np.median(noises))
     noises = np.where(noises > OWN_NOISE_FACTOR * noise, noises, noise)
     blur = math.sqrt(float(np.median([one.blur for one in edges])) ** 2 + PIXEL_VARIANCE)
-    some, middle = strips.some(np.array(owners)), np.zeros(len(owners))
+    some, middle = strips.selected(np.array(owners)), np.zeros(len(owners))
     if isinstance(strips, Sectors):
         # blur moves the rim of a disc inwards by s^2 / (2 r)
         places = places + blur**2 / (2 * (strips.radius + places))

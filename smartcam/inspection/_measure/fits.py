@@ -50,7 +50,7 @@ class Edges(NamedTuple):
     normals: Array  # (N, 2), directions across the edges, of length 1
     sigmas: Array  # (N,), along the normals
 
-    def some(self, which: Mask) -> Edges:
+    def selected(self, which: Mask) -> Edges:
         """Return a selection of the edges."""
         return Edges(*(one[which] for one in self))
 
@@ -124,7 +124,7 @@ def _robust(
         text = f"{number} edges, more than {least} are needed"
         raise NotMeasuredError(NoValueReason.FEW_EDGES, text)
     if kept is not None:
-        return _fitted(edges, kept, fit, _start(edges.some(kept), through, least), least)
+        return _fitted(edges, kept, fit, _start(edges.selected(kept), through, least), least)
     start = _start(edges, through, least)
     all_edges = np.ones(number, dtype=np.bool_)
     found = _fitted(edges, all_edges, fit, start, least)
@@ -168,7 +168,7 @@ def _fitted(
     start: Array,
     least: int,
 ) -> ShapeFit[ShapeT]:
-    some = edges.some(kept)
+    some = edges.selected(kept)
     shape, values = fit(some, start)
     residuals = _distances(values[None], edges)[0]
     freedom = int(np.count_nonzero(kept)) - least

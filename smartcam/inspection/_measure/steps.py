@@ -245,7 +245,7 @@ def _solve(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepF
         still = (moved < CONVERGED_PX) | (damping[active] > 1e8)
         settled[active[still]] = True
         if still.any():
-            active, part = active[~still], part.some(~still)
+            active, part = active[~still], part.selected(~still)
         if not len(active):
             break
     if fixed.size:

@@ -49,7 +49,7 @@ class Strips(NamedTuple):
         (du, dv), (u, v) = self.directions.T[:, :, None], (off[..., 0], off[..., 1])
         return du * u + dv * v, du * v - dv * u
 
-    def some(self, which: NDArray[np.intp]) -> Strips:
+    def selected(self, which: NDArray[np.intp]) -> Strips:
         """Return a selection of the strips."""
         return self._replace(middles=self.middles[which], directions=self.directions[which])
 
@@ -85,7 +85,7 @@ class Sectors(NamedTuple):
         turned -= 2 * np.pi * np.rint(turned / (2 * np.pi))
         return np.hypot(off[..., 0], off[..., 1]) - self.radius, turned * self.radius
 
-    def some(self, which: NDArray[np.intp]) -> Sectors:
+    def selected(self, which: NDArray[np.intp]) -> Sectors:
         """Return a selection of the strips."""
         return self._replace(angles=self.angles[which])
 
@@ -105,7 +105,7 @@ class StripPixels(NamedTuple):
         counts: Array = self.weights.sum(axis=1)
         return counts
 
-    def some(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> StripPixels:
+    def selected(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> StripPixels:
         """Return the pixels of some strips."""
         return StripPixels(*(one[which] for one in self))
 

@@ -302,9 +302,9 @@ class _EdgeFinder:
 
 def _width_of(search: StripSearch, length: float, scale: float) -> float:
     """Return the width of strips along a length without overlap, so that each pixel counts once."""
-    apart = length / search.strips
+    spacing = length / search.strips
     wanted = MAX_WIDTH_PX if search.strip is None else search.strip * scale
-    return max(min(wanted, apart), 1.0)
+    return max(min(wanted, spacing), 1.0)
 
 
 def _corners(points: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:

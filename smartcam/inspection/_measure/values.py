@@ -200,9 +200,9 @@ def _from_line(line: Line, point: Point) -> Value:
 
 def _between_lines(first: Line, second: Line) -> Value:
     ahead = second.direction if first.direction @ second.direction > 0 else -second.direction
-    apart = math.acos(min(1.0, float(first.direction @ ahead)))
-    if apart > MAX_PARALLEL_ANGLE:
-        text = f"the lines are not parallel: {math.degrees(apart):.1f} degrees apart"
+    angle = math.acos(min(1.0, float(first.direction @ ahead)))
+    if angle > MAX_PARALLEL_ANGLE:
+        text = f"the lines are not parallel: {math.degrees(angle):.1f} degrees apart"
         raise NotMeasuredError(NoValueReason.UNCERTAIN, text)
     mean = (first.direction + ahead) / np.linalg.norm(first.direction + ahead)
     normal = np.array([-mean[1], mean[0]])

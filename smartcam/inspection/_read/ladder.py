@@ -191,14 +191,16 @@ def _turned(grey: NDArray[np.uint8], degrees: float) -> Prepared:
     cv2 = load("cv2", "inspection needs")
     height, width = grey.shape
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    wide = math.ceil(width * abs(cos) + height * abs(sin))
-    high = math.ceil(width * abs(sin) + height * abs(cos))
+    size = (
+        math.ceil(width * abs(cos) + height * abs(sin)),
+        math.ceil(width * abs(sin) + height * abs(cos)),
+    )
     back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0]])
-    middle = np.array([(wide - 1) / 2, (high - 1) / 2])
+    middle = (np.array(size) - 1) / 2
     back[:, 2] = ((width - 1) / 2, (height - 1) / 2) - back[:, :2] @ middle
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     turned: NDArray[np.uint8] = cv2.warpAffine(
-        grey, back, (wide, high), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=255
+        grey, back, size, flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=255
     )
     return turned, back
 

@@ -367,10 +367,10 @@ class FramedDialect(Dialect):
 
     @cached_property
     def _decoders(self) -> dict[Sender, dict[int, Codec]]:
-        found: dict[Sender, dict[int, Codec]] = {sender: {} for sender in Sender}
+        decoders: dict[Sender, dict[int, Codec]] = {sender: {} for sender in Sender}
         for row in self.table:
-            found[row.type.sender][row.message_id] = self._encoders[row.type]
-        return found
+            decoders[row.type.sender][row.message_id] = self._encoders[row.type]
+        return decoders
 
     @cached_property
     def _lengths(self) -> dict[Sender, dict[int, range]]:
@@ -381,22 +381,22 @@ class FramedDialect(Dialect):
 
     @cached_property
     def _answers(self) -> dict[int, int | None]:
-        found: dict[int, int | None] = {}
+        answers: dict[int, int | None] = {}
         for row in self.table:
             if issubclass(row.type, Request):
                 answer = self._encoders.get(row.type.answer) if row.type.answer else None
-                found[row.message_id] = None if answer is None else answer.message_id
-        return found
+                answers[row.message_id] = None if answer is None else answer.message_id
+        return answers
 
     @cached_property
     def constant(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
         """Messages without a body: the whole frame, its id, the id of the answer."""
-        found: dict[type[Message], tuple[bytes, int, int | None]] = {}
+        frames: dict[type[Message], tuple[bytes, int, int | None]] = {}
         for row in self.table:
             if not row.fields:
                 frame = self.encode_frame(self.to_frame(row.type()))
-                found[row.type] = frame, row.message_id, self.answer_id(row.message_id)
-        return found
+                frames[row.type] = frame, row.message_id, self.answer_id(row.message_id)
+        return frames
 
     @cached_property
     def _variants(self) -> dict[tuple[str, ...], FramedDialect]:

@@ -29,11 +29,11 @@ class Unfinished:
         searched: number of its bytes that were searched for another header.
     """
 
-    __slots__ = ("_frame", "_heard", "_pause", "searched")
+    __slots__ = ("_frame", "_pause", "_received_at", "searched")
 
     def __init__(self) -> None:
         self._frame = -1
-        self._heard = self._pause = 0.0
+        self._received_at = self._pause = 0.0
         self.searched: int = 0
 
     def age(self, frame: int, since: float, now: float) -> float:
@@ -42,7 +42,7 @@ class Unfinished:
         ``frame``: number of the frame. Its first bytes came at ``since``, the last at ``now``.
         """
         if frame != self._frame:
-            self._frame, self._heard, self._pause, self.searched = frame, since, 0.0, 0
-        self._pause = max(self._pause, now - self._heard)
-        self._heard = now
+            self._frame, self._received_at, self._pause, self.searched = frame, since, 0.0, 0
+        self._pause = max(self._pause, now - self._received_at)
+        self._received_at = now
         return now - since - self._pause

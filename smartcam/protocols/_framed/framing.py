@@ -268,11 +268,11 @@ class Framer:
         the list. ``read``: reader of a header and ``size`` more bytes.
         """
         header, buffer, start = self._header, self.buffer, self.start
-        found: list[bytes] = []
+        payloads: list[bytes] = []
         available, id_first, before = len(buffer), header.id_first, header.size
         least, last = before + size, available - before - size
         if start > last or isinstance(buffer, memoryview):
-            return found
+            return payloads
         magic, wanted, other, first = read(buffer, like)
         if not id_first:
             wanted, other = other, wanted
@@ -282,7 +282,7 @@ class Framer:
         if start + MAX_ALIKE_FRAMES * length <= available and length >= least and other <= longest:
             head, end = buffer[like : like + least], start + (MAX_ALIKE_FRAMES - 1) * length
             if buffer[start : start + least] == head == buffer[end : end + least]:
-                start = _cut_alike(buffer, start, head, length, found)
+                start = _cut_alike(buffer, start, head, length, payloads)
         while start <= last:
             mark, message_id, length, begins = read(buffer, start)
             if not id_first:
@@ -297,10 +297,10 @@ class Framer:
                 or end < start + least
             ):
                 break
-            found.append(buffer[start + least : end])
+            payloads.append(buffer[start + least : end])
             start = end
         self.start = start
-        return found
+        return payloads
 
     def unfinished(self) -> tuple[int, int] | None:
         """Return message id and size, header included, of a frame that is only partly received.
@@ -334,10 +334,10 @@ class Framer:
 
     def next_frame(self) -> Frame | None:
         """Return the next whole frame, or None for "more bytes"; raises as :meth:`cut`."""
-        found = self.cut()
-        if found is None:
+        frame = self.cut()
+        if frame is None:
             return None
-        message_id, begin, end = found
+        message_id, begin, end = frame
         return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:

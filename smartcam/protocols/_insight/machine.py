@@ -258,9 +258,9 @@ class InSightMachine:
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        """Put a request in line; write :meth:`data_to_send` next.
+        """Queue a request; write :meth:`data_to_send` next.
 
-        A Get status that is in line already is not repeated: its answer is new enough. Disconnect
+        A Get status that is queued already is not repeated: its answer is new enough. Disconnect
         sends nothing: the connection ends, and waiting requests are dropped.
 
         Raises:
