@@ -20,8 +20,9 @@ Nothing depends on chance: the same list and the same messages give the same byt
 
 To add a fault, write a class here, with a ``kind``, and list it in ``__all__`` and in one of the
 unions below. Add its effect as a row to ``_CHANGES`` (of one transmission) or ``_REBUILDS`` (of all
-transmissions of a message) in ``_wire_effects.py``, or to ``_ACTIONS`` in ``_device_effects.py``. Then
-write the schema again (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the docstrings.
+transmissions of a message) in ``_wire_effects.py``, or to ``_ACTIONS`` in ``_device_effects.py``.
+Then write the schema again (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the
+docstrings.
 """
 
 from __future__ import annotations
