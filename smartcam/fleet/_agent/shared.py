@@ -10,7 +10,13 @@ import json
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._client._inside import CameraState, Interpretation, Interpreted, Listeners
+from smartcam._client._inside import (
+    CameraState,
+    Interpretation,
+    Interpreted,
+    Listeners,
+    new_tuple,
+)
 from smartcam.client import SmartCamera
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError, TriggerTimeoutError
 
@@ -60,14 +66,15 @@ class Carrier(Interpretation):
     def of(self, owner: Owner) -> Carrier:
         """Return a copy for another owner's trigger, which is cheaper than a new object."""
         other = Carrier.__new__(Carrier)
-        other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
+        other.__dict__ = {**self.__dict__, "_carried": new_tuple(Carried, (owner, b""))}
         return other
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:
         if container.cells is None and container.fault is None:
-            return Interpreted(self._carried, None, 0)
+            carried: Interpreted = new_tuple(Interpreted, (self._carried, None, 0))
+            return carried
         said = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
         return Interpreted(self._carried._replace(cells=said), None, 0)
 
@@ -196,8 +203,8 @@ class SharedCamera(SmartCamera[Carried]):
         If the camera may still have input data queued, from a trigger without a result, the
         application is loaded again first, which empties the queue.
         """
-        if not self._observed:
-            return await self._trigger_in_order(application, request, timeout)
+        if not self._observed and request.input_data is None:
+            return await self._trigger(application, request, timeout)
         called_at = datetime.now(UTC)
         try:
             return await self._trigger_in_order(application, request, timeout)

@@ -7,6 +7,7 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._client._inside import new_tuple
 from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
@@ -515,19 +516,22 @@ class Caller:
         begun = asyncio.get_running_loop().time()
         deadline = begun + timeout
         interpretation = request.interpretation
-        order = TriggerOrder(
-            number,
-            met.epoch,
-            self.clock(deadline),
-            timeout,
-            application,
-            expected,
-            request.results,
-            request.wait,
-            interpretation.by_application,
-            request.input_data,
-            interpretation.numbered_layouts(),
-            self._fence("trigger"),
+        order: TriggerOrder = new_tuple(
+            TriggerOrder,
+            (
+                number,
+                met.epoch,
+                self.clock(deadline),
+                timeout,
+                application,
+                expected,
+                request.results,
+                request.wait,
+                interpretation.by_application,
+                request.input_data,
+                interpretation.numbered_layouts(),
+                self._fence("trigger"),
+            ),
         )
         payload = encode_order(self.program.token, order)
         reply = await self._ask(
