@@ -73,10 +73,9 @@ class Carrier(Interpretation):
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:
         if container.cells is None and container.fault is None:
-            carried: Interpreted = new_tuple(Interpreted, (self._carried, None, 0))
-            return carried
+            return self._carried, None, 0
         text = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
-        return Interpreted(self._carried._replace(cells=text), None, 0)
+        return self._carried._replace(cells=text), None, 0
 
     def burst(
         self,

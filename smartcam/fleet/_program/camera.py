@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -177,7 +177,7 @@ class FleetCamera(Camera[ValueT]):
         settings = self.settings
         if spec is None and settings.calibration is not None:
             spec = "localizations"
-        is_given = "y_down" in settings.model_fields_set
+        is_given = "y_down" in settings.given
         refused: ConfigurationError | None = None
         for y_down in [settings.y_down] if is_given else [False, True]:
             try:
@@ -394,10 +394,10 @@ class FleetCamera(Camera[ValueT]):
         if isinstance(layout, dict):
             layout = {int(key): value for key, value in layout.items()}
         offered = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
-        changes = {key: on for key, on in offered.items() if key not in settings.model_fields_set}
-        fields_set = settings.model_fields_set
-        self.settings: CameraSettings = settings.model_copy(update=changes)
-        self.settings.model_fields_set.intersection_update(fields_set)
+        changes: dict[str, Any] = {
+            key: on for key, on in offered.items() if key not in settings.given
+        }
+        self.settings: CameraSettings = replace(settings, **changes)
         self._agents_layout = layout
         self._interpretations.clear()
         self._met, self._unreadable = True, None
