@@ -151,7 +151,7 @@ class CameraState:
         self.want_application(application)
         self._loaded_by_us = True
 
-    def asked(self) -> None:
+    def clear_active_doubt(self) -> None:
         """Note that the camera was asked which application is active."""
         self.active_in_doubt = False
 

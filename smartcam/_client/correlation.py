@@ -199,7 +199,7 @@ class SentTrigger:
         wanted: number of results expected.
         number: sequence number set for it, None if its layout has none.
         evidence: evidence from the camera's messages.
-        came: number of its results received.
+        received: number of its received results.
         early: containers received before the camera showed that it had taken the trigger.
         given_up: True if it was given up; its missing results are pending.
         ended: True if no caller waits for it any more.
@@ -208,7 +208,7 @@ class SentTrigger:
     wanted: int
     number: int | None
     evidence: TriggerEvidence
-    came: int = field(init=False, default=0)
+    received: int = field(init=False, default=0)
     early: int = field(init=False, default=0)
     given_up: bool = field(init=False, default=False)
     ended: bool = field(init=False, default=False)
@@ -354,8 +354,9 @@ class Correlation:
             fate: fate of the results that still come.
             unread: number of its containers that could not be interpreted.
         """
-        came = pending.came if pending.evidence.proven else 0  # they may belong to another trigger
-        missing = pending.wanted - came - unread
+        # without evidence the received results may belong to another trigger
+        received = pending.received if pending.evidence.proven else 0
+        missing = pending.wanted - received - unread
         if pending.given_up or missing <= 0:
             return
         pending.given_up = True
@@ -423,7 +424,7 @@ class Correlation:
         if not asked:
             return NOBODYS
         if pending is not None and not pending.ended:
-            return OURS if pending.came < pending.wanted else EXTRA
+            return OURS if pending.received < pending.wanted else EXTRA
         return Match(self._pay(self.owed[:1]))
 
     def judge(self, number: int | None) -> Match:
@@ -438,7 +439,7 @@ class Correlation:
             numbered = number is not None and pending.number is not None
             if not numbered or number == pending.number:
                 if pending.evidence.reached:
-                    return OURS if pending.came < pending.wanted else EXTRA
+                    return OURS if pending.received < pending.wanted else EXTRA
                 if not pending.evidence.began:
                     pending.early += 1
         return self.judge_older(number)

@@ -45,14 +45,14 @@ class Remarks:
             values: values for the form.
             now: seconds of any clock that does not jump.
         """
-        found = self._kinds.setdefault(kind, _Logged(now))
-        if now - found.begun >= PERIOD:
-            self._tell_left_out(kind, level, found)
-            found.begun, found.count = now, 0
-        found.count += 1
-        if found.count <= MAX_REMARKS:
+        logged = self._kinds.setdefault(kind, _Logged(now))
+        if now - logged.begun >= PERIOD:
+            self._tell_left_out(kind, level, logged)
+            logged.begun, logged.count = now, 0
+        logged.count += 1
+        if logged.count <= MAX_REMARKS:
             logger.log(level, "%s %s", self._name, text % values)
-        elif found.count == MAX_REMARKS + 1:
+        elif logged.count == MAX_REMARKS + 1:
             more = "%s ! more of the kind %r in %g s than are logged: %d; the others are counted"
             logger.log(level, more, self._name, kind, PERIOD, MAX_REMARKS)
 

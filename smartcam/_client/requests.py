@@ -273,7 +273,7 @@ class Requests:
         """Send a Query after a switch by others, as soon as no earlier Query is open."""
         with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports it
             if self.ask_for_life(asyncio.get_running_loop().time()):
-                self._state.asked()
+                self._state.clear_active_doubt()
 
     def is_done(self, request: type[m.Message], answer: m.Acknowledgement) -> bool:
         """Return True if an answer says that all is well: :meth:`check` would not raise."""

@@ -265,7 +265,7 @@ class Results:
         """Pass on the unproven containers: to the trigger, or as older ones if it has ended."""
         unproven, pending.unproven = pending.unproven, []
         if not pending.ended:
-            pending.came -= sum(fate == "triggered" for _, fate, *_ in unproven)
+            pending.received -= sum(fate == "triggered" for _, fate, *_ in unproven)
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
                 self.hand_on(container, None, fate, number, now, at)
@@ -364,7 +364,7 @@ class Results:
         if pending is not None and (pending.unproven or (ours and not pending.evidence.proven)):
             pending.unproven.append((container, match.fate, number, now, at))
             if ours:
-                pending.came += 1
+                pending.received += 1
             return
         owner = pending if match.fate == "triggered" else None
         self.hand_on(container, owner, match.fate, number, now, at)
@@ -414,7 +414,7 @@ class Results:
         listeners.offer_result(result, now, current=current, late=fate == "late")
         if owner is not None:
             owner.results.append(result)
-            owner.came += 1
+            owner.received += 1
             self._complete(owner, now)
 
     def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
@@ -424,7 +424,7 @@ class Results:
         evidence decides, or a result of it has come already.
         """
         pending = self._pending
-        if pending is None or pending.ended or pending.outcome.done() or pending.came:
+        if pending is None or pending.ended or pending.outcome.done() or pending.received:
             return None
         if self._lossy or self._numbering is not None or container.asked is not None:
             return None
@@ -460,7 +460,7 @@ class Results:
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, without a sign against them."""
-        if owner.came < owner.wanted or not owner.evidence.proven or owner.outcome.done():
+        if owner.received < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:
             self.input_in_doubt = False

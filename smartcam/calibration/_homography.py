@@ -27,8 +27,8 @@ def fit_homography(flat: Array, pixels: Array) -> Array | None:
     # the pixels' squares.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.4.4.
     cv2 = load("cv2")
-    found = cv2.findHomography(flat, pixels)[0]
-    return None if found is None else np.array(found, dtype=np.float64)
+    matrix = cv2.findHomography(flat, pixels)[0]
+    return None if matrix is None else np.array(matrix, dtype=np.float64)
 
 
 def apply_homography(matrix: Array, points: Array) -> Array:

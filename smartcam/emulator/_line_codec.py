@@ -90,8 +90,8 @@ class LineCodec:
 
     def text(self, data: bytes) -> str:
         """Return a line's text without its end."""
-        found = self.ends.search(data)
-        return data[: found.start() if found else None].decode(self.encoding, "replace")
+        match = self.ends.search(data)
+        return data[: match.start() if match else None].decode(self.encoding, "replace")
 
     def sent_text(self, data: bytes) -> str:
         """Return the text of bytes that the camera sends."""
@@ -232,14 +232,14 @@ class _LineForm(NamedTuple):
         end = len(text) - len(texts[-1])
         if not text.startswith(first) or not text.endswith(texts[-1]) or end < len(first):
             return None
-        found: dict[str, str] = {}
+        values: dict[str, str] = {}
         for name, before in zip(reversed(self.fields), reversed((first, *texts[:-1])), strict=True):
-            place = text.rfind(before, len(first), end) if len(found) < len(texts) - 1 else 0
+            place = text.rfind(before, len(first), end) if len(values) < len(texts) - 1 else 0
             if place < 0:
                 return None
-            found[name] = text[place + len(before) : end]
+            values[name] = text[place + len(before) : end]
             end = place
-        return found
+        return values
 
 
 class LineFramer:
@@ -266,17 +266,17 @@ class LineFramer:
     def next_frame(self) -> Frame | None:
         """Return the next line, None if it is incomplete; FrameError: it is too long."""
         codec = self._codec
-        found = codec.ends.search(self._buffer, self._searched)
-        size = len(self._buffer) if found is None else found.start()
-        if size > codec.max_line + (found is None):  # the last byte may be half of an end
+        match = codec.ends.search(self._buffer, self._searched)
+        size = len(self._buffer) if match is None else match.start()
+        if size > codec.max_line + (match is None):  # the last byte may be half of an end
             raise FrameError(
                 f"a line of more than {codec.max_line} bytes came", data=bytes(self._buffer[:64])
             )
-        if found is None:
+        if match is None:
             self._searched = max(0, size - 1)
             return None
-        data = bytes(self._buffer[: found.end()])
-        del self._buffer[: found.end()]
+        data = bytes(self._buffer[: match.end()])
+        del self._buffer[: match.end()]
         self._searched = 0
         return Frame(codec.row_of(data[:size].decode(codec.encoding, "replace")), data)
 

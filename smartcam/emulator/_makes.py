@@ -31,18 +31,18 @@ def emulated_class(protocol: str) -> type[WireCamera]:
         )
     module, _, attribute = target.partition(":")
     try:
-        found: object = getattr(importlib.import_module(module), attribute)
+        camera_class: object = getattr(importlib.import_module(module), attribute)
     except Exception as exc:
         raise PluginError(
             f"protocol {protocol!r}: its emulated camera {target!r} failed to load: {exc!r}",
             name=protocol,
         ) from exc
-    if not (isinstance(found, type) and issubclass(found, WireCamera)):
+    if not (isinstance(camera_class, type) and issubclass(camera_class, WireCamera)):
         raise PluginError(
-            f"protocol {protocol!r}: {target!r} is {found!r}, no class of emulated cameras",
+            f"protocol {protocol!r}: {target!r} is {camera_class!r}, no class of emulated cameras",
             name=protocol,
         )
-    return found
+    return camera_class
 
 
 def _with_emulator() -> list[str]:

@@ -117,11 +117,11 @@ class TableScene:
     def measure(self) -> list[Observation]:
         """Return one observation of each piece, in the order of :attr:`pieces`, with new noise."""
         gauss = self._random.gauss
-        found: list[Observation] = []
+        observations: list[Observation] = []
         for name, pose in list(self.pieces.items()):  # a test may change them in its own thread
             u, v, theta = self.to_pixels(pose)
             turn = gauss(0.0, self.pixel_noise / (_HALF_LENGTH_M * self.scale))
-            found.append(
+            observations.append(
                 Observation(
                     name=name,
                     u=u + gauss(0.0, self.pixel_noise),
@@ -130,7 +130,7 @@ class TableScene:
                     quality=self._random.uniform(0.95, 1.0),
                 )
             )
-        return found
+        return observations
 
 
 def _normal(angle: float) -> float:

@@ -101,8 +101,8 @@ class TicketedCodec(LineCodec):
 
     def sent_text(self, data: bytes) -> str:
         """Return the text of a frame without its header."""
-        found = self.header.match(data)
-        return data[found.end() if found else 0 :].removesuffix(b"\r\n").decode(self.encoding)
+        match = self.header.match(data)
+        return data[match.end() if match else 0 :].removesuffix(b"\r\n").decode(self.encoding)
 
     def request_key(self, data: bytes) -> str:
         """Return the ticket of a request."""
@@ -114,8 +114,8 @@ class TicketedCodec(LineCodec):
 
     def content(self, text: str) -> tuple[str, str]:
         """Return the ticket, "" for none, and the content."""
-        found = self._ticket.match(text)
-        return ("", text) if found is None else (found[0], text[found.end() :])
+        match = self._ticket.match(text)
+        return ("", text) if match is None else (match[0], text[match.end() :])
 
 
 class TicketedFramer(LineFramer):
@@ -128,16 +128,16 @@ class TicketedFramer(LineFramer):
     def next_frame(self) -> Frame | None:
         """Return the next frame, None if it is incomplete; FrameError: it is too long."""
         codec = self._frames
-        found = codec.header.match(self._buffer)
-        if found is None:
+        match = codec.header.match(self._buffer)
+        if match is None:
             mark = self._buffer[codec.width : codec.width + 1]
             if mark == b"L" and len(self._buffer) < codec.header_size:
                 return None
             return super().next_frame()
-        length = int(found[2])
+        length = int(match[2])
         if length > codec.max_line:
             raise FrameError(f"a frame of {length} bytes came", data=bytes(self._buffer[:64]))
-        end = found.end() + length
+        end = match.end() + length
         if len(self._buffer) < end:
             return None
         data = bytes(self._buffer[:end])

@@ -358,8 +358,8 @@ def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
 
 def motion_to_data(transform: Transform) -> dict[str, Any]:
     """Return a rigid motion as data for JSON, without its frames."""
-    found = _Motion(transform.rotation, transform.translation)
-    return {name: values.tolist() for name, values in found._asdict().items()}
+    motion = _Motion(transform.rotation, transform.translation)
+    return {name: values.tolist() for name, values in motion._asdict().items()}
 
 
 def motion_from_data(data: Mapping[str, Any], target: str, source: str) -> Transform:

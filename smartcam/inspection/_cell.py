@@ -186,20 +186,20 @@ def load_cell(path: str | Path) -> dict[str, CellCamera]:
         MissingExtraError: an extra is not installed.
     """
     path = check_path(path, "path", "load_cell")
-    found: dict[str, CellCamera] = {}
+    cameras: dict[str, CellCamera] = {}
 
     def mistake(file: _CellFile) -> tuple[tuple[int | str, ...], str] | None:
         for name, entry in file.cameras.items():
             if entry.software is None:
                 continue
             try:
-                found[name] = make_camera(name, entry.software, path.parent)
+                cameras[name] = make_camera(name, entry.software, path.parent)
             except ProgramError as exc:
                 return ("cameras", name, "software", *exc.place), str(exc)
-        return None if found else (("cameras",), "expected a camera with software:, got none")
+        return None if cameras else (("cameras",), "expected a camera with software:, got none")
 
     read_model(path, "cell", _CellFile, "cameras", mistake)
-    return found
+    return cameras
 
 
 def software_mistakes(

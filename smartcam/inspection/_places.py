@@ -158,10 +158,10 @@ class PlacedRegion:
 
     def mask(self) -> NDArray[np.uint8]:
         """Return a mask (H, W) of the region's rows and columns: 255 in the region, else 0."""
-        found = np.zeros((self.below - self.top, self.right - self.left), np.uint8)
+        mask = np.zeros((self.below - self.top, self.right - self.left), np.uint8)
         corners = np.rint(self.corners - (self.left, self.top)).astype(np.int32)
-        load("cv2", "inspection needs").fillPoly(found, [corners], 255)
-        return found
+        load("cv2", "inspection needs").fillPoly(mask, [corners], 255)
+        return mask
 
 
 def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) -> PlacedRegion:

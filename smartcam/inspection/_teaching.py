@@ -241,12 +241,12 @@ def _flow(value: Any) -> Any:
 
 def tool_settings() -> dict[str, dict[str, str]]:
     """Return the descriptions of settings by kind of tool and name."""
-    found: dict[str, dict[str, str]] = {}
+    descriptions: dict[str, dict[str, str]] = {}
     for info in TOOLS.available():
         kind: Any = TOOLS.load(info.name)
         fields = kind.settings_model.model_fields
-        found[info.name] = {name: one.description or "" for name, one in fields.items()}
-    return found
+        descriptions[info.name] = {name: one.description or "" for name, one in fields.items()}
+    return descriptions
 
 
 def read_settings(given: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Any]]:

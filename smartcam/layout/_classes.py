@@ -120,11 +120,11 @@ def _members(kind: type) -> list[_Member]:
             f"class {kind.__name__}: its annotations cannot be resolved: {exc}; "
             "define what they name at the top of the module"
         ) from exc
-    found: list[_Member] = []
+    members: list[_Member] = []
     for name in names:
         text = next((one for one in _metadata(hints[name]) if isinstance(one, str)), None)
-        found.append(_Member(name, _without_metadata(hints[name]), text))
-    return found
+        members.append(_Member(name, _without_metadata(hints[name]), text))
+    return members
 
 
 def _field(kind: type, member: _Member) -> Field:

@@ -78,12 +78,12 @@ def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
         LayoutError: the text has a mistake; the error gives its position.
     """
     key = text[start:], lenient
-    found = _in_use.get(key)
-    if found is None:
+    compiled = _in_use.get(key)
+    if compiled is None:
         spec = parse_text(text, start)
         canonical = to_text(spec), lenient
-        found = _in_use.get(canonical)
-        if found is None:  # two threads may come here at once; either result may be used
-            found = CompiledLayout(spec, canonical[0], lenient=lenient)
-            _in_use[key] = _in_use[canonical] = found
-    return found
+        compiled = _in_use.get(canonical)
+        if compiled is None:  # two threads may come here at once; either result may be used
+            compiled = CompiledLayout(spec, canonical[0], lenient=lenient)
+            _in_use[key] = _in_use[canonical] = compiled
+    return compiled

@@ -107,25 +107,25 @@ def _count(node: Any, known: dict[int, int]) -> int:
     """
     if node.id == "scalar":
         return 1
-    found = known.get(id(node))
-    if found == 0:
+    count = known.get(id(node))
+    if count == 0:
         raise BadYamlError("an alias of what it stands in", line=node.start_mark.line + 1)
-    if found is None:
+    if count is None:
         known[id(node)] = 0  # nodes that are being counted
         children = (
             node.value if node.id == "sequence" else [one for row in node.value for one in row]
         )
-        found = 1
+        count = 1
         for child in children:
-            found += _count(child, known)
-            if found > MAX_NODES:
+            count += _count(child, known)
+            if count > MAX_NODES:
                 raise BadYamlError(
                     f"expected {MAX_NODES} values at most, aliases counted with all that they "
                     "stand for",
                     line=child.start_mark.line + 1,
                 )
-        known[id(node)] = found
-    return found
+        known[id(node)] = count
+    return count
 
 
 @functools.cache

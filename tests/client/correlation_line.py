@@ -148,7 +148,7 @@ class Line:
         self.judged.append((container, match))
         if match.fate == "triggered":
             assert self.pending is not None
-            self.pending.came += 1
+            self.pending.received += 1
             self.results.append(container)
             self._complete()
         return match
@@ -167,7 +167,7 @@ class Line:
     def _complete(self) -> None:
         pending = self.pending
         assert pending is not None
-        if pending.evidence.proven and pending.came == pending.wanted:
+        if pending.evidence.proven and pending.received == pending.wanted:
             self.at.done(pending)
             pending.ended = True
             self.returned = self.results

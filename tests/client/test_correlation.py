@@ -78,7 +78,7 @@ def test_result_without_a_shown_inspection_is_not_the_triggers(
     assert line.result(number) == NOBODY
     line.hear(READY | Status.OVERHEAT)  # that is no beginning
     assert line.result(number) == NOBODY
-    assert (pending.early, pending.came, pending.ended) == (2, 0, False)
+    assert (pending.early, pending.received, pending.ended) == (2, 0, False)
 
 
 @numbers_of_any_width
@@ -219,7 +219,7 @@ def test_result_before_the_trigger_is_answered_is_older(*, queried: bool) -> Non
         line.answer()
         line.hear(READY)
     assert line.result() == NOBODY
-    assert (pending.early, pending.came) == (1, 0)
+    assert (pending.early, pending.received) == (1, 0)
 
 
 BEFORE = {

@@ -338,7 +338,7 @@ class CameraAndClient(RuleBasedStateMachine):
         """Its results are late from now on, unless it has all that it wants already."""
         pending = self.line.pending
         assert pending is not None
-        if pending.came < pending.wanted:
+        if pending.received < pending.wanted:
             self.given_up.add(self.sent)
 
     @precondition(lambda self: self.ordered)
@@ -463,7 +463,7 @@ class CameraAndClient(RuleBasedStateMachine):
         if own and self.gives:
             assert self.line.pending is not None
             readable = self.number is None or container.number in {None, self.number}
-            full = self.line.pending.came == self.line.pending.wanted
+            full = self.line.pending.received == self.line.pending.wanted
             assert fate == "triggered" or full or not readable, "the trigger's own was not given it"
         elif container.whose in self.given_up and self.kinds == ("number",) and not self.sensors:
             assert fate not in {"nobody", "triggered"}, "a late container was not known"

@@ -35,7 +35,7 @@ def follow(
     went: list[tuple[float, float]] = []
     while len(went) < frames:
         newest = min(math.floor(now / period), stops)
-        since, until = pace.asked(now, newest * period, rest)
+        since, until = pace.window(now, newest * period, rest)
         # the first one that came since, and is new to it; or at the end whichever is newest
         number = max(given_to + 1, math.ceil(since / period - 1e-9), newest)
         at = max(now, number * period)
@@ -47,8 +47,8 @@ def follow(
                     break
                 number = given_to + 1
                 at = number * period
-        pace.took(number * period, number)
-        pace.gave(at)
+        pace.note_taken(number * period, number)
+        pace.note_sent(at)
         went.append((number * period, at))
         given_to, now = number, at + way
     return went

@@ -78,13 +78,13 @@ class GridMap:
     """
 
     def __init__(self, flat: Array, pixels: Array) -> None:
-        found = fit_homography(flat, pixels)
-        self.matrix: Array = np.full((3, 3), np.nan) if found is None else found
+        homography = fit_homography(flat, pixels)
+        self.matrix: Array = np.full((3, 3), np.nan) if homography is None else homography
         self._middle = flat.mean(axis=0)
         self._scale = np.abs(flat - self._middle).max()
         self._bend = np.zeros((10, 2))
-        if len(flat) >= MIN_DOTS_FOR_LENS and found is not None:
-            off = pixels - apply_homography(found, flat)
+        if len(flat) >= MIN_DOTS_FOR_LENS and homography is not None:
+            off = pixels - apply_homography(homography, flat)
             self._bend[:] = np.linalg.lstsq(self._powers(flat), off, rcond=None)[0]
 
     def _powers(self, flat: Array) -> Array:

@@ -93,11 +93,11 @@ def lattices(
     for start, steps in grown.starts(neighbours):
         if seen[start]:
             continue
-        found = grown.grow(start, steps, most)
-        seen[list(found.values())] = True
-        if len(found) >= least and _is_regular(points, found):
-            grown.complete(found, most)
-            yield found
+        grid = grown.grow(start, steps, most)
+        seen[list(grid.values())] = True
+        if len(grid) >= least and _is_regular(points, grid):
+            grown.complete(grid, most)
+            yield grid
         tries -= 1
         if tries == 0:
             return
@@ -256,8 +256,8 @@ def _across(ways: Array, apart: Array) -> Array:
 def _is_regular(points: Array, grid: Lattice) -> bool:
     """Return True if a flat sheet could look like the grid, which chance may have made."""
     places = np.array(list(grid), dtype=np.float64)
-    found = points[list(grid.values())]
-    seen = GridMap(places, found)
-    off = np.linalg.norm(seen(places) - found, axis=1)
+    pixels = points[list(grid.values())]
+    seen = GridMap(places, pixels)
+    off = np.linalg.norm(seen(places) - pixels, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
     return bool(np.median(off / steps) < MAX_MEDIAN_OFFSET)

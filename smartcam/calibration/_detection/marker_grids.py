@@ -60,12 +60,12 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         ):
             break
         looked_at = reduced(image.bytes, times) if scale < 1 else scaled(image.bytes, scale)
-        found = _read(looked_at, target, scale)
-        good, contrary = agreeing(found, board)
+        markers = _read(looked_at, target, scale)
+        good, contrary = agreeing(markers, board)
         read, against = max(read, len(good)), max(against, contrary)
         if good.sum() > len(best.ids):
-            best = found.selected(good)
-            strays = tuple(sorted((found.ids[~good] + target.first_id).tolist()))
+            best = markers.selected(good)
+            strays = tuple(sorted((markers.ids[~good] + target.first_id).tolist()))
     check_one_board(len(best.ids), against, what)
     if len(best.ids) < MIN_AGREEING_MARKERS:
         raise Code.TARGET_NOT_FOUND.refusal(

@@ -89,7 +89,7 @@ class _Drawn(NamedTuple):
     at: Array  # (2,), pixels
 
 
-class _Projection:
+class _ViewerProjection:
     """The projection from points of a scene to pixels of the drawing."""
 
     def __init__(self, scene: DrawnScene, points: Array) -> None:
@@ -136,7 +136,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
     shapes = [_frustum(one, length) for one in scene.cameras]
     ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
-    sight = _Projection(scene, np.concatenate([places, *shapes, *ends]))
+    sight = _ViewerProjection(scene, np.concatenate([places, *shapes, *ends]))
     items = [
         _Drawn(
             sight.depth(one.corners),
@@ -170,7 +170,7 @@ def _frustum(camera: DrawnCamera, length: float) -> Array:
     return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *rim]))
 
 
-def _camera(sight: _Projection, camera: DrawnCamera, shape: Array) -> _Drawn:
+def _camera(sight: _ViewerProjection, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
     sides = [line(centre, one, "camera") for one in rim]
     svg = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
@@ -200,7 +200,7 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
-def _scale(sight: _Projection) -> Iterator[str]:
+def _scale(sight: _ViewerProjection) -> Iterator[str]:
     metres = round_down(0.2 * WIDTH / sight.zoom)
     start = np.array([BORDER, HEAD + HEIGHT + 30])
     end = start + np.array([metres * sight.zoom, 0.0])

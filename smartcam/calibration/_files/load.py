@@ -43,9 +43,9 @@ def of_document(document: Document, name: str) -> AnyCalibration:
     Raises WRONG_KIND, or SHAPE if the data are no calibration.
     """
     if document.kind in KINDS:
-        found = KINDS[document.kind].from_data(document.data)
-        warn(found, name)
-        return found
+        calibration = KINDS[document.kind].from_data(document.data)
+        warn(calibration, name)
+        return calibration
     expected = " or ".join(map(repr, KINDS))
     raise Code.WRONG_KIND.refusal(
         f"{name}: holds {document.kind!r}, expected {expected}", expected, document.kind

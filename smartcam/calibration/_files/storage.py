@@ -125,9 +125,9 @@ class SavedCalibration(Stored):
             CalibrationError: the file is damaged, newer, or of another kind.
             OSError: the file does not exist, or cannot be read.
         """
-        found = cls.from_data(store.read(path, cls.kind))
-        warn(found, str(path))
-        return found
+        calibration = cls.from_data(store.read(path, cls.kind))
+        warn(calibration, str(path))
+        return calibration
 
 
 StoredTarget = Annotated[

@@ -162,8 +162,8 @@ def _turns(robot: RobotPoses) -> Array:
 def _second(products: Array, count: int) -> Array:
     # Rotation vectors of one axis are multiples of each other, so the second eigenvalue of the sum
     # of their products is 0. Divided by their number it is a mean square.
-    found: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
-    return found / math.sqrt(count * (count - 1))
+    roots: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
+    return roots / math.sqrt(count * (count - 1))
 
 
 def solve_linear(
@@ -178,28 +178,28 @@ def solve_linear(
         some = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
         robot, seen = robot.taken(some), seen.taken(some)
     try:
-        found = LINEAR[name](name, robot, seen)
+        solution = LINEAR[name](name, robot, seen)
     except (load("cv2").error, np.linalg.LinAlgError):
         return None
-    return found if _sound(found) else None
+    return solution if _sound(solution) else None
 
 
 def _hand_eye(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
     cv2, carrier = load("cv2"), robot.between.inverse()
     # the fifth argument is an output: a method without its name would be ignored
-    found = cv2.calibrateHandEye(
+    solution = cv2.calibrateHandEye(
         *_lists(carrier), *_lists(seen), method=getattr(cv2, HAND_EYE[name])
     )
-    camera = _rigid(*found)
+    camera = _rigid(*solution)
     return camera, mean_target(camera, robot, seen)
 
 
 def _robot_world(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
     cv2 = load("cv2")
-    found = cv2.calibrateRobotWorldHandEye(
+    solution = cv2.calibrateRobotWorldHandEye(
         *_lists(seen), *_lists(robot.between), method=getattr(cv2, ROBOT_WORLD[name])
     )
-    return _rigid(*found[2:]).inverse(), _rigid(*found[:2]).inverse()
+    return _rigid(*solution[2:]).inverse(), _rigid(*solution[:2]).inverse()
 
 
 def _rigid(turn: Any, shift: Any) -> Rigid:
@@ -231,14 +231,14 @@ def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
 
 def scale_of(robot: RobotPoses, seen: Rigid) -> float | None:
     """Return the target's size over the nominal one, as the robot's motions show it."""
-    found = solve_linear("park", robot, seen)  # the camera's rotation does not depend on lengths
-    if found is None:
+    solution = solve_linear("park", robot, seen)  # the camera's rotation does not depend on lengths
+    if solution is None:
         return None
     # S = X^-1 A Z with all of the camera's lengths times s: R_A t_Z - t_X - s R_X t_S = -t_A.
     between, count = robot.between, seen.size
     rows = np.zeros((count, 3, 7))
     rows[:, :, :3], rows[:, :, 3:6] = between.rotation, -np.eye(3)
-    rows[:, :, 6] = -seen.translation @ found[0].rotation.T
+    rows[:, :, 6] = -seen.translation @ solution[0].rotation.T
     right = -between.translation.reshape(-1)
     return float(np.linalg.lstsq(rows.reshape(-1, 7), right, rcond=None)[0][6])
 

@@ -168,7 +168,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         held_out, codes = self.held_out_error, {one.code for one in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
         several = "s" * (len(left_out) > 1)
-        found = judge(
+        judgement = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
             [one for one in self.warnings if not (left_out and one.code == Code.BAD_VIEW)],
             worst=1 + self.worst,
@@ -177,8 +177,8 @@ class HandEyeCalibration(storage.SavedCalibration):
             more="take more views",
             where=f" without view{several} {', '.join(left_out)}" if left_out else "",
         )
-        if found.verdict.level != "good" or self.used[-1]:
-            return found
+        if judgement.verdict.level != "good" or self.used[-1]:
+            return judgement
         text = (
             "Not known how good: the last view does not fit, and may show that something moved: "
             "take more views"
@@ -366,8 +366,8 @@ def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) ->
     """Return the points at which pixels' rays meet a camera's plane; raise OUT_OF_FIELD."""
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     raised = plane.rotation[:, 2] * height + plane.translation
-    found = on_plane(rays, plane.rotation, raised)
-    missed = ~np.isfinite(found).all(axis=1)
+    points = on_plane(rays, plane.rotation, raised)
+    missed = ~np.isfinite(points).all(axis=1)
     if missed.any():
         row = int(np.argmax(missed))
         raise Code.OUT_OF_FIELD.refusal(
@@ -375,7 +375,7 @@ def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) ->
             f"{pixels[row].tolist()} in row {row}, whose ray does not",
             got=pixels[row].tolist(),
         )
-    above: Array = found + np.array([0.0, 0.0, height])
+    above: Array = points + np.array([0.0, 0.0, height])
     return above
 
 

@@ -62,17 +62,17 @@ def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solu
     ``seen`` is whitened. The adjustment begins at ``start``, and with its noise if it has one.
     """
     noise = start.noise or RobotNoise(FIRST_SIGMAS, FIRST_SHARED_FACTOR)
-    found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
+    adjusted = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
     for number in range(MAX_ROUNDS):
-        if not math.isfinite(found.cost):
+        if not math.isfinite(adjusted.cost):
             break
         before = noise
-        noise = _estimate(robot, seen, found, noise, search=not number and start.noise is None)
+        noise = _estimate(robot, seen, adjusted, noise, search=not number and start.noise is None)
         settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED_RATIO)
-        found = adjust(robot, seen, found, noise, gain=ROUGH_GAIN)
+        adjusted = adjust(robot, seen, adjusted, noise, gain=ROUGH_GAIN)
         if settled:
             break
-    return adjust(robot, seen, found, noise)
+    return adjust(robot, seen, adjusted, noise)
 
 
 def _logs(noise: RobotNoise) -> Array:
@@ -101,8 +101,8 @@ def _estimate(
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
     start = min([_logs(noise), *grid], key=cost)
     settings = {"xatol": 3e-3, "fatol": 1e-3, "maxiter": 300}
-    found = load("scipy.optimize").minimize(cost, start, method="Nelder-Mead", options=settings)
-    values = np.exp(np.clip(found.x, low, high)).tolist()
+    minimum = load("scipy.optimize").minimize(cost, start, method="Nelder-Mead", options=settings)
+    values = np.exp(np.clip(minimum.x, low, high)).tolist()
     return RobotNoise(RobotSigmas(values[0], values[1]), values[2])
 
 

@@ -136,10 +136,10 @@ class _Moving:
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
         robot, seen = self._robot(offset, index), self._seen.taken(index)
-        found = solve_linear("shah", robot, seen)
-        if found is None:
+        solution = solve_linear("shah", robot, seen)
+        if solution is None:
             return math.inf
-        turn, shift = np.split(seen.after(carried(found[0], robot, found[1])), 2, axis=1)
+        turn, shift = np.split(seen.after(carried(solution[0], robot, solution[1])), 2, axis=1)
         squares = (shift**2).sum(axis=1) + self._arm**2 * (turn**2).sum(axis=1)
         return math.sqrt(float(squares.mean()))
 
@@ -161,5 +161,5 @@ class _Moving:
         step = 2.0 * self._most / (COARSE_STEPS - 1)
         low, high = max(near - step, -self._most), min(near + step, self._most)
         search = load("scipy.optimize").minimize_scalar
-        found = search(lambda one: self.error(one, index), bounds=(low, high), method="bounded")
-        return float(found.x)
+        minimum = search(lambda one: self.error(one, index), bounds=(low, high), method="bounded")
+        return float(minimum.x)

@@ -89,17 +89,17 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     Raises SHAPE if these are no poses; WRONG_FRAME if they are in several frames, or inverted.
     """
     what = "pose of the target"
-    found = [
+    poses_seen = [
         as_motion(one, f"{what} {number}", CAMERA, TARGET)
         for number, one in enumerate(as_list(target_poses, object, what))
     ]
-    for number, one in enumerate(found):
-        if one.label != found[0].label or (one.target, one.source) == (TARGET, CAMERA):
-            wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else found[0].label
+    for number, one in enumerate(poses_seen):
+        if one.label != poses_seen[0].label or (one.target, one.source) == (TARGET, CAMERA):
+            wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else poses_seen[0].label
             raise Code.WRONG_FRAME.unexpected(
                 f"{what} {number}: expected {wanted}", wanted, one.label
             )
-    return found
+    return poses_seen
 
 
 def extent(problem: Problem) -> float:
@@ -154,11 +154,11 @@ def _better(
 ) -> Agreed | None:
     """Return the motion of some poses if all poses agree with it better than with ``best``."""
     for name in CLOSED_FORMS:
-        found = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
-        if found is None:
+        motion = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
+        if motion is None:
             continue
-        expected = carried(found[0], problem.robot, found[1])
-        tried = Agreed(*found, _apart(problem.poses, expected, arm))
+        expected = carried(motion[0], problem.robot, motion[1])
+        tried = Agreed(*motion, _apart(problem.poses, expected, arm))
         if best is None or tried.median < best.median:
             best = tried
     return best

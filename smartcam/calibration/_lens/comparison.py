@@ -256,8 +256,8 @@ def _cells(camera: CameraModel, points: Array) -> list[int]:
     """Return the index of the cell in which each point is seen."""
     part = (camera.project(points) + 0.5) / camera.size * CELLS[::-1]
     columns, rows = np.clip(np.floor(part), 0, np.array(CELLS[::-1]) - 1).astype(int).T
-    found: list[int] = (rows * CELLS[1] + columns).tolist()
-    return found
+    cells: list[int] = (rows * CELLS[1] + columns).tolist()
+    return cells
 
 
 def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) -> Rigid:

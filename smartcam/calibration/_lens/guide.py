@@ -190,8 +190,8 @@ def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Arr
     points = points_at(camera, places(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
     field = sensitivity(camera, known_points(points), far=distance is None)
     freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
-    found: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
-    return found
+    criterion: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
+    return criterion
 
 
 def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:

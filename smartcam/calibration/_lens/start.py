@@ -78,21 +78,21 @@ def fit_lens(
     Raises ``POOR_FIT`` if no focal length leads to a fit, and the errors of :func:`lens_basis`.
     """
     basis = lens_basis(model, fixed)
-    found: list[AdjustedBundle] = []
+    fits: list[AdjustedBundle] = []
     for length in FOCAL_LENGTHS:
         try:
-            found.append(_fit(views, model, basis, length))
+            fits.append(_fit(views, model, basis, length))
         except (CalibrationError, load("cv2").error):
             continue
-        if found[-1].rms <= MAX_GOOD_RMS_PX:
+        if fits[-1].rms <= MAX_GOOD_RMS_PX:
             break
-    if not found:
+    if not fits:
         raise Code.POOR_FIT.refusal(
             f"intrinsics: expected a lens that shows the {len(views)} views as they are, got none "
             f"from focal lengths of {min(FOCAL_LENGTHS[1:])} to {max(FOCAL_LENGTHS[1:])} image "
             "widths"
         )
-    return min(found, key=lambda one: one.rms)
+    return min(fits, key=lambda one: one.rms)
 
 
 def _fit(

@@ -103,10 +103,10 @@ def draw(
     ``parts`` are localizations in the camera's frame, drawn in green. ``title`` is a line on top.
     The SVG document has a fixed size and loads no other file; lines end with a line feed.
     """
-    found = list(parts)
+    elements = list(parts)
     counted = calibration.weights > 0.0
     points, left_out = calibration.camera_points[counted], calibration.camera_points[~counted]
-    places = np.array([part.pose.position[:2] for part in found]).reshape(-1, 2)
+    places = np.array([part.pose.position[:2] for part in elements]).reshape(-1, 2)
     both = np.concatenate([points, places])
     low, high = both.min(axis=0), both.max(axis=0)
     near = (np.abs(left_out - (low + high) / 2) < high - low).all(axis=1)
@@ -129,7 +129,7 @@ def draw(
             for one in both[: len(outlines), None] + enlargement * outlines
         ),
         *_touches(calibration, field, points + enlargement * residuals),
-        *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
+        *(_part(part, place) for part, place in zip(elements, field.pixels(places), strict=True)),
         *_legend(calibration, field, enlargement, title),
     ]
     return document(FIELD_WIDTH_PX + 2 * BORDER_PX, field.foot + LEGEND_HEIGHT_PX, shapes, STYLE)

@@ -172,7 +172,7 @@ class PlaneMap:
         projective, isfinite = self.projective, math.isfinite
         last: Header | None = None
         header: Header | None = None
-        found: list[Localization] = []
+        mapped: list[Localization] = []
         for feature_id, quality, photo_index, pose in localizations:
             seen, (u, v, height), (qx, qy, qz, qw) = pose
             if height or qx or qy:
@@ -202,8 +202,8 @@ class PlaneMap:
             if not isfinite(sum(position) + (i + j + m + r)):
                 raise not_finite(f"pose of {feature_id!r:.60}", (*position, *orientation))
             result = new(Pose, (header, new(Position, position), new(Quaternion, orientation)))
-            found.append(new(Localization, (feature_id, quality, photo_index, result)))
-        return found
+            mapped.append(new(Localization, (feature_id, quality, photo_index, result)))
+        return mapped
 
 
 class _Homogeneous:

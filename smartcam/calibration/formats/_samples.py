@@ -50,8 +50,8 @@ class HandEyeSample(NamedTuple):
 
 def parse_json(text: str) -> list[HandEyeSample]:
     """Return the samples of a JSON file; frames are base, effector, camera and object."""
-    found = sequence(load_json(text), "file")
-    pairs = [sequence(pair, f"sample {index}", 2) for index, pair in enumerate(found)]
+    samples = sequence(load_json(text), "file")
+    pairs = [sequence(pair, f"sample {index}", 2) for index, pair in enumerate(samples)]
     return [
         _sample(index, *(matrix_of(one, f"sample {index}", (4, 4)) for one in pair))
         for index, pair in enumerate(pairs)

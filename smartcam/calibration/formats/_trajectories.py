@@ -76,21 +76,21 @@ def parse_csv(
     ``BAD_TIME`` for a time outside of 1970 to 9999.
     """
     header: _Columns | None = None
-    found: list[Transform] = []
+    poses: list[Transform] = []
     for index, line in enumerate(map(str.strip, text.splitlines()), 1):
         if len(line) > MAX_LINE_LENGTH:
             raise malformed(f"line {index}", f"{MAX_LINE_LENGTH} characters at most", len(line))
         if not line or (header is not None and line.startswith("#")):
             continue
         if header is not None:
-            found.append(_pose(line, header, f"line {index}", target, source))
+            poses.append(_pose(line, header, f"line {index}", target, source))
             continue
         header = _header(line)
         if header is None and not line.startswith("#"):
             raise _no_header(line)
     if header is None:
         raise _no_header("")
-    return found if header.metres is None else Measured(found, header.metres)
+    return poses if header.metres is None else Measured(poses, header.metres)
 
 
 def _no_header(line: str) -> CalibrationError:

@@ -208,8 +208,8 @@ class HandEyeScene:
         poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)
         noise = RobotNoise(robot_sigmas) if max(robot_sigmas) > 0 else None
         truth = Solution(self.camera_pose.rigid, self.target_pose.rigid, noise=noise)
-        found = information(RobotPoses(poses, self.setup == "eye-in-hand"), seen, truth)
-        variances = np.diag(np.linalg.inv(found))
+        fisher = information(RobotPoses(poses, self.setup == "eye-in-hand"), seen, truth)
+        variances = np.diag(np.linalg.inv(fisher))
         return Bound(math.sqrt(variances[:3].sum()), math.sqrt(variances[3:6].sum()))
 
     def errors(self, camera_pose: Transform) -> tuple[float, float]:

@@ -71,7 +71,7 @@ def _last_check(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     try:
-        found = json.loads(whole[-1])
+        check = json.loads(whole[-1])
     except (IndexError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return check if isinstance(check, dict) else {}

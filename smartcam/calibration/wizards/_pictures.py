@@ -192,7 +192,7 @@ class PictureFolder:
 
     def _look(self) -> dict[str, tuple[int, int]]:
         """Return the time of writing, ns, and the number of bytes of each picture."""
-        found: dict[str, tuple[int, int]] = {}
+        files: dict[str, tuple[int, int]] = {}
         try:
             for count, file in enumerate(self.path.iterdir()):
                 if count >= MAX_FILES:
@@ -205,12 +205,12 @@ class PictureFolder:
                     about = file.stat()
                 except FileNotFoundError:  # removed or renamed meanwhile
                     continue
-                found[file.name] = (about.st_mtime_ns, about.st_size)
+                files[file.name] = (about.st_mtime_ns, about.st_size)
         except OSError as exc:
             raise Code.NO_PICTURE.unexpected(
                 f"{self.path}: expected a folder that pictures come into", got=exc.strerror
             ) from exc
-        return found
+        return files
 
     def _read(self, name: str) -> NDArray[Any]:
         try:

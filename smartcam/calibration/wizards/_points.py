@@ -471,7 +471,7 @@ def calibrated_plane(
     )
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
     judgement = calibration.judged()
-    found = {
+    figures = {
         **judgement.figures,
         "model": calibration.model,
         "points": points,
@@ -481,4 +481,4 @@ def calibrated_plane(
         "predicted_mm": predicted,
         "remarks": [[one.code.value, one.text] for one in calibration.warnings],
     }
-    return Calibrated(calibration, found, tuple(notes), judgement)
+    return Calibrated(calibration, figures, tuple(notes), judgement)

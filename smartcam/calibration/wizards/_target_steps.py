@@ -134,5 +134,5 @@ def _checked(data: object) -> dict[str, Any]:
         wrong = "expected the description of a target, such as "
         wrong += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
         raise Code.WRONG_ANSWERS.refusal(wrong, got={"description": wrong})
-    found: dict[str, Any] = data
-    return found
+    target: dict[str, Any] = data
+    return target

@@ -616,14 +616,14 @@ def _first_step(asked: CalibrationStart, camera: str) -> Step:
 
 def _parameters(asked: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
     """Return the defaults of a wizard's steps that a request gives."""
-    found: dict[str, Any] = {"setup": "eye-in-hand"}
+    defaults: dict[str, Any] = {"setup": "eye-in-hand"}
     if camera is not None:
-        found["camera_unit"] = camera.unit
+        defaults["camera_unit"] = camera.unit
     if asked.tf_frame_robot_base:
-        found["robot_frame"] = asked.tf_frame_robot_base
+        defaults["robot_frame"] = asked.tf_frame_robot_base
     if asked.checkerboard_squaresize_m:
-        found["square"] = 1e3 * asked.checkerboard_squaresize_m
-    return found
+        defaults["square"] = 1e3 * asked.checkerboard_squaresize_m
+    return defaults
 
 
 def _start(

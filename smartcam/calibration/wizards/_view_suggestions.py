@@ -124,5 +124,5 @@ def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
         seen = focal * placed[:, :2] / (placed[:, 2:] + away)
         away *= float((np.ptp(seen, axis=0) / image).max()) / look.fill
     seen = focal * placed[:, :2] / (placed[:, 2:] + away)
-    found: Array = seen - (seen.max(axis=0) + seen.min(axis=0)) / 2 + image * look.place
-    return found
+    outline_px: Array = seen - (seen.max(axis=0) + seen.min(axis=0)) / 2 + image * look.place
+    return outline_px

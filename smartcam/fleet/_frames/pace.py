@@ -23,45 +23,46 @@ class FramePace:
     """Pace of one stream. All times are from one clock."""
 
     def __init__(self) -> None:
-        self._gave: float | None = None
-        self._ways = (0.0, 0.0)  # seconds on the way of the last two frames
+        self._given_at: float | None = None
+        self._transit_times = (0.0, 0.0)  # seconds on the way of the last two frames
         self._last: tuple[float, int] | None = None
         self._period = 0.0  # period of the source; 0: unknown
         self._due = -math.inf
         self._rest = 0.0
 
-    def asked(self, now: float, came: float, rest: float = 0.0) -> tuple[float, float]:
+    def window(self, now: float, arrived_at: float, rest: float = 0.0) -> tuple[float, float]:
         """Return the time after which the next frame must have come, and the end of the wait.
 
         Args:
             now: time of the request for the next frame, when the last one has arrived.
-            came: time at which the newest frame came.
+            arrived_at: time at which the newest frame arrived.
             rest: least number of seconds from one frame to the next.
         """
-        if self._gave is not None:
-            self._ways, self._gave = (self._ways[1], now - self._gave), None
+        if self._given_at is not None:
+            self._transit_times = (self._transit_times[1], now - self._given_at)
+            self._given_at = None
         self._rest = rest
-        way = min(self._ways)
+        way = min(self._transit_times)
         since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
         if 0 < self._period <= way:  # otherwise the link is free before the next frame comes
-            until = came + MAX_WAIT_PERIODS * self._period
+            until = arrived_at + MAX_WAIT_PERIODS * self._period
         if rest and now < self._due:
             since = max(since, self._due - self._period / 2)
             until = max(until, self._due + MAX_WAIT_PERIODS * self._period)
         return since, until
 
-    def took(self, came: float, offered: int) -> None:
+    def note_taken(self, arrived_at: float, offered: int) -> None:
         """Note which frame was taken.
 
         Args:
-            came: time at which the frame came.
+            arrived_at: time at which the frame arrived.
             offered: number of frames that came until then.
         """
         if self._last is not None and offered > self._last[1]:
-            self._period = (came - self._last[0]) / (offered - self._last[1])
-        self._last = came, offered
-        self._due = max(self._due, came - self._rest) + self._rest
+            self._period = (arrived_at - self._last[0]) / (offered - self._last[1])
+        self._last = arrived_at, offered
+        self._due = max(self._due, arrived_at - self._rest) + self._rest
 
-    def gave(self, now: float) -> None:
+    def note_sent(self, now: float) -> None:
         """Note that the frame is sent now."""
-        self._gave = now
+        self._given_at = now

@@ -116,14 +116,14 @@ class PictureStream(FrameStream):
 
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
-        since, until = self.pace.asked(loop.time(), reader.came, order.rest)
+        since, until = self.pace.window(loop.time(), reader.came, order.rest)
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
             await reader.fresh(since, until)
             frame = await anext(reader)
-        self.pace.took(reader.came, reader.statistics().offered)
+        self.pace.note_taken(reader.came, reader.statistics().offered)
         async with asyncio.timeout(order.timeout):
             taken = TakenFrame(*await self.encode(frame, order.encoding))
-        self.pace.gave(loop.time())
+        self.pace.note_sent(loop.time())
         return [taken]
 
     def counts(self) -> dict[str, int]:

@@ -315,7 +315,7 @@ def _slopes(levels: Array, smooth: float) -> Array:
 def _peaks(slopes: Array, least: float) -> list[int]:
     """Return the places of peaks of a least height, whose prominence is at least half of it."""
     after, before = np.append(slopes[1:], -np.inf), np.insert(slopes[:-1], 0, -np.inf)
-    found = []
+    peaks = []
     for at in np.flatnonzero((slopes > before) & (slopes >= after) & (slopes >= least)).tolist():
         higher = np.flatnonzero(slopes > slopes[at])
         left = higher[higher < at].max(initial=-1)
@@ -325,8 +325,8 @@ def _peaks(slopes: Array, least: float) -> list[int]:
         valleys = [slopes[left + 1 : at + 1].min()] if left >= 0 else []
         valleys += [slopes[at:right].min()] if right < len(slopes) else []
         if not valleys or slopes[at] - max(valleys) >= least / 2:
-            found.append(at)
-    return found
+            peaks.append(at)
+    return peaks
 
 
 def _peak(slopes: Array, at: int) -> float:
@@ -360,7 +360,7 @@ class _FittedStep(NamedTuple):
 
 def _groups(candidates: list[Array], half: float, near: Array, reach: Array) -> list[_EdgeGroup]:
     """Return the groups of edges; ``near`` and ``reach`` (N,), pixels, of each strip."""
-    found = []
+    groups = []
     for owner, places in enumerate(candidates):
         if not len(places):
             continue
@@ -369,8 +369,8 @@ def _groups(candidates: list[Array], half: float, near: Array, reach: Array) -> 
         for part, before, after in zip(parts, [-half, *between], [*between, half], strict=True):
             low = max(float(part[0] - reach[owner]), before)
             high = min(float(part[-1] + reach[owner]), after)
-            found.append(_EdgeGroup(owner, tuple(part.tolist()), low, high))
-    return found
+            groups.append(_EdgeGroup(owner, tuple(part.tolist()), low, high))
+    return groups
 
 
 def _steps(

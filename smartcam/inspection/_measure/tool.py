@@ -212,15 +212,15 @@ class _EdgeFinder:
 
     def edge(self, search: Across) -> FoundPoint:
         """Return the edge in a strip."""
-        found = find_point(self._image, self._strip(search), self._settings(search), search.which)
-        self._edges.append(found.pixel[None])
-        return found
+        point = find_point(self._image, self._strip(search), self._settings(search), search.which)
+        self._edges.append(point.pixel[None])
+        return point
 
     def pair(self, search: AcrossPair) -> tuple[FoundPoint, FoundPoint]:
         """Return the two edges of a bar."""
-        found = find_pair(self._image, self._strip(search), self._settings(search), search.which)
-        self._edges += [one.pixel[None] for one in found]
-        return found
+        pair = find_pair(self._image, self._strip(search), self._settings(search), search.which)
+        self._edges += [one.pixel[None] for one in pair]
+        return pair
 
     def line(self, search: LineSearch) -> tuple[FoundShape, ShapeFit[Line]]:
         """Return the edges of a line, and the line in the picture's pixels."""
@@ -251,7 +251,7 @@ class _EdgeFinder:
         turn = np.linspace(begin, end, CIRCLE_CORNERS + 1)
         rim = np.column_stack([np.cos(turn), np.sin(turn)])
         self._regions += [centre + (radius + side) * rim for side in (-reach, reach)]
-        found = find_circle(
+        circle = find_circle(
             self._image,
             centre,
             radius,
@@ -262,11 +262,11 @@ class _EdgeFinder:
             settings=self._settings(search),
             which=search.which,
         )
-        found = found._replace(kept=circle_of(found, self.plane).kept)
-        fit = circle_of(found, PIXELS)
+        circle = circle._replace(kept=circle_of(circle, self.plane).kept)
+        fit = circle_of(circle, PIXELS)
         self._shapes.append(fit.shape.centre + fit.shape.radius * rim)
-        self._keep(found, fit)
-        return found, fit
+        self._keep(circle, fit)
+        return circle, fit
 
     def _keep(self, found: FoundShape, fit: ShapeFit[Any]) -> None:
         self._edges.append(found.edges.points[fit.kept])

@@ -108,14 +108,14 @@ def read_codes(
         prepared: name of the picture's preparation.
     """
     zxing = load("zxingcpp", PURPOSE)
-    found = zxing.read_barcodes(
+    barcodes = zxing.read_barcodes(
         grey,
         formats=formats,
         text_mode=zxing.TextMode.Plain,
         binarizer=getattr(zxing.Binarizer, binarizer),
     )
     is_gs1 = zxing.ContentType.GS1
-    return [_code(one, back, prepared, gs1=one.content_type == is_gs1) for one in found]
+    return [_code(one, back, prepared, gs1=one.content_type == is_gs1) for one in barcodes]
 
 
 def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:

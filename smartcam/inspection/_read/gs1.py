@@ -37,7 +37,7 @@ def elements(text: str) -> tuple[tuple[str, str], ...]:
     At an element that is cut, or whose identifier is no number, the list ends: the rest of the text
     is the last value, with the identifier "".
     """
-    found: list[tuple[str, str]] = []
+    elements: list[tuple[str, str]] = []
     at = 1 if text.startswith(GS) else 0
     while at < len(text):
         digits = _IDENTIFIER_DIGITS.get(text[at : at + 2], 2)
@@ -48,8 +48,8 @@ def elements(text: str) -> tuple[tuple[str, str], ...]:
         end = reach if end < 0 else end
         stop = end if length is None else at + length
         if not (identifier.isascii() and identifier.isdigit()) or not at + digits < stop <= end:
-            found.append(("", text[at:]))
+            elements.append(("", text[at:]))
             break
-        found.append((identifier, text[at + digits : stop]))
+        elements.append((identifier, text[at + digits : stop]))
         at = stop + 1 if text[stop : stop + 1] == GS else stop
-    return tuple(found)
+    return tuple(elements)

@@ -54,7 +54,7 @@ class TextPattern:
             TooLongError: matching takes longer than :data:`MAX_MATCH_SECONDS`.
         """
         try:
-            found = self._compiled.fullmatch(text, timeout=MAX_MATCH_SECONDS, concurrent=True)
+            match = self._compiled.fullmatch(text, timeout=MAX_MATCH_SECONDS, concurrent=True)
         except (TimeoutError, MemoryError, RecursionError) as exc:
             raise TooLongError from exc
-        return found is not None
+        return match is not None

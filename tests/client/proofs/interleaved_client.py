@@ -366,7 +366,7 @@ class Client:
                 "cancelled" if outcome.cancelled() else type(outcome.exception()).__name__
             )
             call = (
-                *(pending.number, of(pending.evidence), pending.came, pending.given_up),
+                *(pending.number, of(pending.evidence), pending.received, pending.given_up),
                 *(pending.ended, ended, tuple(one.raw for one in pending.results)),
             )
         waiting = tuple((one.data, fate, number) for one, fate, number, *_ in self.waiting)

@@ -259,7 +259,7 @@ class Client:
         ]
         pending = results._pending
         if pending is not None:
-            yield pending.came, pending.early, pending.given_up, pending.ended
+            yield pending.received, pending.early, pending.given_up, pending.ended
             yield len(pending.unproven), [*map(_told, pending.results)], _slots(pending.evidence)
             yield _outcome(pending.outcome)
         yield results.input_in_doubt, results._warned_extra, results._warned_others

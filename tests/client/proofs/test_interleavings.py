@@ -41,7 +41,7 @@ class KeepsUnproven(Results):
     def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
         super().begin_trigger(pending, deadline)
         pending.unproven, self.kept = self.kept, []
-        pending.came = sum(fate == "triggered" for _, fate, *_ in pending.unproven)
+        pending.received = sum(fate == "triggered" for _, fate, *_ in pending.unproven)
 
 
 class LosesUnproven(Results):
