@@ -13,6 +13,7 @@ of the lens decides how many coefficients are written and read.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
@@ -22,6 +23,7 @@ import numpy as np
 from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats import _foreign as foreign
+from smartcam.calibration.formats._file_format import MAX_FILE_BYTES as MAX_MRCAL_BYTES
 from smartcam.calibration.formats._file_format import Format, Measured
 from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix
 from smartcam.calibration.formats._plain import (
@@ -475,7 +477,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
     "opencv": _form("opencv", parse_opencv, compose_opencv),
     "ros_ini": _foreign("ros_ini", foreign.parse_ros_ini),
     "euroc": _foreign("euroc", foreign.parse_euroc),
-    "mrcal": _foreign("mrcal", foreign.parse_mrcal),
+    "mrcal": dataclasses.replace(_foreign("mrcal", foreign.parse_mrcal), most=MAX_MRCAL_BYTES),
     "colmap": _foreign("colmap", foreign.parse_colmap),
     "basalt": _foreign("basalt", foreign.parse_basalt),
     "multical": _foreign("multical", foreign.parse_multical),
