@@ -368,7 +368,7 @@ def parse_opencv(
     data = _normal(load_storage(text))
     if extrinsics:
         data = {**_normal(load_storage(extrinsics)), **data}
-    sides = next((ends for ends in _ENDS if _has(data, _MATRIX, ends[0])), None)
+    sides = next((ends for ends in _ENDS if _first(data, _MATRIX, ends[0])), None)
     stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
     whole = _first(data, ("imagesize", "size"), "", [])
     size = _size(stated or sequence(whole, "image_size"), size)
@@ -409,10 +409,6 @@ def _normal(data: Plain) -> dict[str, Plain]:
     return found
 
 
-def _has(data: dict[str, Plain], names: Sequence[str], end: str) -> bool:
-    return any(f"{name}{end}" in data for name in names)
-
-
 def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain = None) -> Plain:
     """Return the value of the first name that is there."""
     return next((data[f"{name}{end}"] for name in names if f"{name}{end}" in data), other)
@@ -420,7 +416,7 @@ def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain 
 
 def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
     for names in (_MATRIX, _BENT):
-        if not _has(data, names, end):
+        if _first(data, names, end) is None:
             expected = f"{names[0]}{end} (or {', '.join(f'{one}{end}' for one in names[1:])})"
             raise malformed("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
