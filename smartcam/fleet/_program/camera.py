@@ -656,14 +656,16 @@ class FleetCamera(Camera[ValueT]):
         if self._switch_in_doubt:
             timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
-        deadline = self._deadline(timeout)
+        deadline = asyncio.get_running_loop().time() + timeout
         if self.opening is not None:
             await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)
         try:
-            reply = await self._caller.trigger(request, application, expected, number, timeout)
+            reply = await self._caller.trigger(
+                request, application, expected, number, deadline, timeout
+            )
             receiver.take_states(reply)
             if not receiver.has(reply.states, reply.batch.following):
                 await self._reach(reply.states, reply.batch.following, deadline)
