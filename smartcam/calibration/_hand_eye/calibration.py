@@ -161,9 +161,9 @@ def calibrate_hand_eye(
             beside the robot (``eye-to-hand``, with the target on the hand).
         camera: the camera's lens, which the expected errors assume to be exact; None: it is
             calibrated from the same views, which should then show the target tilted, and from the
-            robot's motions, and the expected errors include those of the lens. Where ``adjust``
-            keeps the lens, or the views deny that the target is as described, the views alone tell
-            it, with the target's points adjusted.
+            robot's motions, together with bends of the target, and the expected errors include
+            those of the lens. Where ``adjust`` keeps the lens, the views alone tell it, with the
+            target's points adjusted.
         method: ``auto`` chooses the one of ``robot`` and ``reprojection`` that predicts left-out
             poses better; or one of these two, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
@@ -613,10 +613,9 @@ def _covariance(chosen: Candidate) -> Array:
     if whole is None or left is None:  # solved without a part of the poses, not without each
         return jackknife(steps[:MAX_FOLDS])
     places = of_one_place(chosen.problem.robot.poses)
-    if len(first := np.unique(places)) > 1:  # without all of a place: to first order, the sum
-        some = [places == one for one in first]
-        steps = np.array([steps[one].sum(axis=0) for one in some])
-        left = np.array([whole - (whole - left[one]).sum(axis=0) for one in some])
+    alike = [places == one for one in np.unique(places)]  # poses of one place are left out together
+    steps = np.array([steps[one].sum(axis=0) for one in alike])  # to first order
+    left = np.array([whole - (whole - left[one]).sum(axis=0) for one in alike])
     spreads = np.array([inverse_scaled(one)[:12, :12] for one in left])
     scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole)[:12, :12])
     lens, seen = chosen.problem.lens, chosen.problem.seen

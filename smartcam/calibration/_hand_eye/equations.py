@@ -60,9 +60,6 @@ needed."""
 BENDS = 3
 """Bends of a target that may be adjusted: heights that grow with x^2, x y and y^2."""
 
-UP = np.array([0.0, 0.0, 1.0])
-"""Normal of a target in its own frame."""
-
 ROUNDING_COST = 100.0
 """Squared standard deviations that are added to the cost with which a gain is compared, for
 rounding errors."""
@@ -266,7 +263,8 @@ class PixelObservations(Observations):
 
     def _bent(self, full: Array) -> Array:
         """Return the target's points with the bends of ``full`` made, (V, N, 3)."""
-        points: Array = self.points + (self._heights() @ full[-BENDS:])[..., None] * UP
+        points = self.points.copy()
+        points[..., 2] += self._heights() @ full[-BENDS:]
         return points
 
 
