@@ -8,6 +8,7 @@ import gc
 import importlib
 import inspect
 import os
+import re
 import shutil
 import signal
 import sys
@@ -31,6 +32,9 @@ settings.register_profile("nightly", deadline=None, max_examples=2000, print_blo
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 ROOT = Path(__file__).parent.parent
+
+ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", flags=re.MULTILINE)
+"""What marks all tests of a module as ``long``."""
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     # Tests run side by side, and their matrices are small: more threads of one test wait for each
@@ -101,7 +105,8 @@ def _import_from_ones_own_place_on(session: pytest.Session) -> None:
     if worker is None or worker["workercount"] == 1:
         return
     paths = [Path(one.split("::")[0]).absolute() for one in session.config.args]
-    files = sorted({file for path in paths for file in _test_files(path)})
+    found = {file for path in paths for file in _test_files(path)}
+    files = sorted(one for one in found if not pytest_ignore_collect(one, session.config))
     number, count = int(worker["workerid"].removeprefix("gw")), worker["workercount"]
     begin = len(files) * number // count
     for file in files[begin:] + files[:begin]:
@@ -117,6 +122,14 @@ def _test_files(path: Path) -> list[Path]:
     if not path.is_relative_to(ROOT / "tests"):
         return []
     return list(path.rglob("test_*.py")) if path.is_dir() else [path] if path.is_file() else []
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Spare the short run the modules of which every test is ``long``."""
+    if config.option.markexpr != "not long" or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return ALL_LONG.search(text) is not None or None
 
 
 @pytest.hookimpl(tryfirst=True)
