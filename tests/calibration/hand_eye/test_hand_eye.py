@@ -139,6 +139,8 @@ def test_hand_eye_does_not_depend_on_the_order(setup: Setup) -> None:
     np.testing.assert_allclose(later.errors, first.errors[order], atol=1e-12)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_takes_poses_of_a_controller() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT, poses=5)
     noon = datetime(2026, 3, 4, 12, tzinfo=UTC)
@@ -327,7 +329,8 @@ def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> Non
     assert scene(setup, poses=10).errors(found.camera_pose)[1] < 2e-3
 
 
-@pytest.mark.sampled(every=2)
+@pytest.mark.long
+@pytest.mark.judged
 @pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.05, True)])
 def test_hand_eye_tells_a_size_that_was_not_to_be_adjusted(factor: float, told: bool) -> None:
     poses, views = printed("eye-in-hand", factor)
@@ -441,6 +444,8 @@ def test_hand_eye_names_a_wrong_pose_and_leaves_it_out(setup: Setup) -> None:
     assert HandEyeCalibration.from_data(found.to_data()).used == found.used
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
     poses, views = _with_a_wrong_pose("eye-in-hand")
     found = calibrate_hand_eye(
@@ -458,6 +463,8 @@ def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
     assert found.warnings[0].text.endswith("it is used all the same")
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_of_few_poses_keeps_a_wrong_one() -> None:
     poses, views = _with_a_wrong_pose("eye-in-hand", poses=8)
     found = calibrate_hand_eye(
@@ -599,6 +606,8 @@ def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
         np.testing.assert_allclose(where, parts, rtol=0, atol=1e-9)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_to_plane_of_raised_features_is_where_they_are() -> None:
     truth = scene("eye-to-hand", poses=5)
     poses, views = measured("eye-to-hand", 0.0, EXACT, poses=5)
@@ -653,6 +662,8 @@ def test_point_errors_of_its_own_poses_are_its_errors(noisy: HandEyeCalibration)
     np.testing.assert_allclose(rms, noisy.errors, rtol=1e-9)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT, poses=6)
     said = Checkerboard(columns=5, rows=4, square=0.03 / 0.98)

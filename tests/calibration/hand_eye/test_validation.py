@@ -114,6 +114,8 @@ def test_hand_eye_of_two_exchanged_poses_leaves_both_out() -> None:
     assert "it belongs to another view, or numbers the target" in found.warnings[0].text
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_of_six_poses_leaves_one_of_another_view_out() -> None:
     poses, views = measured("eye-in-hand", poses=6)
     found = calibrated([*poses[:5], poses[0]], views)
@@ -212,6 +214,8 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
     )
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_check_poses_that_belong_together_tells_no_gross_ones() -> None:
     asked = problem(list(scene("eye-in-hand", poses=8).robot_poses), "eye-in-hand")
     assert check_poses(asked).gross(most_error(asked)).tolist() == []

@@ -94,6 +94,8 @@ def test_calibrate_stereo_held_out_error_is_that_of_a_calibration_without_the_pa
     assert found.pairs[0].held_out == pytest.approx(math.sqrt(np.mean(errors**2)), rel=1e-3)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_calibrate_stereo_uses_views_of_one_camera_alone() -> None:
     left, right = pairs(8)
     some: Views = [None if number == 2 else view for number, view in enumerate(right)]
@@ -123,6 +125,8 @@ def test_calibrate_stereo_names_a_view_of_another_moment_and_leaves_it_out() -> 
     assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_calibrate_stereo_leaves_a_swapped_pair_out() -> None:
     left, right = pairs(8)
     left[3], right[3] = right[3], left[3]

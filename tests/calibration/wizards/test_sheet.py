@@ -211,6 +211,7 @@ async def test_rulers_that_no_printer_makes_keep_the_step(tmp_path: Path) -> Non
     session.close()
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("picture", "text"),
     [
