@@ -138,15 +138,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
     values of the parameter that changes fastest take turns. Of the others every second one is
-    ``judged``, and the rest ``widest``.
+    ``judged``, and the rest ``widest``. With ``SMARTCAM_TEST_CASES=first`` one case of each test
+    stays.
     """
+    first_alone = os.environ.get("SMARTCAM_TEST_CASES") == "first"
     counts: Counter[tuple[Any, str]] = Counter()
     left_out: Counter[tuple[Any, str]] = Counter()
     for item in items:
         marker = item.get_closest_marker("sampled")
-        if marker is None or item.get_closest_marker("long"):
+        if item.get_closest_marker("long") or (marker is None and not first_alone):
             continue
-        test, every = (item.parent, getattr(item, "originalname", "")), marker.kwargs["every"]
+        test = (item.parent, getattr(item, "originalname", ""))
+        every = sys.maxsize if marker is None or first_alone else marker.kwargs["every"]
         row, place = divmod(counts[test], every)
         if (row + place) % every:
             item.add_marker(pytest.mark.long)

@@ -167,6 +167,7 @@ async def test_every_part_is_put_onto_its_place_and_errors_are_as_predicted(
     assert load_cell(folder / "marks.yaml")["desk/camera"].calibration is None
 
 
+@pytest.mark.long
 @NEEDS_INSPECTION
 def test_demo_with_plain_is_a_command(tmp_path: Path) -> None:
     folder = tmp_path / "demo"
