@@ -33,7 +33,13 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 ROOT = Path(__file__).parent.parent
 
-ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", flags=re.MULTILINE)
+ONLY_LONG = frozenset({"long", "long and not widest", "judged"})
+"""Choices of marks by which only ``long`` tests run."""
+
+SOME_LONG = re.compile(r"\b(long|sampled|judged|widest|LONG|ONE_LONG)\b|_long\b")
+"""What is in each module that has ``long`` tests."""
+
+ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", re.MULTILINE)
 """What marks all tests of a module as ``long``."""
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
@@ -125,11 +131,13 @@ def _test_files(path: Path) -> list[Path]:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Spare the short run the modules of which every test is ``long``."""
-    if config.option.markexpr != "not long" or collection_path.suffix != ".py":
+    """Spare a run the modules of which it has no test: all are ``long``, or none is."""
+    marks = config.option.markexpr
+    if not collection_path.match("test_*.py") or marks not in {"not long", *ONLY_LONG}:
         return None
     text = collection_path.read_text(encoding="utf-8")
-    return ALL_LONG.search(text) is not None or None
+    none = SOME_LONG.search(text) is None if marks in ONLY_LONG else ALL_LONG.search(text)
+    return True if none else None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -137,25 +145,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark as ``long`` the cases of a ``sampled`` test that the short run leaves out.
 
     Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
-    values of the parameter that changes fastest take turns. Of the others every second one is
+    values of the parameter that changes fastest take turns. Of the others every third one is
     ``judged``, and the rest ``widest``. With ``SMARTCAM_TEST_CASES=first`` one case of each test
     stays.
     """
     first_alone = os.environ.get("SMARTCAM_TEST_CASES") == "first"
     counts: Counter[tuple[Any, str]] = Counter()
     left_out: Counter[tuple[Any, str]] = Counter()
+    long_ones: set[Path] = set()
     for item in items:
         marker = item.get_closest_marker("sampled")
-        if item.get_closest_marker("long") or (marker is None and not first_alone):
+        if item.get_closest_marker("long"):
+            long_ones.add(item.path)
+            continue
+        if marker is None and not first_alone:
             continue
         test = (item.parent, getattr(item, "originalname", ""))
         every = sys.maxsize if marker is None or first_alone else marker.kwargs["every"]
         row, place = divmod(counts[test], every)
         if (row + place) % every:
             item.add_marker(pytest.mark.long)
-            item.add_marker(pytest.mark.widest if left_out[test] % 2 else pytest.mark.judged)
+            item.add_marker(pytest.mark.widest if left_out[test] % 3 else pytest.mark.judged)
             left_out[test] += 1
         counts[test] += 1
+    for path in long_ones:
+        if SOME_LONG.search(path.read_text(encoding="utf-8")) is None:
+            raise pytest.UsageError(f"{path} has long tests, but not a word of {SOME_LONG.pattern}")
 
 
 def pytest_collection_finish() -> None:
