@@ -119,7 +119,7 @@ class OutletsFile(_OutletFields):
         """Read a file.
 
         Raises:
-            ConfigurationError: the file cannot be read, or a field is wrong; told with line and
+            ConfigurationError: the file cannot be read, or a field is wrong; the error has line and
                 field.
             MissingExtraError: the extra ``yaml`` is not installed.
         """

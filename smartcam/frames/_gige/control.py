@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 ANSWER_TIMEOUT: Final = 0.3
 """Seconds for an answer: by the standard, a camera answers or says "pending" within 200 ms."""
 
-TRIES: Final = 3
+MAX_ATTEMPTS: Final = 3
 
 IP_MTU: Final = 14
 """Socket option for the MTU of the path of a connected socket, from linux/in.h."""
@@ -183,7 +183,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             datagram = encode(command, request_id, payload)
             try:
                 self._expected = request_id
-                for _ in range(TRIES):
+                for _ in range(MAX_ATTEMPTS):
                     ack = await self._tried(datagram, command, what)
                     if ack is not None:
                         return self._checked(ack, command, least, what)
@@ -191,7 +191,8 @@ class ControlChannel(asyncio.DatagramProtocol):
                 self._expected = 0
                 self._emptied()
         raise FrameTimeoutError(
-            f"{self.source}: no answer to {command.name} {what} in {TRIES} x {ANSWER_TIMEOUT:g} s",
+            f"{self.source}: no answer to {command.name} {what} in "
+            f"{MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s",
             source=self.source,
         )
 

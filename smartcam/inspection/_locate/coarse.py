@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 DIRECTIONS: Final = 16
-"""Directions of gradients that are told apart in the full circle."""
+"""Number of directions of gradients in the full circle that are distinguished."""
 
 AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
-"""Agreement of two directions that are so many steps apart; of others it is 0."""
+"""Agreement of two directions by the steps between them; 0 for more steps."""
 
 MAX_TOP_POINTS: Final = 44
 """Largest number of points of a part that are looked up everywhere: with 4 of agreement each, their
@@ -331,7 +331,7 @@ class _AgreementTable:
 
 
 def _thinned(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
-    """Return so many of the points at most, evenly."""
+    """Return at most a number of the points, evenly spread."""
     if len(points) <= most:
         return points, normals
     kept = np.linspace(0, len(points) - 1, most).round().astype(int)

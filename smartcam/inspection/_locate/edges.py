@@ -53,11 +53,11 @@ MAX_SHIFT_PX: Final = 1.5
 """Pixels that a fit may move a segment by; more of them, and it is another edge."""
 
 MAX_BLUR_PX: Final = 3.0
-"""Blur of an edge that a place is told by at most, in pixels."""
+"""Largest blur of an edge whose place is measured, in pixels."""
 
 MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
 """Rms of a band's pixels about its step in parts of the noise, and of the edge's height, up to
-which the edge is a step whose place can be told to a fraction of a pixel."""
+which the edge is a step whose place can be measured to a fraction of a pixel."""
 
 MAX_SIGMA_PX: Final = 0.3
 """Largest standard deviation of the place of a taught edge, pixels."""
@@ -79,7 +79,7 @@ class TaughtEdges(NamedTuple):
     """The edges of a picture as segments."""
 
     segments: Segments  # places in pixels of the picture
-    exact: NDArray[np.bool_]  # (N,), those whose place is told to a fraction of a pixel
+    exact: NDArray[np.bool_]  # (N,), those whose place is measured to a fraction of a pixel
     points: Array  # (M, 2), all edge pixels
 
 

@@ -68,7 +68,7 @@ MAX_REGION_PX: Final = 25_000_000
 """Pixels of a region that is taught, at most."""
 
 MIN_SEGMENTS: Final = 12
-"""Least number of segments whose place is told to a fraction of a pixel that a part has."""
+"""Least number of a part's segments whose place can be measured to a fraction of a pixel."""
 
 MIN_TOP_POINTS: Final = 16
 """Least number of points of a part at the smallest level of the pyramid."""
@@ -362,7 +362,7 @@ def _taught(
     if edges is None or len(exact) < MIN_SEGMENTS:
         raise TeachingError(
             TeachingTrouble.FEW_EDGES,
-            f"{len(exact)} pieces of edges whose place can be told, expected {MIN_SEGMENTS} or "
+            f"{len(exact)} pieces of edges whose place can be measured, expected {MIN_SEGMENTS} or "
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.some(exact)

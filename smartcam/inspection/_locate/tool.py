@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MAX_DRAWN: Final = 80
 """Largest number of edges of a part that are drawn."""
 
-STEPS: Final = np.array([0.5, 0.5, 1e-3])
+POSE_STEPS: Final = np.array([0.5, 0.5, 1e-3])
 """Pixels, and radians, by which a pose is moved to see what its place in the plane does."""
 
 
@@ -214,7 +214,7 @@ def in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
     start = np.array([part.pose.x, part.pose.y, part.pose.angle])
     values = _pose_in(start, plane)
     columns = []
-    for way in np.diag(STEPS):
+    for way in np.diag(POSE_STEPS):
         off = _pose_in(start + way, plane) - _pose_in(start - way, plane)
         off[2] = math.remainder(off[2], 2 * math.pi)
         columns.append(off / (2 * way.max()))

@@ -13,7 +13,7 @@ class TeachingTrouble(enum.Enum):
     EMPTY = "empty"
     """The region has no pixel in the picture."""
     FEW_EDGES = "few edges"
-    """Too few edges whose place can be told to a fraction of a pixel."""
+    """Too few edges whose place can be measured to a fraction of a pixel."""
     BORDER = "border"
     """Too many of the edges lie at the border of the region: it cuts the part."""
     OPEN = "open"
