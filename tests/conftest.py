@@ -37,10 +37,10 @@ ONLY_LONG = frozenset({"long", "long and not widest", "judged"})
 """Choices of marks by which only ``long`` tests run."""
 
 SOME_LONG = re.compile(r"\b(long|sampled|judged|widest|LONG|ONE_LONG)\b|_long\b")
-"""What is in each module that has ``long`` tests."""
+"""Pattern of the words of which each module that has ``long`` tests has one."""
 
 ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", re.MULTILINE)
-"""What marks all tests of a module as ``long``."""
+"""Pattern of the line that marks all tests of a module as ``long``."""
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     # Tests run side by side, and their matrices are small: more threads of one test wait for each
@@ -147,7 +147,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
     values of the parameter that changes fastest take turns. Of the others every third one is
     ``judged``, and the rest ``widest``. With ``SMARTCAM_TEST_CASES=first`` one case of each test
-    stays.
+    stays. What is marked ``judged`` is ``long``.
     """
     first_alone = os.environ.get("SMARTCAM_TEST_CASES") == "first"
     counts: Counter[tuple[Any, str]] = Counter()
@@ -155,6 +155,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     long_ones: set[Path] = set()
     for item in items:
         marker = item.get_closest_marker("sampled")
+        if item.get_closest_marker("judged"):
+            item.add_marker(pytest.mark.long)
         if item.get_closest_marker("long"):
             long_ones.add(item.path)
             continue

@@ -1,8 +1,8 @@
 """The event loops that tests run in, and others that one run may have in their place.
 
 ``SMARTCAM_TEST_LOOP`` is ``eager`` (every task begins where it is made, Python 3.12 and later),
-``debug`` (asyncio's debug mode), ``eager debug``, or ``uvloop``, whose time cannot be moved: then the tests
-that need a time of their own are left out.
+``debug`` (asyncio's debug mode), ``eager debug``, or ``uvloop``, whose time cannot be moved: then
+the tests that need a time of their own are left out.
 """
 
 from __future__ import annotations

@@ -48,23 +48,14 @@ FUZZED = {
 
 each_parser = pytest.mark.parametrize("parser", PARSERS.values(), ids=list(PARSERS))
 
-KIN = (", thesis", ", b16", ", bid")
-"""Dialects in whose frames the short run does not count what it counts in the handbook's."""
-
 # what reads YAML needs larger inputs; in the short run the row of YAML stands for all
 each_parser_in_turn = pytest.mark.parametrize(
     "parser",
     [
-        pytest.param(
-            one,
-            marks=[pytest.mark.long, pytest.mark.widest]
-            if one.short == PAST_LOOKAHEAD
-            else [pytest.mark.long]
-            if one.name.endswith(KIN)
-            else [],
-        )
+        pytest.param(one, marks=[pytest.mark.long, pytest.mark.widest] if large else [])
         for one in PARSERS.values()
         if one.name != "YAML"
+        for large in [one.short == PAST_LOOKAHEAD]
     ],
     ids=lambda one: one.name,
 )

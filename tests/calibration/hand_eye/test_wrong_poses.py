@@ -159,7 +159,6 @@ def test_matrices_in_place_of_transforms_are_refused(make: Any, text: str) -> No
         make()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_poses_visited_thrice_tell_no_more_than_once() -> None:
     robot, seen = TRUTH.measured(

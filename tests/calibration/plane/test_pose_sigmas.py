@@ -23,12 +23,8 @@ def localized(x: float, y: float, theta: float, sigma: PoseSigma | None) -> Loca
 
 
 @pytest.mark.parametrize(
-    ("model", "count", "within"),
-    [  # of 100 a standard deviation is known to 7 %, of 400 to 3.5 %
-        ("similarity", 100, 0.25),
-        pytest.param("similarity", 400, 0.12, marks=[pytest.mark.long, pytest.mark.widest]),
-        pytest.param("homography", 400, 0.12, marks=[pytest.mark.long, pytest.mark.judged]),
-    ],
+    ("model", "count", "within"),  # of 100 a standard deviation is known to 7 %, of 400 to 3.5 %
+    [("similarity", 100, 0.25), pytest.param("homography", 400, 0.12, marks=pytest.mark.judged)],
 )
 def test_sigma_is_that_of_many_calibrations(model: str, count: int, within: float) -> None:
     random = np.random.default_rng(5)

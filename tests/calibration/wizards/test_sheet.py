@@ -134,7 +134,6 @@ async def test_wrong_touch_is_touched_again_or_removed(tmp_path: Path) -> None:
     session.close()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_smaller_print_is_reported_unless_the_rulers_are_smaller_too(tmp_path: Path) -> None:
     cell = Cell(scale=0.97, sigma=0.0)
@@ -235,7 +234,6 @@ async def test_picture_without_the_sheet_keeps_the_step(
     session.close()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_unmarked_origin_is_reported(tmp_path: Path) -> None:
     cell = Cell()
