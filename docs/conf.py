@@ -29,6 +29,7 @@ from pydantic import BaseModel
 
 import smartcam
 from smartcam._client.handshake import load_protocol
+from smartcam._settings_model import OPTIONS
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Application, InSightQuirks, Quirks, Scenario, faults
 from smartcam.emulator._scenario.timeline import Cue
@@ -54,7 +55,7 @@ from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._machine import State
 from smartcam.protocols.messages import Request, Sender, Wire
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import CameraSettings
+from smartcam.settings import CameraSettings, parse_address
 from smartcam.web import _clouds as cloud_page
 from smartcam.web import _colours as colour_page
 from smartcam.web import _emulator as emulator_page
@@ -119,7 +120,7 @@ LIMITS = (
     "_client.link.FIRST_CHUNK",
     "_client.link.LARGEST_CHUNK",
     "_client.link.TURN_TIME",
-    "_zenoh.TURN",
+    "_zenoh.CALLBACKS_PER_TURN",
     "_zenoh.PATIENT_TURN",
     "_client.link.MAX_REST_BYTES",
     "camera.DEFAULT_MAX_QUEUE",
@@ -212,7 +213,7 @@ LIMITS = (
     "_zenoh.LEASE_TIME",
     "fleet._bus.zenoh.MAX_DIRECT_BYTES",
     "_zenoh.MAX_WAITING_BYTES",
-    "_zenoh.TURN",
+    "_zenoh.CALLBACKS_PER_TURN",
     "recording._mcap.form.MAX_CAMERAS",
     "recording._mcap.form.MAX_MESSAGE_BYTES",
     "recording._mcap.form.MAX_NAME_CHARACTERS",
@@ -281,7 +282,7 @@ LIMITS = (
     "conformance.camera._wire.MAX_BODY_BYTES",
     "conformance.camera._raw_client.MAX_HEARD_BYTES",
     "conformance.camera._raw_client.MAX_TRAIL",
-    "conformance.camera._raw_client.FAREWELL",
+    "conformance.camera._raw_client.CLOSE_TIMEOUT",
     "conformance.camera._session_under_test.SESSION_TRIES",
     "conformance.camera._options.MAX_SECONDS",
     "conformance.camera._options.MAX_INPUT_DATA_BYTES",
@@ -291,7 +292,7 @@ LIMITS = (
     "web._routes.READ_TIMEOUT",
     "web._streams.MAX_STREAMS",
     "web._streams.PERIOD",
-    "web._streams.SLOW",
+    "web._streams.SHOW_TIMEOUT",
     "web._emulator.MAX_ENTRIES",
     "web._emulator.MAX_WAIT",
     "web._emulator.MAX_WAITING_CHANGES",
@@ -312,7 +313,7 @@ LIMITS = (
     "web._live_view.MAX_SHOWN_RAW_BYTES",
     "web._live_view.SERIES",
     "web._live_view.IMAGE_PERIOD",
-    "web._site.FAREWELL",
+    "web._site.FINISH_TIMEOUT",
     "web._connections.MAX_CONNECTIONS",
     "web._connections.HEAD_TIMEOUT",
     "web._connections.KEEP_ALIVE",
@@ -533,10 +534,9 @@ def _faults(family: type[BaseModel]) -> str:
 
 def settings() -> str:
     """Return the options of ``connect()``."""
+    usual = CameraSettings(address=parse_address("camera"))
     rows = [
-        (f"`{name}`", "" if field.is_required() else f"`{field.default!r}`", field.description)
-        for name, field in CameraSettings.model_fields.items()
-        if name != "address"
+        (f"`{name}`", f"`{getattr(usual, name)!r}`", about) for name, (_, about) in OPTIONS.items()
     ]
     return _table(("option", "default", "meaning"), rows)
 
