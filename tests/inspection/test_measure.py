@@ -419,7 +419,7 @@ FAR, ACROSS_ALL = [[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.
 @pytest.mark.parametrize(
     ("pixels", "number", "least", "most"),
     [
-        (FAR, 12, 0.5, 2.0),
+        (FAR, 6, 0.4, 2.5),
         *(
             pytest.param(one, 100, 0.8, 1.25, marks=[pytest.mark.long, pytest.mark.widest])
             for one in (FAR, ACROSS_ALL)

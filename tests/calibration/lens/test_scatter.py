@@ -105,7 +105,6 @@ def test_halves_of_views_with_common_errors_give_the_same_lens() -> None:
     assert compared.ratio < 2.0
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_views_that_number_a_board_from_its_other_end_are_numbered_as_the_rest() -> None:
     """A sheet that bends to one side shows its ends, whose numbers a picture does not show."""
