@@ -377,7 +377,7 @@ class EmulatedCamera(WireCamera):
             if isinstance(message, m.Disconnect):
                 self._collect()
                 self._active = None
-                link.unseated()
+                link.session_ended()
         self._collect()
         self.device.tell_entered()
         if faults:

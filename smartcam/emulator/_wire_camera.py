@@ -517,11 +517,11 @@ class WireCamera(Server):
         """Note a frame that a machine saw, or bytes that make no frame."""
         traffic, now = self._traffic, self.clock.now
         if isinstance(what, Frame):
-            traffic.entries.keep(now, link.peer, sender, what, link.hearing)
+            traffic.entries.keep(now, link.peer, sender, what, link.input_faults)
             if sender is m.Sender.CLIENT:
                 traffic.count(what)
         else:
-            traffic.add(now, link.peer, sender, what, link.hearing)
+            traffic.add(now, link.peer, sender, what, link.input_faults)
         if self._shows:
             self._show_last()
 

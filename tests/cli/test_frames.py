@@ -133,14 +133,14 @@ def test_list_of_nothing_says_what_was_looked_for(shelf: Puts) -> None:
 
 def test_list_of_what_is_not_looked_for_reports_it() -> None:
     done = run("frames", "list", "--scheme", "synthetic").done()
-    assert done.out == "synthetic:// is not looked for: its sources are opened by their URLs\n"
+    assert done.out == "synthetic:// has no search: open its sources by their URLs\n"
     assert "synthetic" not in run("frames", "list").done().out
 
 
 def test_list_goes_on_after_a_driver_that_fails(shelf: Puts) -> None:
     shelf(fails=RuntimeError("broken"))
     done = run("frames", "list").done()
-    assert "shelf: cannot be looked for: RuntimeError('broken')\n" in done.out
+    assert "shelf: the search failed: RuntimeError('broken')\n" in done.out
     told = [one for one in run("frames", "list", "--json").done().lines if "error" in one]
     assert {"scheme": "shelf", "error": "RuntimeError('broken')"} in told
 

@@ -245,7 +245,7 @@ def test_pcap_is_read_by_tshark(url: str, tmp_path: Path) -> None:
         [TSHARK, "-r", str(packets)], capture_output=True, text=True, check=True, timeout=300
     )
     assert done.lines == [{"file": str(packets), "packets": len(shown.stdout.splitlines())}]
-    run("pcap", str(path), "-o", str(packets)).failed(2, "run.pcap: the file is there already")
+    run("pcap", str(path), "-o", str(packets)).failed(2, "run.pcap: the file exists already")
     assert run("pcap", str(path), "-o", str(packets), "--force").done().out == (
         f"{packets}: {done.lines[0]['packets']} packets\n"
     )

@@ -496,7 +496,7 @@ async def test_session_lost_if_nobody_waits_is_noticed(monkeypatch: pytest.Monke
 
         async def lose(exam: Examination) -> None:
             emulator.inject(faults.SecondClient())
-            await until(lambda: not exam.patient.connected)
+            await until(lambda: not exam.connected_camera.connected)
 
         idle = doctor._DoctorCheck("idle", lose, lambda options: 5.0)
         name, session, *_ = doctor._CHECKS

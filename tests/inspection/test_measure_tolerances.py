@@ -121,7 +121,7 @@ def test_learned_tolerance_contains_good_values_with_guard_and_is_explained() ->
     (remark,) = found.remarks
     assert remark.startswith(f"measure: tolerance {limits.text}, from 20 pictures: mean 92.")
     assert "standard deviation 0.0" in remark
-    assert "of which measuring makes 0.01 px" in remark
+    assert "of which the measurement causes 0.01 px" in remark
     assert "Not learned from" not in remark
 
 

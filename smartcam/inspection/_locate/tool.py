@@ -1,4 +1,4 @@
-"""The tool `locate`: taught parts, with their poses and the errors of these."""
+"""The tool `locate`: taught parts, with their poses and the errors of the poses."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 MAX_DRAWN: Final = 80
 """Largest number of edges of a part that are drawn."""
 
-STEPS: Final = np.array([0.5, 0.5, 1e-3])
-"""Pixels, and radians, by which a pose is moved to see what its place in the plane does."""
+POSE_STEPS: Final = np.array([0.5, 0.5, 1e-3])
+"""Steps, pixels and radians, of the numerical derivative of a pose in the plane."""
 
 
 class PlanePose(NamedTuple):
@@ -38,7 +38,7 @@ class PlanePose(NamedTuple):
     covariance: Array  # (3, 3)
 
     def fields(self, si: float) -> dict[str, float]:
-        """Return the fields of a result, in SI units by the metres of a length's unit."""
+        """Return the fields of a result in SI units; ``si``: metres per unit of length."""
         units = np.array([si, si, 1.0])
         x, y, theta = (self.values * units).tolist()
         sigmas = np.sqrt(np.diag(self.covariance))
@@ -66,7 +66,7 @@ class Locate(Tool[LocateSettings]):
 
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "locate needs")  # now, so that the first picture need not wait
+        load("scipy.special", "locate needs")  # saves the first picture the import
         self.models = [PartModel.read(setup.folder / one) for one in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
@@ -178,7 +178,7 @@ class Locate(Tool[LocateSettings]):
         )
 
     def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
-        """Return why what was found is not ok; "" if it is."""
+        """Return the reason why the found parts are not ok; "" if they are ok."""
         least, most = self._wanted
         count, nearest = len(found.parts), found.nearest
         if not least <= count <= most:
@@ -214,7 +214,7 @@ def in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
     start = np.array([part.pose.x, part.pose.y, part.pose.angle])
     values = _pose_in(start, plane)
     columns = []
-    for way in np.diag(STEPS):
+    for way in np.diag(POSE_STEPS):
         off = _pose_in(start + way, plane) - _pose_in(start - way, plane)
         off[2] = math.remainder(off[2], 2 * math.pi)
         columns.append(off / (2 * way.max()))
