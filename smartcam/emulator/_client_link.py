@@ -111,7 +111,7 @@ class LinkOwner(Protocol):
         """Forget a link that is gone; a second call does nothing."""
         ...
 
-    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+    def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         """Note that a connection has ended."""
         ...
 
@@ -195,7 +195,7 @@ class ClientLink(ABC):
         """Write bytes that belong together; False if it was not possible."""
 
     @abstractmethod
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         """End the link after the bytes written so far, or by a reset."""
 
     def hold(self, on: bool) -> None:  # noqa: B027  only TCP keeps unread bytes
@@ -417,7 +417,7 @@ class FaultyLink:
         if self._link.closed:
             return
         if ending.how in {"close", "reset"}:
-            self._link.part("close" if ending.how == "close" else "reset")
+            self._link.end_link("close" if ending.how == "close" else "reset")
             return
         self.muted = ending.cause
         self._outgoing.close()

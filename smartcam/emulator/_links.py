@@ -113,7 +113,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._listener.leave(self)
         with self._owner.step():
             self._owner.lost(self)
-        self._owner.parted(self, by_client=by_client, reset=exc is not None)
+        self._owner.connection_ended(self, by_client=by_client, reset=exc is not None)
 
     def write(self, data: bytes) -> bool:
         if self.closed:
@@ -135,7 +135,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self._owner.lost(self)
         self._transport.abort()
 
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         if how == "reset":
             with contextlib.suppress(OSError):  # the client may be gone already
                 sock = self._transport.get_extra_info("socket")
@@ -164,7 +164,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
 
     def heal(self) -> None:
         if self._faulty is not None and self._faulty.muted is not None:
-            self.part("reset")
+            self.end_link("reset")
 
     def _write_frames(self, frames: list[bytes]) -> None:
         if frames:
@@ -280,7 +280,7 @@ class _UdpLink(ClientLink):
     def write(self, data: bytes) -> bool:
         return not data or self._listener.send(data, self._address)
 
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         self.close(f"{why} ({how})")
 
     def stop_listening(self) -> None:

@@ -35,7 +35,7 @@ MAX_TURN_SECONDS = 0.0005
 would wait that long if its result comes while a spool is written."""
 
 RESULT_BYTES = 600
-"""Bytes that a result takes in memory besides its container, about."""
+"""Approximate number of bytes that a result takes in memory besides its container."""
 
 
 class OutletState(NamedTuple):

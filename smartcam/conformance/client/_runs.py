@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message
 
-SETTLING = 0.3
-"""Seconds that the camera waits for the end of a client that has ended: loopback is faster."""
+SETTLING_TIME = 0.3
+"""Seconds that the camera waits for the last messages of a client that has ended."""
 
 MAX_LINES = 40
 """Largest number of lines of the wire that a finding shows: the last ones."""
@@ -161,7 +161,7 @@ async def perform(
 
 async def _settle(camera: EmulatedCamera) -> None:
     """Wait until the camera has received the client's last message."""
-    end = time.monotonic() + SETTLING
+    end = time.monotonic() + SETTLING_TIME
     seen = -1
     while time.monotonic() < end:
         # each turn of the loop handles datagrams and deliveries that are there already

@@ -381,7 +381,7 @@ class EmulatedInSight(LineCamera):
         clients = [one for one in self._clients.values() if isinstance(one, TelnetClient)]
         return sorted(clients, key=lambda one: one.number)
 
-    def _began(self) -> None:
+    def _after_start(self) -> None:
         self._offset = nanoseconds(self.clock.now) - self.device.now
 
     def _move(self) -> None:

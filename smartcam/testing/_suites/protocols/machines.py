@@ -44,8 +44,8 @@ FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
-ENOUGH = 1000
-"""Bytes without an end count as messages after this many messages."""
+MAX_MESSAGES = 1000
+"""Number of messages after which endless bytes count as a valid series of messages."""
 
 MAX_HIDDEN_FACTOR = 2
 """Largest memory of a machine for waiting bytes, without events, in multiples of the bound."""
@@ -179,7 +179,7 @@ class MachineChecks(Parameters):
                 break
             if datagrams:
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
-            if messages > ENOUGH:
+            if messages > MAX_MESSAGES:
                 break  # they are messages
         kept = tracemalloc.get_traced_memory()[0] - before
         assert kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
