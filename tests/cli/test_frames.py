@@ -239,7 +239,9 @@ def test_grab_numbers_several_and_says_what_it_missed(shelf: Puts, tmp_path: Pat
     numbers = [one["sequence"] for one in done.lines]
     assert numbers == sorted(set(numbers))
     assert re.fullmatch(r"note: \d+ skipped, \d+ lost\n", done.err)
-    grab("-o", str(tmp_path / "x.png"), "--count", "9").failed(2, "x-0001.png: the file exists already")
+    grab("-o", str(tmp_path / "x.png"), "--count", "9").failed(
+        2, "x-0001.png: the file exists already"
+    )
 
 
 def test_grab_after_now_waits_past_what_was_on_its_way(shelf: Puts, tmp_path: Path) -> None:

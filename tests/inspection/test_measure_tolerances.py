@@ -198,8 +198,8 @@ def test_a_tool_that_was_not_asked_teaches_nothing() -> None:
     found = learned({"present": {}}, good)
     assert found.tools == {"present": {"count": [2, 2]}}
     assert found.remarks == [
-        "present: 2 spots in 1 picture; area stays as it is, as the result does not have all of "
-        "them (most). Not learned from: a.png (outside)."
+        "present: 2 spots in 1 picture; area stays as it is, since `most` leaves some of them "
+        "out of the result. Not learned from: a.png (outside)."
     ]
     del good["b.png"]
     assert learned({"present": {"count": 3}}, good).tools == {"present": {"count": 3}}

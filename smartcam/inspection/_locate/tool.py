@@ -83,7 +83,7 @@ class Locate(Tool[LocateSettings]):
                     unit=settings.unit,
                 )
             )
-        for model in self.models:  # worked out now, for the same reason
+        for model in self.models:  # computed here, so that the first picture takes no longer
             _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
@@ -253,7 +253,7 @@ def _values(found: Located) -> dict[str, Any]:
 
 def _near(nearest: LocatedPart | None, named: bool) -> str:
     if nearest is None:
-        return "; nothing is like it"
+        return "; nothing in the picture resembles it"
     name = f"{nearest.name} " if named else ""
     return f"; {name}at {nearest.pose.x:.0f}, {nearest.pose.y:.0f}: {nearest.refusal}"
 
