@@ -88,14 +88,14 @@ napoleon_custom_sections = ["Cancellation", "Source"]
 ROOT = Path(__file__).parents[1]
 
 DOES = {
-    "say": "puts",
-    "hear": "subscribes",
-    "ask": "queries",
+    "put": "puts",
+    "subscribe": "subscribes",
+    "query": "queries",
     "answer": "answers queries",
-    "appear": "has tokens",
+    "present": "has tokens",
     "watch": "looks for tokens",
 }
-"""What a right of a role is, in the engine's words."""
+"""Kinds of use in Zenoh's words."""
 
 WORDS = {"I": "UINT32", "H": "UINT16"}
 """A dialect's ordinary integers."""
@@ -300,7 +300,7 @@ LIMITS = (
     "web._emulator.MAX_NAMES",
     "web._serialize.MAX_HEX_BYTES",
     "web._serialize.MAX_VALUES_BYTES",
-    "web._serialize.MAX_TOLD_BYTES",
+    "web._serialize.MAX_REPLY_BYTES",
     "web._serialize.MAX_LISTED",
     "web._feed.MAX_LOG_NEWS",
     "web._feed.MAX_FAULTS_TOLD",

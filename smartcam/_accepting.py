@@ -13,10 +13,10 @@ deadlines.
 - Some file descriptors of the process are left to others. If only those are left, the connection
   without a session for longest, of any server on this event loop, is closed.
 
-Connections are not accepted by ``asyncio.Server``. A connection that the server has accepted, but
-not yet wrapped at its end, stays open until the garbage collector finds it, and a client would wait
-forever. And if no file descriptor is left, it writes a traceback for each place of its backlog,
-every second.
+Connections are not accepted by ``asyncio.Server``. If it is closed before an accepted connection
+has a transport, the socket stays open until the garbage collector finds it, and the client waits
+forever. Without a free file descriptor it logs a traceback for each place of its backlog, every
+second.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def share_of(most: int) -> int:
 
 
 class Occupant(Protocol):
-    """A connection for the policy."""
+    """A connection, as far as the policy knows it."""
 
     @property
     def settled(self) -> bool:
@@ -189,14 +189,14 @@ class Places(Generic[G]):
             place.within, place.what = math.inf if within is None else within, what
             place.deadline = now + place.within
 
-    def longest(self) -> tuple[float, G] | None:
-        """Return the connection without a session for longest, and since when; else None."""
+    def waits_longest(self) -> tuple[float, G] | None:
+        """Return the connection that has had no session for longest, and since when; None: none."""
         found = next((one for one in self._places.items() if not one[0].settled), None)
         return None if found is None else (found[1].since, found[0])
 
     def make_room(self, why: str) -> None:
-        """Close the connection without a session for longest."""
-        found = self.longest()
+        """Close the connection that has had no session for longest."""
+        found = self.waits_longest()
         if found is not None:
             self.crowded_out += 1
             self._send_away(found[1], why)
@@ -265,7 +265,7 @@ class Acceptor(Generic[G]):
         self._moving = 0  # connections that wait for a free descriptor
         self._scarce = False  # the last try has failed
         self._timer: asyncio.TimerHandle | None = None  # timer of the next deadline
-        self.loop: asyncio.AbstractEventLoop | None = None  # listening socket while it is open
+        self.loop: asyncio.AbstractEventLoop | None = None  # event loop while the socket listens
 
     # ------------------------------------------------------------------ the port
 
@@ -290,7 +290,7 @@ class Acceptor(Generic[G]):
 
     async def wait_closed(self) -> None:
         """Wait until every connection that was accepted has its protocol, or is closed."""
-        if self._moving:  # which takes one turn of the loop
+        if self._moving:  # a move takes one turn of the loop
             await asyncio.sleep(0)
         if self._adopting:
             await asyncio.wait(self._adopting)
@@ -411,7 +411,8 @@ class Acceptor(Generic[G]):
     def _move(self, connection: socket.socket) -> None:
         """Move a connection to the descriptor that has become free, and release the last one.
 
-        Otherwise the last ones would stay in use, and the next connection would get the free one.
+        Otherwise this connection would keep one of the last descriptors, and the next connection
+        would get the free one.
         """
         self._moving -= 1
         try:
@@ -426,7 +427,7 @@ class Acceptor(Generic[G]):
         self._scarce = False
         connection.setblocking(False)
         with contextlib.suppress(OSError):  # the connection is gone again
-            # asyncio does so only if the listening socket was made with the protocol's number
+            # asyncio sets TCP_NODELAY only if the listening socket names the protocol TCP
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.adopt(connection)
 
@@ -452,7 +453,7 @@ def _make_room() -> bool:
     """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
     open_here = [one.places for one in _here.acceptors if one.loop is loop]
-    waiting = [(found[0], one) for one in open_here if (found := one.longest()) is not None]
+    waiting = [(found[0], one) for one in open_here if (found := one.waits_longest()) is not None]
     if not waiting:
         return False
     _, places = min(waiting, key=lambda one: one[0])

@@ -41,7 +41,7 @@ _Text = Annotated[str, Field(max_length=200)]
 _Application = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
-def said_spec(text: str) -> str | None:
+def spec_of_text(text: str) -> str | None:
     """Return the specification that a text names; None for an empty text."""
     spec = text.strip()
     return _KEYWORDS.get(spec.lower(), spec) or None
@@ -219,7 +219,7 @@ async def _setup(call: ThesisCall) -> dict[str, Any]:
     """Set a camera up by a request, after checking that the request means this camera."""
     face, request = call.face, call.request
     _check_place(face, request)
-    spec = said_spec(request.interpret_as)
+    spec = spec_of_text(request.interpret_as)
     if spec is not None:
         face.check_reading(spec)
     face.check_status_topic(request.topic_status)

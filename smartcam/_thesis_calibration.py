@@ -124,7 +124,7 @@ class CalibrationFace(Protocol):
     Attributes:
         name: the camera's name.
         calibrations: calibrations of the camera; None if no folder for them is set.
-        camera: function that returns the camera, for one call of so many seconds.
+        camera: function that returns the camera, for one call of that number of seconds.
     """
 
     name: str

@@ -1084,7 +1084,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         encoding = check_choice(encoding, "encoding", STREAM_ENCODINGS, self.name)
         if encoding not in encodings:
             raise wrong_argument(
-                "encoding", "no video: no frame of it is a picture by itself", encoding, self.name
+                "encoding", "no video: its frames depend on each other", encoding, self.name
             )
         return FrameRequest(encoding, quality)
 

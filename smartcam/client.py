@@ -94,7 +94,7 @@ class SmartCamera(Camera[ValueT]):
     def _go_to(self, address: Address) -> None:
         """Use another address than that of the settings; only before the client is opened."""
         self.settings: CameraSettings = self.settings.model_copy(update={"address": address})
-        self._supervisor.go_by(self.settings)
+        self._supervisor.use_settings(self.settings)
 
     def _read_by(self, spec: object) -> None:
         super()._read_by(spec)
@@ -281,7 +281,7 @@ class SmartCamera(Camera[ValueT]):
     async def reboot(self) -> None:
         link = self._connection.require_link()
         self._connection.require(m.Reboot)
-        self._supervisor.restarts(link)
+        self._supervisor.expect_restart(link)
         await self._send(m.Reboot())
         if link.machine.transport is Transport.TCP:
             await link.wait_closed(self.settings.close_timeout)
@@ -301,7 +301,7 @@ class SmartCamera(Camera[ValueT]):
             # the camera still answers, and its answer must not pass for the next request's
             await self._requests.post(raw.message, raw.answer, deadline)
         else:
-            await self._requests.tell(raw.message, deadline, answered=False)
+            await self._requests.send_unanswered(raw.message, deadline, answered=False)
         return None
 
     async def _send(self, message: m.Request) -> None:

@@ -80,9 +80,9 @@ class Address(NamedTuple):
         if self.parameters or self.quirks:
             named = [quote(value, safe="") for key, value in self.parameters if key == USER]
             user = "".join(f"{one}@" for one in named)
-            said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
+            pairs = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
             query = urlencode(
-                [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
+                [(key, value) for key, value in pairs if value and key not in {USER, PASSWORD}],
                 safe=",:",
             )
         elif self.dialect:

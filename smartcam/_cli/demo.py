@@ -39,9 +39,9 @@ class Steps:
 
 async def demo(options: Options) -> None:
     """Connect, switch while BUSY, trigger, localize, stream, disconnect."""
-    say = Steps(options)
+    steps = Steps(options)
     async with EmulatedCamera(seed=1) as emulator:
-        say.step(f"An emulated BVS002C listens on real TCP: {emulator.url}", url=emulator.url)
+        steps.step(f"An emulated BVS002C listens on real TCP: {emulator.url}", url=emulator.url)
         interpret_as = {
             TANGRAM: "localizations",
             COUNTER: "n: int32",
@@ -50,13 +50,13 @@ async def demo(options: Options) -> None:
         async with smartcam.connect(
             emulator.url, name="demo", application=HELLO, interpret_as=interpret_as
         ) as camera:
-            say.step(f"Connected, application {camera.active_application} runs: {camera.status}")
-            await _switch(camera, say)
-            await _localize(camera, emulator, say)
-            await _stream(camera, say)
+            steps.step(f"Connected, application {camera.active_application} runs: {camera.status}")
+            await _switch(camera, steps)
+            await _localize(camera, emulator, steps)
+            await _stream(camera, steps)
             account = camera.statistics()
-        say.step("Disconnected. The account of every result that arrived:")
-        say.detail(
+        steps.step("Disconnected. The account of every result that arrived:")
+        steps.detail(
             f"   received {account.received} = triggered {account.triggered} + streamed "
             f"{account.streamed} + unclaimed {account.unclaimed} + late {account.late} + wrong "
             f"application {account.wrong_application} + uninterpretable {account.uninterpretable}",
@@ -64,9 +64,9 @@ async def demo(options: Options) -> None:
         )
 
 
-async def _switch(camera: smartcam.Camera, say: Steps) -> None:
+async def _switch(camera: smartcam.Camera, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
-    say.step(
+    steps.step(
         f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
     )
     begin = loop.time()
@@ -80,20 +80,20 @@ async def _switch(camera: smartcam.Camera, say: Steps) -> None:
         event = await anext(events)
         match event:
             case StatusChanged(status=status):
-                say.detail(f"   status: {status}", status=status)
+                steps.detail(f"   status: {status}", status=status)
             case ApplicationChanged(application=application):
-                say.detail(f"   application {application} is active", application=application)
+                steps.detail(f"   application {application} is active", application=application)
             case _:
                 pass
-    say.detail(
+    steps.detail(
         f"   ready {1e3 * (loop.time() - begin):.0f} ms after the order, with a trigger that was "
         f"asked for while BUSY: {len(result.value)} parts"
     )
 
 
-async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, say: Steps) -> None:
+async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, steps: Steps) -> None:
     result = await camera.trigger(timeout=2.0)
-    say.step(
+    steps.step(
         f"Triggered: {len(result.value)} parts after {1e3 * (result.latency or 0):.0f} ms. "
         "Found beside their true poses (metres, degrees):"
     )
@@ -116,11 +116,11 @@ async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, say: Step
             )
         )
     head = ("part", "x", "y", "theta", "true x", "true y", "true theta", "off by")
-    say.detail(table_text(head, rows), result=result)
+    steps.detail(table_text(head, rows), result=result)
 
 
-async def _stream(camera: smartcam.Camera, say: Steps) -> None:
-    say.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
+async def _stream(camera: smartcam.Camera, steps: Steps) -> None:
+    steps.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
     async with camera.application(COUNTER):
         numbers: list[int] = []
         async with camera.results() as results, asyncio.timeout(10):
@@ -128,5 +128,5 @@ async def _stream(camera: smartcam.Camera, say: Steps) -> None:
                 numbers.append(result.value.n)
                 if len(numbers) == STREAMED:
                     break
-    say.detail(f"   {', '.join(map(str, numbers))}", numbers=numbers)
-    say.detail(f"   and back in application {camera.active_application}")
+    steps.detail(f"   {', '.join(map(str, numbers))}", numbers=numbers)
+    steps.detail(f"   and back in application {camera.active_application}")

@@ -44,7 +44,7 @@ async def demo(options: Options) -> None:
     from smartcam.fleet._inside import ZenohEnd
 
     ZenohEnd(BusLink())  # raises if the engine is missing
-    say = Steps(options)
+    steps = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"
     async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * PATIENCE_TIMEOUT):
@@ -58,24 +58,24 @@ async def demo(options: Options) -> None:
             file.write_text(json.dumps({"agent": name, place: endpoint, "cameras": cameras}))
             agents[name] = await stack.enter_async_context(_agent(file, count))
             doing = "is the router, too" if place == "listen" else "joins it there"
-            say.step(
+            steps.step(
                 f"Agent {name}, process {agents[name].pid}, has {count} emulated cameras and "
                 f"{doing}: {url}",
                 agent=name,
                 url=url,
             )
         fleet = await stack.enter_async_context(open(url))
-        _show_fleet(fleet, say)
+        _show_fleet(fleet, steps)
         programs = [
             await stack.enter_async_context(smartcam.connect(f"{url}/{SHARED}", name=name))
             for name in ("robot", "dashboard", "recorder")
         ]
         robot, dashboard, recorder = programs
-        await _share(robot, dashboard, recorder, say)
-        await _reserve(fleet[SHARED], dashboard, say)
-        await _trigger_all(fleet, say)
-        await _kill(fleet, agents["south"], robot, say)
-        await _end(agents["north"], robot, say)
+        await _share(robot, dashboard, recorder, steps)
+        await _reserve(fleet[SHARED], dashboard, steps)
+        await _trigger_all(fleet, steps)
+        await _kill(fleet, agents["south"], robot, steps)
+        await _end(agents["north"], robot, steps)
 
 
 @contextlib.asynccontextmanager
@@ -105,23 +105,23 @@ async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
             await process.wait()
 
 
-def _show_fleet(fleet: Fleet, say: Steps) -> None:
+def _show_fleet(fleet: Fleet, steps: Steps) -> None:
     cameras = fleet.cameras()
-    say.step(f"The whole fleet by one URL, {len(cameras)} cameras:", agents=fleet.agents())
+    steps.step(f"The whole fleet by one URL, {len(cameras)} cameras:", agents=fleet.agents())
     rows = [
         (one.name, *fleet.agents(one.name), one.active_application, str(one.status))
         for one in cameras
     ]
-    say.detail(
+    steps.detail(
         table_text(("camera", "agent", "application", "status"), rows),
         cameras=[one.url for one in cameras],
     )
 
 
 async def _share(
-    robot: smartcam.Camera, dashboard: smartcam.Camera, recorder: smartcam.Camera, say: Steps
+    robot: smartcam.Camera, dashboard: smartcam.Camera, recorder: smartcam.Camera, steps: Steps
 ) -> None:
-    say.step(
+    steps.step(
         f"Three programs use {SHARED}, each with a connection of its own: a robot triggers, a "
         "dashboard watches and triggers by hand, a recorder takes every result:"
     )
@@ -139,14 +139,14 @@ async def _share(
         pressing = group.create_task(trigger(dashboard, BY_HAND))
     for name, task in (("robot", moving), ("dashboard", pressing), ("recorder", recording)):
         numbers = task.result()
-        say.detail(
+        steps.detail(
             f"   {name:9} results {', '.join(map(str, numbers))}", program=name, numbers=numbers
         )
     owned = sorted([*moving.result(), *pressing.result()])
     each = "each is one's own" if owned == recording.result() else "they are NOT one's own"
     account, seen = recorded.statistics(), statuses.statistics().offered
-    say.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {each}", own=owned)
-    say.detail(
+    steps.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {each}", own=owned)
+    steps.detail(
         f"   the recorder's account: sent {account.offered + account.missed} = taken "
         f"{account.taken} + dropped {account.dropped} + queued {account.queued} + missed "
         f"{account.missed}; the dashboard saw {seen} statuses",
@@ -155,26 +155,26 @@ async def _share(
     )
 
 
-async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, say: Steps) -> None:
-    say.step(
+async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, steps: Steps) -> None:
+    steps.step(
         f"One program has {SHARED} for itself; the dashboard's trigger waits, and says for whom:"
     )
     async with camera.reserve(PATIENCE_TIMEOUT):
         try:
             await other.trigger(timeout=SOON_TIMEOUT)
         except SmartCamError as exc:
-            say.detail(f"   {exc}", error=type(exc).__name__, reason=str(exc))
+            steps.detail(f"   {exc}", error=type(exc).__name__, reason=str(exc))
     result = await other.trigger(timeout=PATIENCE_TIMEOUT)
-    say.detail(f"   and when it is given back: result {result.number}", number=result.number)
+    steps.detail(f"   and when it is given back: result {result.number}", number=result.number)
 
 
-async def _trigger_all(fleet: Fleet, say: Steps) -> None:
+async def _trigger_all(fleet: Fleet, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
     begin = loop.time()
     outcomes = await fleet.trigger(timeout=PATIENCE_TIMEOUT)
     taken = loop.time() - begin
     results: list[Result] = [one for one in outcomes.values() if not isinstance(one, SmartCamError)]
-    say.step(
+    steps.step(
         f"All cameras triggered at once: {len(results)} results of {len(outcomes)} cameras after "
         f"{1e3 * taken:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",
         results=len(results),
@@ -182,8 +182,8 @@ async def _trigger_all(fleet: Fleet, say: Steps) -> None:
     )
 
 
-async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps) -> None:
-    say.step("Agent south is killed. Every program learns of it at once:")
+async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
+    steps.step("Agent south is killed. Every program learns of it at once:")
     events, loop = fleet.events(), asyncio.get_running_loop()
     await _drain(events)
     begin = loop.time()
@@ -193,14 +193,14 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps
         while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS_OF_AGENT["south"][1]:
             left.append(type(await anext(events)).__name__)
     gone = left.count("CameraLeft")
-    say.detail(
+    steps.detail(
         f"   {1e3 * (loop.time() - begin):.0f} ms later: {gone} cameras and their agent are gone; "
         f"there are {len(fleet)}, of {', '.join(fleet.agents())}",
         gone=gone,
         left=len(fleet),
     )
     result = await robot.trigger(timeout=PATIENCE_TIMEOUT)
-    say.detail(f"   the robot goes on: result {result.number}", number=result.number)
+    steps.detail(f"   the robot goes on: result {result.number}", number=result.number)
 
 
 async def _drain(events: Any) -> None:
@@ -209,7 +209,7 @@ async def _drain(events: Any) -> None:
         await anext(events)
 
 
-async def _end(agent: Process, robot: smartcam.Camera, say: Steps) -> None:
+async def _end(agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
     gone = robot.events()
     agent.terminate()
     async with asyncio.timeout(PATIENCE_TIMEOUT):
@@ -219,7 +219,7 @@ async def _end(agent: Process, robot: smartcam.Camera, say: Steps) -> None:
     try:
         await robot.trigger()
     except SmartCamError as exc:
-        say.step(
+        steps.step(
             f"Agent north ends; its cameras get their Disconnect. The robot's next trigger: {exc}",
             error=type(exc).__name__,
         )

@@ -100,19 +100,19 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     """Draw parts, write a cell file, and inspect the pictures."""
     from smartcam.inspection import Picture, load_cell
 
-    say = Steps(options)
+    steps = Steps(options)
     with naming(f"--folder {folder}"):
         await asyncio.to_thread(_write, folder, seed)
-    say.step(
+    steps.step(
         f"A folder with drawn pictures of {len(PARTS)} parts, and a file with the expected "
         f"findings: {folder / 'cell.yaml'}",
         folder=str(folder),
     )
     camera = load_cell(folder / "cell.yaml")["desk/drawn"]
     check = camera.program("check")
-    say.step("The application 3 reads, looks for a hole, and compares a print. Its results are:")
-    say.detail(f"   {check.interpret_as}", layout=check.interpret_as)
-    say.step("Inspected, beside the truth:")
+    steps.step("The application 3 reads, looks for a hole, and compares a print. Its results are:")
+    steps.detail(f"   {check.interpret_as}", layout=check.interpret_as)
+    steps.step("Inspected, beside the truth:")
     rows: list[tuple[object, ...]] = []
     parts: list[dict[str, Any]] = []
     for part in PARTS:
@@ -126,12 +126,12 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
             (part.name, part.fault or "none", ", ".join(wrong) or "none", f"{milliseconds:.1f} ms")
         )
         parts.append({"picture": part.name, "fault": part.fault, "found": wrong})
-    say.detail(table_text(("picture", "fault", "found", "took"), rows), parts=parts)
-    say.step(
+    steps.detail(table_text(("picture", "fault", "found", "took"), rows), parts=parts)
+    steps.step(
         f"What the tools saw stands in {folder / 'seen'}. Change {folder / 'cell.yaml'}, and try "
         "it:"
     )
-    say.detail(f"   smartcam inspect {folder}/cell.yaml desk/drawn check {folder}/pictures")
+    steps.detail(f"   smartcam inspect {folder}/cell.yaml desk/drawn check {folder}/pictures")
 
 
 def _write(folder: Path, seed: int) -> None:

@@ -88,20 +88,20 @@ async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> No
     installed; ConfigurationError: the folder cannot be written.
     """
     load("scipy", "calibration needs")  # first, so that it fails before the other steps
-    say = Steps(options)
+    steps = Steps(options)
     with naming(f"--folder {folder}"):
         await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
     table = DrawnTable(seed)
     TableDriver.tables[table.address] = table
     try:
-        await _run(_Demo(options, say, folder, table, TableRobot(table, seed), grid))
+        await _run(_Demo(options, steps, folder, table, TableRobot(table, seed), grid))
     finally:
         del TableDriver.tables[table.address]
 
 
 class _Demo(NamedTuple):
     options: Options
-    say: Steps
+    steps: Steps
     folder: Path
     table: DrawnTable
     robot: TableRobot
@@ -109,8 +109,8 @@ class _Demo(NamedTuple):
 
 
 async def _run(demo: _Demo) -> None:
-    say, table = demo.say, demo.table
-    say.step(
+    steps, table = demo.steps, demo.table
+    steps.step(
         f"A plain camera above a level table, drawn: {1e3 * table.pixel:g} mm a pixel, noise of "
         f"{NOISE:g} grey levels. A robot beside it, which does not know where the table is.",
         address=table.address,
@@ -133,10 +133,10 @@ async def _run(demo: _Demo) -> None:
                 break
         empty = (await camera.trigger(timeout=timeout)).value
         reason = empty.reason or f"{len(empty.locate)} found"
-        say.step(f"Triggered once more: {reason}.", reason=reason, left=len(table.parts))
+        steps.step(f"Triggered once more: {reason}.", reason=reason, left=len(table.parts))
     errors = [one.error for one in placed]
     beside = [one.off_place for one in placed if one.taken]
-    say.detail(
+    steps.detail(
         f"   error {1e3 * _rms(errors):.3f} mm rms, predicted {1e3 * _rms(expected):.3f} mm; "
         f"{len(beside)} of {len(pattern)} places filled, parts lie {1e3 * _rms(beside):.2f} mm rms "
         "beside them",
@@ -145,16 +145,18 @@ async def _run(demo: _Demo) -> None:
         filled=len(beside),
         places=len(pattern),
     )
-    say.step(
+    steps.step(
         f"Models, calibration, cell file and pictures stand in {demo.folder}. Try on them what you "
         "change:"
     )
-    say.detail(f"   smartcam inspect {demo.folder / CELL_FILE} desk/camera 1 {demo.folder}/judged")
+    steps.detail(
+        f"   smartcam inspect {demo.folder / CELL_FILE} desk/camera 1 {demo.folder}/judged"
+    )
 
 
 async def _taught(demo: _Demo) -> PartModel:
     """Teach both kinds of parts, each from one picture; return the model of the bracket."""
-    demo.say.step("Taught from one picture each, by a region around the part:")
+    demo.steps.step("Taught from one picture each, by a region around the part:")
     rows: list[tuple[object, ...]] = []
     for part in (TablePart("mark", TablePose(0.15, 0.125, 0.0)), TAUGHT):
         demo.table.parts = [part]
@@ -171,7 +173,7 @@ async def _taught(demo: _Demo) -> PartModel:
             )
         )
     head = ("part", "symmetry", "pieces of edges", "a pose is good to", "")
-    demo.say.detail(table_text(head, rows))
+    demo.steps.detail(table_text(head, rows))
     return model
 
 
@@ -207,7 +209,7 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
     with naming(f"--folder {demo.folder}"):
         await asyncio.to_thread(calibration.save, demo.folder / "plane.json")
     held_out = calibration.held_out_error or math.nan
-    demo.say.step(
+    demo.steps.step(
         f"The mark, located and touched at nine places ({1e3 * TOUCH_SIGMA:g} mm of noise on each "
         f"axis). Calibrated ({calibration.model}): each touch against a calibration from the "
         f"others, {1e3 * held_out:.2f} mm rms, the touch's own noise included",
@@ -227,7 +229,7 @@ def _pattern(demo: _Demo) -> PlacePattern:
         first, row_end, column_end, rows=rows, columns=columns, layers=layers, height=HEIGHT
     )
     across, along, _ = pattern.pitch
-    demo.say.step(
+    demo.steps.step(
         f"A pallet of {rows} rows, {columns} columns and {layers} layers, of which the robot "
         f"touched three corners: {1e3 * across:.2f} mm from column to column, {1e3 * along:.2f} mm "
         "from row to row",
@@ -265,7 +267,7 @@ def _palletize(
                 f"{1e3 * one.off_place:.2f}",
             )
         )
-    demo.say.step(
+    demo.steps.step(
         f"Triggered: {len(value.locate)} parts in the robot's frame. It moves each of them to the "
         "next place (row/column/layer), mm and degrees:"
         if rows
@@ -273,7 +275,7 @@ def _palletize(
     )
     head = ("x", "y", "error", "predicted", "turned by", "predicted", "place", "off it")
     if rows:
-        demo.say.detail(table_text(head, rows), placed=placed[-len(rows) :])
+        demo.steps.detail(table_text(head, rows), placed=placed[-len(rows) :])
 
 
 async def _write(demo: _Demo, name: str, text: str) -> None:

@@ -116,10 +116,10 @@ async def pick(options: Options, picture: str, seed: int) -> None:
     from smartcam._extras import load
 
     load("scipy")  # first, so that it fails before the other steps
-    say = Steps(options)
+    steps = Steps(options)
     async with EmulatedCamera(active=TANGRAM, seed=seed) as emulator:
         robot = SimulatedRobot(emulator.scene, seed)
-        say.step(
+        steps.step(
             f"A camera above a table: {emulator.url}. A robot beside it, which does not know where "
             "the table is.",
             url=emulator.url,
@@ -132,14 +132,14 @@ async def pick(options: Options, picture: str, seed: int) -> None:
             marks = nine_marks()
             _lay(emulator.scene, marks)
             seen = (await camera.trigger(timeout=timeout)).value
-            calibration = _calibrate(seen, marks, robot, say)
+            calibration = _calibrate(seen, marks, robot, steps)
             _lay(emulator.scene, pieces)
             result = await camera.trigger(timeout=timeout)
             noise = emulator.scene.pixel_noise / emulator.scene.scale
-            _pick_all(result.value, calibration, robot, noise, say)
+            _pick_all(result.value, calibration, robot, noise, steps)
             left = (await camera.trigger(timeout=timeout)).value
-            say.step(f"Triggered once more: {len(left)} parts on the table.", left=len(left))
-    _write(picture, calibration, result.value, say)
+            steps.step(f"Triggered once more: {len(left)} parts on the table.", left=len(left))
+    _write(picture, calibration, result.value, steps)
 
 
 def nine_marks() -> dict[str, TablePose]:
@@ -156,13 +156,13 @@ def _lay(scene: TableScene, things: dict[str, TablePose]) -> None:
 
 
 def _calibrate(
-    seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, say: Steps
+    seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, steps: Steps
 ) -> PlaneCalibration:
     from smartcam.calibration import fit_plane
 
     camera_points = [tuple(mark.pose.position[:2]) for mark in seen]
     robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in seen]
-    say.step(
+    steps.step(
         f"The camera localizes {len(seen)} marks, the robot touches each of them "
         f"({1e3 * TOUCH_SIGMA:g} mm of noise on each axis), mm:",
         camera_points=camera_points,
@@ -172,12 +172,12 @@ def _calibrate(
         (mark.feature_id, *_mm(*camera, *touched))
         for mark, camera, touched in zip(seen, camera_points, robot_points, strict=True)
     ]
-    say.detail(table_text(("mark", *_right("camera x", "y", "robot x", "y", "z")), rows))
+    steps.detail(table_text(("mark", *_right("camera x", "y", "robot x", "y", "z")), rows))
     calibration = fit_plane(
         camera_points, robot_points, touch_sigma=TOUCH_SIGMA, tool_z=robot.tool_z
     )
     held_out = calibration.held_out_error or math.nan
-    say.step(
+    steps.step(
         f"Calibrated ({calibration.model}). Each touch against a calibration from the other eight: "
         f"{1e3 * held_out:.2f} mm rms, the touch's own noise included",
         model=calibration.model,
@@ -185,7 +185,7 @@ def _calibrate(
         warnings=[remark.text for remark in calibration.warnings],
     )
     for remark in calibration.warnings:
-        say.detail(f"   {remark.code}: {remark.text}")
+        steps.detail(f"   {remark.code}: {remark.text}")
     return calibration
 
 
@@ -194,14 +194,14 @@ def _pick_all(
     calibration: PlaneCalibration,
     robot: SimulatedRobot,
     noise: float,
-    say: Steps,
+    steps: Steps,
 ) -> None:
     """Pick every part; the camera's noise on both axes adds to the calibration's error."""
     where = [part.pose.position[:2] for part in parts]
     predicted = [math.hypot(p, noise, noise) for p in calibration.predicted_error(where).tolist()]
     targets = calibration.to_robot(parts, tool_flip=True)
     picks = [robot.pick(part, error) for part, error in zip(targets, predicted, strict=True)]
-    say.step(f"Triggered: {len(parts)} parts. The robot goes to each of them and picks it, mm:")
+    steps.step(f"Triggered: {len(parts)} parts. The robot goes to each of them and picks it, mm:")
     rows = [
         (
             pick.part,
@@ -212,9 +212,9 @@ def _pick_all(
         for pick in picks
     ]
     head = ("part", *_right("x", "y", "z", "error", "predicted"), "turned by", "")
-    say.detail(table_text(head, rows), picks=picks)
+    steps.detail(table_text(head, rows), picks=picks)
     errors, expected = ([getattr(pick, name) for pick in picks] for name in ("error", "predicted"))
-    say.detail(
+    steps.detail(
         f"   error {1e3 * _rms(errors):.2f} mm rms, predicted {1e3 * _rms(expected):.2f} mm; "
         f"{sum(pick.taken for pick in picks)} of {len(picks)} picked",
         error=_rms(errors),
@@ -237,10 +237,12 @@ def _rms(values: list[float]) -> float:
     return math.hypot(*values) / math.sqrt(len(values))
 
 
-def _write(path: str, calibration: PlaneCalibration, parts: list[Localization], say: Steps) -> None:
+def _write(
+    path: str, calibration: PlaneCalibration, parts: list[Localization], steps: Steps
+) -> None:
     from smartcam.calibration._inside import draw
 
     text = draw(calibration, parts, title="smartcam demo --pick")
     with naming(f"--picture {path}"):
         Path(path).write_text(text, encoding="utf-8", newline="\n")
-    say.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)
+    steps.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)

@@ -16,7 +16,7 @@ import numpy as np
 from smartcam._cli.demo import Steps
 from smartcam._cli.texts import table_text
 from smartcam.depth import ColourRange, SpatialFilter, TemporalFilter, find_regions, region_depth
-from smartcam.depth._inside import AXES, BLOCK, FOCAL, laid, to_robot
+from smartcam.depth._inside import AXES, BLOCK, FOCAL, random_table, to_robot
 from smartcam.exceptions import FrameFormatError
 
 if TYPE_CHECKING:
@@ -121,9 +121,9 @@ async def tower(
         MissingExtraError: the extra ``depth`` is not installed.
         SystemExit: an error was larger than :data:`TOLERANCE`.
     """
-    say = Steps(options)
-    table = laid(seed, layers) if table is None else table
-    say.step(
+    steps = Steps(options)
+    table = random_table(seed, layers) if table is None else table
+    steps.step(
         "A camera at a robot's hand, a table with wooden and black blocks on it, and a tower of "
         f"two. The robot is to put {layers} black ones on top:",
         layers=layers,
@@ -132,13 +132,13 @@ async def tower(
     compared: list[Compared] = []
     for layer in range(1, layers + 1):
         seen = await asyncio.to_thread(_look, table, colours)
-        compared += _put_one(table, seen, layer, say)
+        compared += _put_one(table, seen, layer, steps)
         doing = PERSON.get(layer)
         if doing is not None:
             getattr(table, doing)()
             did = {"add": "puts a wooden block on top", "remove": "takes the highest block away"}
-            say.step(f"A person {did[doing]}. The robot is not told.", person=doing)
-    _judge(compared, table, say)
+            steps.step(f"A person {did[doing]}. The robot is not told.", person=doing)
+    _judge(compared, table, steps)
 
 
 class Seen(NamedTuple):
@@ -171,7 +171,7 @@ def _look(table: TowerTable, colours: ColourRange) -> Seen:
     return Seen(blocks, reached, block, measured_top(table, *tower_place(overview, depth)))
 
 
-def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Compared]:
+def _put_one(table: TowerTable, seen: Seen, layer: int, steps: Steps) -> list[Compared]:
     """Put the block on top; return the findings beside the truth.
 
     Raises:
@@ -184,7 +184,7 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Comp
         Compared("block", block, grip.off, grip.turned, 0.0),
         _compared("tower's top", top, true_top),
     ]
-    say.step(
+    steps.step(
         f"Layer {layer}: {len(seen.blocks)} black blocks lie on the table, {len(seen.reached)} "
         "within reach. The nearest of these, and the tower's top:",
         layer=layer,
@@ -192,14 +192,14 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Comp
         reached=len(seen.reached),
     )
     values = [row._asdict() | {"found": row.found._asdict()} for row in rows]
-    say.detail(_text(rows), compared=values)
+    steps.detail(_text(rows), compared=values)
     if table.held is None:
         raise FrameFormatError(
             f"{ARM}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on nothing",
             source=ARM,
         )
     lies = table.place(top.x, top.y, top.angle + math.pi / 2)
-    say.detail(
+    steps.detail(
         f"   picked, and put down across at {1e3 * top.height:.1f} mm; the tower is now "
         f"{1e3 * lies.top:.1f} mm high",
         height=lies.top,
@@ -366,7 +366,7 @@ def _text(rows: list[Compared]) -> str:
     return table_text((*head, *off), cells)
 
 
-def _judge(compared: list[Compared], table: TowerTable, say: Steps) -> None:
+def _judge(compared: list[Compared], table: TowerTable, steps: Steps) -> None:
     """Print the largest errors; raise SystemExit if one of them is above its tolerance."""
     beside, turned, higher = (
         max(row.errors[place] for row in compared) for place in range(len(TOLERANCE))
@@ -376,7 +376,7 @@ def _judge(compared: list[Compared], table: TowerTable, say: Steps) -> None:
     )
     most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
     stack = table.tower()
-    say.step(
+    steps.step(
         f"The tower has {len(stack)} layers, {1e3 * stack[-1].top:.1f} mm. At worst "
         f"{1e3 * beside:.2f} mm beside, {math.degrees(turned):.2f} degrees turned, "
         f"{1e3 * higher:.2f} mm of height: {'all' if within else 'not all'} within {most}, "

@@ -28,7 +28,7 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
 @click.command(
     cls=JsonErrors,
     help="Make certificates for a fleet over TLS, each with a role: agents share cameras, viewers "
-    "read, operators also command, and a router of Zenoh's forwards. DIR gets an authority "
+    "read, operators also command, and Zenoh routers forward. DIR gets an authority "
     "the first time, with its key, and a folder for each name, with instructions for its "
     "use. Run it again to add names, and to renew certificates that end within 30 days; the "
     'rest stays. Needs the extra "fleet".',
@@ -37,7 +37,7 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
 @_names("--agent", "agents", "An agent, by its name in fleet.yaml.")
 @_names("--viewer", "viewers", "A program that may read.")
 @_names("--operator", "operators", "A program that may command, too.")
-@_names("--router", "routers", "A router of Zenoh's, zenohd.")
+@_names("--router", "routers", "A Zenoh router, zenohd.")
 @click.option(
     "--host",
     "hosts",

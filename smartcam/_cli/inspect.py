@@ -29,8 +29,8 @@ PAGE: Final = "index.html"
 
 @click.command(
     help="Try an application of a software camera on pictures, and draw its findings. CELL is a "
-    "cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
-    "PICTURES files, or folders of them. Prints the results; --output also draws the tools' "
+    "cell file, or a fleet file with software cameras. APPLICATION is a number or a name, and "
+    "PICTURES are files or folders. Prints the results; --output also draws the tools' "
     "findings."
 )
 @click.argument("cell")

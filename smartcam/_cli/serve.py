@@ -129,7 +129,7 @@ class Serving:
                 await stack.enter_async_context(FleetOutlets(server, self._tell_outlet))
             await self._enter(stack)
             stack.callback(notifier.stopping)
-            server.reloads.tell = self._on_reload
+            server.reloads.on_reload = self._on_reload
             stack.enter_context(notifier.telling(self._status))
             await stack.enter_async_context(_while_here(self._reload_when(wanted)))
             await server.wait_tried()

@@ -118,66 +118,66 @@ _NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOW
 REASONS: tuple[Reason, ...] = (
     Reason(
         lambda one: isinstance(one.error, (socket.gaierror, UnicodeError)),
-        "the name {host!r} does not resolve: {said}",
+        "the name {host!r} does not resolve: {outcome}",
         "Look for a slip in the name, or give the camera's IP address. Names need a DNS server, or "
         "an entry in this machine's hosts file.",
     ),
     Reason(
         lambda one: isinstance(one.error, (CommandRejectedError, SessionRefusedError)),
-        "{where} refuses: {said}",
+        "{where} refuses: {outcome}",
         "Address and dialect are right. Look at the password, and for another client.",
     ),
     Reason(
         lambda one: one.failed_with(errno.ECONNREFUSED),
-        "nothing listens at {where}: {said}",
+        "nothing listens at {where}: {outcome}",
         "Look at the port ({default} by default), and whether the camera's process interface is "
         "switched on{interface}. A camera that has just been switched on needs about half a "
         "minute.",
     ),
     Reason(
         lambda one: one.failed_with(*_NO_WAY),
-        "there is no way to {where}: {said}",
+        "there is no way to {where}: {outcome}",
         "Look at the address, at this machine's network and mask, the cable and the camera's "
         "power: both must be in one network, or have a route.",
     ),
     Reason(
         lambda one: not one.opened and isinstance(one.error, TimeoutError),
-        "nobody answers at {where}, not even with a refusal: {said}",
+        "nobody answers at {where}, not even with a refusal: {outcome}",
         "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
         "camera answer a ping from this machine?",
     ),
     Reason(
         lambda one: not one.opened,
-        "no connection to {where}: {said}",
+        "no connection to {where}: {outcome}",
         "Look at the address, this machine's network and the camera's.",
     ),
     Reason(
         lambda one: one.hung_up,
-        "{where} takes the connection and hangs up without a word: {said}",
+        "{where} takes the connection and hangs up without a word: {outcome}",
         "It may serve another client and refuse newcomers: end the other one. Or it is no "
         "camera, or something else listens at this port.",
     ),
     Reason(
         lambda one: isinstance(one.error, ProtocolError),
-        "what {where} answers is no camera's language: {said}",
+        "what {where} answers is no camera's language: {outcome}",
         "Something else listens there, or a camera with a dialect that smartcam does not know. "
         "smartcam probe shows every byte.",
     ),
     Reason(
         lambda one: one.received > 0,
-        "{where} answers, and no session comes of it: {step}: {said}",
+        "{where} answers, and no session comes of it: {step}: {outcome}",
         "Something else listens there, or the camera's answers get lost. smartcam probe shows "
         "every byte.",
     ),
     Reason(
         lambda one: one.transport == Transport.UDP.value,
-        "nothing comes back from {where}: {said}; UDP does not tell whether anybody is there",
+        "nothing comes back from {where}: {outcome}; UDP does not tell whether anybody is there",
         "Look at address, cable and power, whether the camera's process interface is at {port} "
         "({default} by default){interface}, and for another client or dialect.",
     ),
     Reason(
         lambda one: True,
-        "{where} takes the connection and says nothing: {step}: {said}",
+        "{where} takes the connection and says nothing: {step}: {outcome}",
         "Look whether the camera's process interface is at {port} ({default} by default)"
         "{interface}, and for another client or dialect.",
     ),
@@ -197,7 +197,7 @@ def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
     return {
         "where": f"{address.host}:{address.port} ({this})",
         "host": address.host,
-        "said": one.outcome,
+        "outcome": one.outcome,
         "step": one.step,
         "port": str(address.port),
         "default": str(protocol.default_port),

@@ -50,7 +50,7 @@ class CameraState:
             any.
         active_in_doubt: True after another client or a person loaded an application.
         loads_by_others: number of times that another client or a person loaded one.
-        statuses_heard: number of statuses received.
+        statuses_received: number of statuses received.
         status_asked_at: loop time at which the camera was last asked for its status.
     """
 
@@ -65,18 +65,18 @@ class CameraState:
         self.want(Wanted(application, None))
         self.active_in_doubt: bool = False
         self.loads_by_others: int = 0
-        self.statuses_heard: int = 0
+        self.statuses_received: int = 0
         self.status_asked_at: float = 0.0
         self._statuses_due = 0  # number of statuses received once all requests are answered
         self._name = name
         self._listeners = listeners
-        self._told: int | None = None  # the last status of this session
+        self._last_status: int | None = None  # the last status of this session
         self._loaded_by_us = False
 
     def begin_session(self) -> None:
         """Forget facts that only the previous session has reported."""
-        self._told, self.active_in_doubt = None, False
-        self._statuses_due = self.statuses_heard
+        self._last_status, self.active_in_doubt = None, False
+        self._statuses_due = self.statuses_received
 
     def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
         """Handle a status.
@@ -91,10 +91,10 @@ class CameraState:
         """
         status = report.status
         # int(status) costs three times as much, with each status that comes
-        bits, was = status._value_, self._told
-        self.statuses_heard += 1
+        bits, was = status._value_, self._last_status
+        self.statuses_received += 1
         self.status, self.endian = status, report.endian
-        self.bits = self._told = bits
+        self.bits = self._last_status = bits
         if bits & _RUNNING_OR_BUSY == _BUSY:  # it loads an application
             self._loaded_by_us = False
         elif (
@@ -108,27 +108,27 @@ class CameraState:
 
     def stays(self, application: int, bits: int, endian: int) -> bool:
         """Return True if this is the last status that the camera has sent in this session."""
-        same = self.bits == bits and self._told == bits and self.endian == endian
+        same = self.bits == bits and self._last_status == bits and self.endian == endian
         return same and self.active == application
 
     def report_round(self, report: StatusReport) -> None:
         """Handle two statuses of a running camera; the second equals the present status."""
-        self.statuses_heard += 2
+        self.statuses_received += 2
         self.status = report.status
 
     @property
-    def owes_status(self) -> bool:
+    def status_is_pending(self) -> bool:
         """True if a request for the status is not answered yet."""
-        return self.statuses_heard < self._statuses_due
+        return self.statuses_received < self._statuses_due
 
     def status_asked(self, now: float, count: int = 1) -> None:
-        """Note requests for the status: so many more answers are pending."""
+        """Note ``count`` requests for the status, whose answers are pending."""
         self.status_asked_at = now
-        self._statuses_due = max(self._statuses_due, self.statuses_heard) + count
+        self._statuses_due = max(self._statuses_due, self.statuses_received) + count
 
     def status_lost(self) -> None:
         """Note that the pending statuses will not come."""
-        self._statuses_due = self.statuses_heard
+        self._statuses_due = self.statuses_received
 
     @property
     def active_text(self) -> str:

@@ -75,7 +75,7 @@ class CommandLock:
     def __post_init__(self) -> None:
         # tasks of the session; None between two sessions
         self._jobs: asyncio.TaskGroup | None = None
-        self._owed: Before | None = None  # state to restore in the next session
+        self._to_restore: Before | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
         self._in_line = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
@@ -91,9 +91,9 @@ class CommandLock:
             restore: whether to restore the wanted application and run state.
         """
         self._jobs = jobs
-        owed, self._owed = self._owed, None
-        if owed is not None:
-            self._start_job("going_back", self._go_back(owed))
+        before, self._to_restore = self._to_restore, None
+        if before is not None:
+            self._start_job("going_back", self._go_back(before))
         elif restore:
             self._start_job("restoring", self._restore())
 
@@ -200,7 +200,7 @@ class CommandLock:
         If several switches back are due, the one to the outermost block's application counts.
         """
         if self._jobs is None or self._waits.end is not None:
-            self._owe(before)
+            self._restore_later(before)
             return None
         return self._start_job("going_back", self._go_back(before))
 
@@ -280,9 +280,9 @@ class CommandLock:
         while self._leaving:
             await asyncio.wait(self._leaving)
 
-    def _owe(self, before: Before) -> None:
+    def _restore_later(self, before: Before) -> None:
         """Keep the state that the next session must restore."""
-        self._owed = before
+        self._to_restore = before
         self._state.want(before.wanted)
 
     async def _go_back(self, before: Before) -> None:
@@ -290,11 +290,11 @@ class CommandLock:
         await self._adopted()
         async with self._lock:
             try:
-                await self._have(before.application, before.running)
+                await self._reach(before.application, before.running)
             except SmartCamError as error:
                 logger.warning("%s ! going back failed: %s", self._connection.name, error)
                 if self._is_loss(error):
-                    self._owe(before)
+                    self._restore_later(before)
                 else:
                     self._failed = error
             finally:
@@ -309,7 +309,7 @@ class CommandLock:
         wanted = self._state.wanted
         async with self._lock:
             try:
-                await self._have(*wanted)
+                await self._reach(*wanted)
             except SmartCamError as error:
                 logger.warning("%s ! restoring failed: %s", self._connection.name, error)
                 if not self._is_loss(error):
@@ -327,7 +327,7 @@ class CommandLock:
         link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 
-    async def _have(self, application: int | None, running: bool | None) -> None:
+    async def _reach(self, application: int | None, running: bool | None) -> None:
         """Reach an application and run state with the fewest commands; None leaves it unchanged."""
         commands, status = self._commands, self._status
         deadline = self._connection.deadline(self._switch_timeout)

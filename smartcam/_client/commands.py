@@ -133,8 +133,8 @@ class Commands:
             ResponseTimeoutError: no answer, or the camera was busy all the time.
         """
         requests = self._requests
-        if requests.owes(m.SwitchAnswer):
-            await requests.await_owed(m.SwitchAnswer, _QUERY, deadline)
+        if requests.is_pending(m.SwitchAnswer):
+            await requests.await_pending(m.SwitchAnswer, _QUERY, deadline)
         while True:
             answer = await requests.ask(_QUERY, m.QueryAnswer, deadline)
             if requests.is_done(m.Query, answer):
@@ -220,8 +220,8 @@ class Commands:
         while requests.is_busy(answer):
             await self._status.pause(deadline, f"the busy camera to load {application}")
             answer = await requests.ask(request, m.SwitchAnswer, deadline)
-        told = answer.application in self._connection.dialect.application_ids
-        return answer.code, answer.application if told else self._state.active
+        is_known = answer.application in self._connection.dialect.application_ids
+        return answer.code, answer.application if is_known else self._state.active
 
     def load_request(self, application: int | str) -> m.Request:
         """Return the request that loads an application; send nothing.

@@ -300,7 +300,7 @@ class Correlation:
         self.satisfied = self.doubted = False
         self._last = None
 
-    def heard(self) -> None:
+    def note_query_answered(self) -> None:
         """Note that all earlier messages are received, since a later Query is answered.
 
         A trigger without a sign by now was not taken: it will have no result.
@@ -417,7 +417,7 @@ class Correlation:
         self._given = None  # that run uses it
         return self._complete and previous is not None
 
-    def judge_told(self, asked: bool) -> Match:
+    def judge_marked(self, asked: bool) -> Match:
         """Return the trigger of a container if the wire shows whether it answers this client."""
         pending = self.pending
         if not asked:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.remarks import Remarks
-from smartcam._client.waits import told
+from smartcam._client.waits import copy_to_raise
 from smartcam.exceptions import ConnectionClosedError
 from smartcam.models import NoticeReceived, Status, StatusChanged
 from smartcam.protocols import Verdict
@@ -214,7 +214,7 @@ class Dispatch:
         if self._waits.fail(error):
             self._remarks.end()
             if self._listeners.may_await:
-                self._listeners.fail(told(error))
+                self._listeners.fail(copy_to_raise(error))
             self._results.fail(error)
 
     def finish(self, error: SmartCamError) -> None:

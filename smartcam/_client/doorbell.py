@@ -1,7 +1,7 @@
 """Wake the receive task, and callers that wait for it, without a turn of the event loop.
 
-A future wakes its task by way of the event loop: a handle, another turn, another system call. For
-each delivery of bytes that costs more than processing them. A caller that rings this doorbell from
+A future wakes its task by way of the event loop: a handle, another turn, another system call.
+That costs more than processing the bytes of a delivery. A caller that rings this doorbell from
 a callback of the loop, as a transport does, makes the task go on at once. It is still a task: an
 exception in it ends the task, and never reaches the caller.
 
@@ -51,7 +51,7 @@ class Doorbell:
         self._context: contextvars.Context | None = None
 
     def ring(self) -> None:
-        """Make the task go on: at once, or if another task rings, in the loop's next turn."""
+        """Make the task go on at once; in the loop's next turn if a task calls this."""
         wake, context = self._wake, self._context
         if wake is None or context is None:
             return
@@ -62,7 +62,7 @@ class Doorbell:
             self.loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
-        """Make the task go on as :meth:`ring` does, and after it the callers whose outcome came.
+        """Make the task go on as :meth:`ring` does, then the callers whose outcomes it has set.
 
         The loop raises exceptions that end the program: a transport would take them for its own.
         """
@@ -137,7 +137,7 @@ class Doorbell:
 
 
 class DirectFuture(Generic[T]):
-    """A result or an error that one task waits for, once; as a future is used.
+    """A future for one result or error, which one task awaits once.
 
     Cancellation: safe; the task is woken by the loop.
     """
@@ -168,10 +168,10 @@ class DirectFuture(Generic[T]):
         """Make the task go on with a result.
 
         Raises:
-            asyncio.InvalidStateError: it is done.
+            asyncio.InvalidStateError: the outcome is set already.
         """
         if self._done:
-            raise asyncio.InvalidStateError("the outcome is there")
+            raise asyncio.InvalidStateError("the outcome is set already")
         self._done, self._value = True, value
         due = self._bell.due
         if due is None:
@@ -183,10 +183,10 @@ class DirectFuture(Generic[T]):
         """Make the task go on with an error.
 
         Raises:
-            asyncio.InvalidStateError: it is done.
+            asyncio.InvalidStateError: the outcome is set already.
         """
         if self._done:
-            raise asyncio.InvalidStateError("the outcome is there")
+            raise asyncio.InvalidStateError("the outcome is set already")
         self._done, self._error = True, error
         self.wake_soon()
 
@@ -211,7 +211,7 @@ class DirectFuture(Generic[T]):
     def __await__(self) -> Generator[DirectFuture[T], None, T]:
         if not self._done:
             self._asyncio_future_blocking = True
-            yield self  # which raises the error
+            yield self  # an error is raised here
             return self._value  # type: ignore[return-value]
         return self.result()
 
@@ -226,7 +226,7 @@ class DirectFuture(Generic[T]):
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
-        """Wake the task to be cancelled; False if it goes on anyway, and is cancelled then."""
+        """Wake the task with a CancelledError; False: it was woken already."""
         if self._done:
             return False
         self._done = self._cancelled = True
@@ -239,7 +239,7 @@ class DirectFuture(Generic[T]):
         error, self._error = self._error, None  # once raised, it refers to the waiting task
         if error is not None:
             raise error
-        return self._value  # type: ignore[return-value]  # there is one
+        return self._value  # type: ignore[return-value]  # done
 
 
 Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"

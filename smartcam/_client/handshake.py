@@ -116,11 +116,11 @@ class _Collector:
             match event:
                 case ConnectAnswer(code=code, version=version):
                     if dialect.code(code, Connect).verdict is not Verdict.DONE:
-                        said = "the camera refused the session: "
-                        said += code_text(dialect, code, Connect)
+                        text = "the camera refused the session: "
+                        text += code_text(dialect, code, Connect)
                         if dialect.has_login:
-                            raise CommandRejectedError(said, code=code)
-                        raise SessionRefusedError(said)
+                            raise CommandRejectedError(text, code=code)
+                        raise SessionRefusedError(text)
                     if version < 1:
                         raise RemoteProtocolError(f"the camera speaks protocol version {version}")
                     self.version = version
@@ -167,8 +167,8 @@ class _Collector:
             while answered < TELLING_ROUNDS and unanswered < certain:
                 before = self.statuses
                 await self.ask(question)
-                told = self.statuses > before
-                answered, unanswered = answered + told, 0 if told else unanswered + 1
+                status_came = self.statuses > before
+                answered, unanswered = answered + status_came, 0 if status_came else unanswered + 1
             machine.adopt((others if unanswered else asking)[0])
         else:
             machine.adopt(machine.kin[0])

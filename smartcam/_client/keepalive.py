@@ -57,7 +57,7 @@ class KeepAlive:
         """
         status = self._state.status
         loading = status is not None and status.loading
-        slow = loading or any(map(self._waits.owes, (m.SwitchAnswer, m.TriggerAnswer)))
+        slow = loading or any(map(self._waits.is_pending, (m.SwitchAnswer, m.TriggerAnswer)))
         return self._switch_timeout if slow else usual
 
 

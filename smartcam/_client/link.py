@@ -476,7 +476,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
-    """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut.
+    """Return a larger chunk's first frames, ``frames`` of them, and its rest; a burst may be cut.
 
     A trigger's answer and the events after it stay together, since one frame may be both: otherwise
     a caller that waits for the answer would send before the result of that frame is judged.
@@ -546,17 +546,17 @@ async def open_link(
 
     def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
         at = datetime.now(UTC)
-        said: Frame | TraceEntry
+        content: Frame | TraceEntry
         if isinstance(frame, RemoteProtocolError):
-            said = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+            content = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
         else:
-            said = frame
-        note(RawFrame(at, name, machine.dialect, sender, said))
+            content = frame
+        note(RawFrame(at, name, machine.dialect, sender, content))
 
     def on_rest(rest: bytes) -> None:
         at, text = datetime.now(UTC), f"{len(rest)} bytes that make no whole frame"
-        said = TraceEntry(at, name, "!", None, text, None, rest[:MAX_REST_BYTES].hex())
-        note(RawFrame(at, name, machine.dialect, Sender.CAMERA, said))
+        content = TraceEntry(at, name, "!", None, text, None, rest[:MAX_REST_BYTES].hex())
+        note(RawFrame(at, name, machine.dialect, Sender.CAMERA, content))
 
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
     machine = protocol.machine(

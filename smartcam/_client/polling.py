@@ -1,9 +1,9 @@
 """Poll the status, in dialects that do not send it unasked (``bid``), while it is needed.
 
 There is one timer, which runs while a wait for a status or a trigger is pending, or while statuses
-or events are subscribed to. It asks only if no question of any task is open; an unanswered
-question is repeated after a while, since a datagram may be lost. On TCP nothing is lost: if a
-camera sends other messages but no answer, the link is given up.
+or events are subscribed to. It sends a request only if no request for the status is open; an
+unanswered request is repeated after a while, since a datagram may be lost. On TCP nothing is lost:
+if a camera sends other messages but no answer, the link is given up.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 PERIOD = 0.02
-"""Seconds between two questions while a task waits: a fraction of a usual inspection time."""
+"""Seconds between two requests while a task waits: a fraction of a usual inspection time."""
 
 IDLE_PERIOD = 0.25
-"""Seconds between two questions while statuses are only subscribed to."""
+"""Seconds between two requests while statuses are only subscribed to."""
 
 REPEAT_AFTER = 0.5
-"""Seconds until an open question counts as lost: answers take milliseconds."""
+"""Seconds until an open request counts as lost: answers take milliseconds."""
 
 
 @dataclass(eq=False)
@@ -43,7 +43,7 @@ class Polling:
     _state: CameraState
     _waits: Waits
     _listeners: Listeners
-    _patience: float  # seconds that an answer may take
+    _answer_timeout: float  # seconds
 
     def __post_init__(self) -> None:
         self._running = False
@@ -51,22 +51,22 @@ class Polling:
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0  # time at which the timer fires; a timer of uvloop does not have it
         self._open_since = 0.0
-        self._heard = -1  # number of statuses that had come when the timer fired last
+        self._received = -1  # number of statuses that had come when the timer fired last
 
     def begin_session(self) -> None:
-        """Begin to ask, if the dialect does not send the status unasked."""
+        """Begin to request the status, if the dialect does not send it by itself."""
         self._running = self._connection.features.polled
         self._open_since = 0.0
-        self._heard = -1
+        self._received = -1
         self.wanted()
 
     def end_session(self) -> None:
-        """Stop asking."""
+        """Stop requesting the status."""
         self._running = False
         self._stop()
 
     def wanted(self) -> None:
-        """Begin to ask for the status, or ask more often, since it is needed."""
+        """Request the status from now on, or more often, since a task needs it."""
         if not self._running:
             return
         loop = self._connection.loop
@@ -79,7 +79,7 @@ class Polling:
         """Note that a trigger is pending, which needs the status.
 
         Args:
-            questions: number of questions that were sent together with the trigger.
+            questions: number of requests for the status that were sent together with the trigger.
         """
         self._triggered = True
         if questions:
@@ -97,23 +97,23 @@ class Polling:
 
     def _tick(self) -> None:
         self._timer = None
-        link, heard = self._connection.link, self._state.statuses_heard
+        link, received = self._connection.link, self._state.statuses_received
         soon = self._triggered or self._waits.statuses
         if not (soon or self._listeners.watches_status) or link is None or link.lost:
             return
         loop = self._connection.loop
         now = loop.time()
         state = self._state
-        if heard != self._heard or not state.owes_status or self._may_be_silent:
-            self._heard, self._open_since = heard, now
-        elif self._connection.features.ordered and now - self._open_since >= self._patience:
+        if received != self._received or not state.status_is_pending or self._may_be_silent:
+            self._received, self._open_since = received, now
+        elif self._connection.features.ordered and now - self._open_since >= self._answer_timeout:
             open_for = shown_time(now - self._open_since, coarse=True)
             silence = f"no status within {open_for} of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return
-        if state.owes_status and now - state.status_asked_at >= REPEAT_AFTER:
+        if state.status_is_pending and now - state.status_asked_at >= REPEAT_AFTER:
             state.status_lost()
-        if not state.owes_status:
+        if not state.status_is_pending:
             try:
                 self._requests.ask_status()
             except SmartCamError:  # the link has ended, which the receive task reports
@@ -128,4 +128,4 @@ class Polling:
     @property
     def _may_be_silent(self) -> bool:
         """Return True while the camera loads or inspects, since it may answer only afterwards."""
-        return self._waits.owes(SwitchAnswer) or self._waits.owes(TriggerAnswer)
+        return self._waits.is_pending(SwitchAnswer) or self._waits.is_pending(TriggerAnswer)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam._client.connection import Connection
     from smartcam._client.doorbell import Waiter
     from smartcam._client.link import Link
-    from smartcam._client.waits import OwedAnswer, Waits
+    from smartcam._client.waits import PendingAnswer, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -70,9 +70,9 @@ class Requests:
         """Forget pending answers: the session is new."""
         self._due.clear()
 
-    # ------------------------------------------------------------------ say and wait
+    # ------------------------------------------------------------------ send and wait
 
-    async def tell(
+    async def send_unanswered(
         self, message: m.Message, deadline: float, *, answered: bool | None = None
     ) -> None:
         """Send a message that the camera never answers; returns once written.
@@ -109,7 +109,7 @@ class Requests:
         """
         answer = type(message).answer
         if answer is None or not self._connection.dialect.answers(type(message)):
-            await self.tell(message, deadline)
+            await self.send_unanswered(message, deadline)
             return
         got = await self.exchange(message, answer, deadline)
         self.check(type(message), got)
@@ -125,14 +125,14 @@ class Requests:
         verdict = self._connection.dialect.code(code, request).verdict
         if verdict is Verdict.DONE:
             return
-        said = (
+        text = (
             f"{self.name}: {request.__name__}: "
             f"the camera answered {code_text(self._connection.dialect, code, request)}"
         )
         if verdict is Verdict.UNKNOWN:
-            raise UnsupportedError(said)
+            raise UnsupportedError(text)
         raise CommandRejectedError(
-            said,
+            text,
             message_id=self._connection.dialect.message_id(request),
             code=code,
             active_application=self._state.active,
@@ -171,7 +171,7 @@ class Requests:
 
     async def post(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
-    ) -> OwedAnswer:
+    ) -> PendingAnswer:
         """Send a request as soon as none of its kind is open; its answer is pending from then on.
 
         Args:
@@ -188,7 +188,7 @@ class Requests:
 
     def is_free(self, key: type[m.Message] | int) -> bool:
         """Return True if no answer of this kind is pending, and no request of it is in line."""
-        return not (self._waits.owes(key) or self._locks[key].locked())
+        return not (self._waits.is_pending(key) or self._locks[key].locked())
 
     async def await_turn(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
@@ -196,7 +196,8 @@ class Requests:
         """Wait in line with requests of this kind until none is open; send at once then.
 
         Raises:
-            ResponseTimeoutError: an earlier one was open until ``deadline``; as :meth:`await_owed`.
+            ResponseTimeoutError: an earlier one was open until ``deadline``, as in
+                :meth:`await_pending`.
         """
         lock = self._locks[key]
         try:
@@ -205,23 +206,25 @@ class Requests:
         except TimeoutError as exc:
             raise self._unsent(message) from exc
         try:
-            await self.await_owed(key, message, deadline)
+            await self.await_pending(key, message, deadline)
         finally:
             lock.release()
 
-    def _send(self, message: m.Message, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
+    def _send(
+        self, message: m.Message, key: type[m.Message] | int, deadline: float
+    ) -> PendingAnswer:
         link = self._connection.require_link()
         link.send(message)
         return self._expect(link, key, deadline)
 
-    def expect(self, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
+    def expect(self, key: type[m.Message] | int, deadline: float) -> PendingAnswer:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
         It may come later: the link is given up only when ``request_timeout`` is over, too.
         """
         return self._expect(self._connection.require_link(), key, deadline)
 
-    def _expect(self, link: Link, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
+    def _expect(self, link: Link, key: type[m.Message] | int, deadline: float) -> PendingAnswer:
         patience = self._switch_patience if key is m.SwitchAnswer else self.patience
         now = link.loop.time()
         due = now + patience
@@ -232,7 +235,7 @@ class Requests:
 
     async def fence(self, deadline: float) -> None:
         """Wait until everything is received that the camera sent before now."""
-        await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
+        await self.await_pending(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
     def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
@@ -252,11 +255,11 @@ class Requests:
 
     def ask_for_life(self, deadline: float) -> bool:
         """Send a Query unless one is open; its answer is awaited until ``deadline``."""
-        if self._waits.owes(m.QueryAnswer):
+        if self._waits.is_pending(m.QueryAnswer):
             return False
         features = self._connection.features
         # the status must be fresh; over UDP a pending answer may have been lost
-        if features.polled and not (features.ordered and self._state.owes_status):
+        if features.polled and not (features.ordered and self._state.status_is_pending):
             self.ask_status()
         self._connection.require_link().send(m.Query())
         self.expect(m.QueryAnswer, deadline)
@@ -279,11 +282,11 @@ class Requests:
 
     # ------------------------------------------------------------------ answers
 
-    def owes(self, key: type[m.Message]) -> bool:
+    def is_pending(self, key: type[m.Message]) -> bool:
         """Return True if an answer of this kind is pending."""
-        return self._waits.owes(key)
+        return self._waits.is_pending(key)
 
-    async def await_owed(
+    async def await_pending(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
         """Wait for the answer to an earlier request, which is dropped.
@@ -292,10 +295,10 @@ class Requests:
             ResponseTimeoutError: the answer did not come; the link is given up if its own time is
                 over too.
         """
-        while self._waits.owes(key):  # a trigger may have sent the next Query before this goes on
-            owed = self._waits.owed_answer(key)
+        while self._waits.is_pending(key):  # a trigger may send the next Query meanwhile
+            answer = self._waits.pending_answer(key)
             try:
-                await self._take_answer(owed, deadline)
+                await self._take_answer(answer, deadline)
             except TimeoutError as exc:
                 error = self._unsent(message)
                 self._give_up_overdue(key, error)
@@ -307,7 +310,7 @@ class Requests:
         if loop.time() + TIMER_RESOLUTION >= self._due[key]:
             self._connection.require_link().give_up(error)
 
-    async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
+    async def _take_answer(self, answer: PendingAnswer, deadline: float) -> m.Message:
         """Wait until an answer is there, and return it.
 
         If the waiting task is cancelled, the answer stays pending.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from smartcam._client.correlation import Correlation, Match, SentTrigger
 from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.interpretation import new_tuple
-from smartcam._client.waits import told
+from smartcam._client.waits import copy_to_raise
 from smartcam.exceptions import (
     CameraFaultError,
     InputContainerError,
@@ -126,7 +126,7 @@ class Results:
         Its results may still come in the next session: they are pending.
         """
         if self._pending is not None:
-            self.give_up(told(error))
+            self.give_up(copy_to_raise(error))
 
     def finish(self) -> None:
         """End for good: leave nothing in the event loop."""
@@ -354,8 +354,8 @@ class Results:
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        told = container.asked
-        match = correlation.judge(number) if told is None else correlation.judge_told(told)
+        asked = container.asked
+        match = correlation.judge(number) if asked is None else correlation.judge_marked(asked)
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:

@@ -147,11 +147,11 @@ class StatusRequests:
         connection = self._connection
         if not connection.dialect.has(m.GetStatus):
             return
-        heard = self._state.statuses_heard
+        heard = self._state.statuses_received
         while True:  # a datagram may be lost
             self._requests.ask_status()
             await self._requests.fence(deadline)
-            if self._state.statuses_heard != heard:
+            if self._state.statuses_received != heard:
                 return
             await self.pause(deadline, "the camera to tell its status")
 

@@ -1,6 +1,6 @@
 """The life of a client: sessions, one after the other, and the steps between them.
 
-One task per client, its only bare ``create_task``. It makes a session, has the receive
+One task per client, the only one outside of a task group. It makes a session, has the receive
 task read its link to the end, ends all waits, and makes the next by the
 :class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another client has
 it: then the task stops or, at an agent, tries again slowly. The steps after its end are done by a
@@ -56,8 +56,8 @@ client (a decision of this library; the camera does not say so)."""
 
 FIRST_RETRY_DELAY_OF_TAKEN = 30.0
 MAX_RETRY_DELAY_OF_TAKEN = 600.0
-"""Seconds until a taken camera is tried again, if it is: twice as long each time that it is
-taken again. Each try costs the other client its session for a moment."""
+"""Shortest and longest time, seconds, until a taken camera is tried again, if ``on_taken`` is set:
+doubled each time that it is taken again. Each try interrupts the other client's session."""
 
 
 @dataclass(eq=False)
@@ -122,15 +122,15 @@ class Supervisor:
         session = self.session
         return session is not None and not session.link.lost and self._waits.end is None
 
-    def go_by(self, settings: CameraSettings) -> None:
-        """Make sessions by other settings; before it is started."""
+    def use_settings(self, settings: CameraSettings) -> None:
+        """Replace the settings of sessions; only before the supervisor is started."""
         self._settings = settings
 
     async def open(self) -> None:
         """Start, and wait for the first session.
 
         Raises:
-            ConnectFailedError: there was none.
+            ConnectFailedError: no session could be made.
         """
         self._opened = opened = asyncio.get_running_loop().create_future()
         self._task = asyncio.create_task(
@@ -142,7 +142,7 @@ class Supervisor:
             raise error
 
     async def close(self) -> None:
-        """End the session, in order if there is time, and the task. Idempotent, bounded.
+        """End the task and the session, with a Disconnect if there is time. Idempotent, bounded.
 
         Cancellation: the link is dropped at once.
         """
@@ -151,7 +151,7 @@ class Supervisor:
         self._closing = True
         try:
             if self.connected and self._lock.goes_back:
-                with contextlib.suppress(TimeoutError):  # another's command may be in between
+                with contextlib.suppress(TimeoutError):  # another task's command may be under way
                     async with asyncio.timeout(self._settings.switch_timeout):
                         await self._lock.settle()
             linked = self.connected
@@ -192,7 +192,7 @@ class Supervisor:
         """Wait until there is a session, and its state is restored.
 
         Raises:
-            LinkError: there will be none.
+            LinkError: there will be no session.
             ResponseTimeoutError: at ``deadline`` (loop time).
         """
         try:
@@ -207,9 +207,9 @@ class Supervisor:
                         return
                     await changed.wait()
         except TimeoutError as exc:
-            why = self._counters.last_error or "there was none yet"
+            why = self._counters.last_error or "none yet"
             raise ResponseTimeoutError(
-                f"{self._name}: no session within {timeout:g} s; the last one: {why}",
+                f"{self._name}: no session within {timeout:g} s; the last error: {why}",
                 waited=timeout,
             ) from exc
 
@@ -223,7 +223,7 @@ class Supervisor:
         if self.taken:
             self._take_back.set()
 
-    def restarts(self, link: Link) -> None:
+    def expect_restart(self, link: Link) -> None:
         """Note that a restart was requested: the link will end without a fault."""
         self._restarting = link
 
@@ -242,7 +242,7 @@ class Supervisor:
         error = self._reason(task)
         self._dispatch.fail(error)
         if self._closing:
-            error = self._closed or self.closed_error()  # whatever it was before
+            error = self._closed or self.closed_error()  # also if the session was lost before
         else:
             self._ended_by = error
         if self.session is not None:
@@ -251,12 +251,12 @@ class Supervisor:
         self._dispatch.finish(error)
         self._commands.end_session()
         self._finished = True
-        self._tell()
+        self._wake_waiters()
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(error)
 
     def _reason(self, task: asyncio.Task[SmartCamError]) -> SmartCamError:
-        """Return why a task that is over made its last session."""
+        """Return why the ended task makes no more sessions."""
         if task.cancelled():
             if self._closing:
                 return self.closed_error()
@@ -288,13 +288,13 @@ class Supervisor:
         session = await establish(self._settings, self._observers.trace, self._dispatch.layout)
         while True:
             again = self.session is not None
-            error = await self._have(session)
+            error = await self._run_session(session)
             made_at = session.early[0].received_at
             restarting, self._restarting = self._restarting is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
             ordered = session.link.machine.transport is Transport.TCP
-            # over UDP only silence shows that another client has it, which began earlier
+            # over UDP only silence shows that another client has the camera: the loss began earlier
             now = asyncio.get_running_loop().time()
             short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
             takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
@@ -312,7 +312,7 @@ class Supervisor:
             await self._lock.vacated()
             session = await self._reconnect(error)
 
-    async def _have(self, session: Session) -> ConnectionLostError:
+    async def _run_session(self, session: Session) -> ConnectionLostError:
         """Keep one session until its link ends; return the reason of the end."""
         settings, link = self._settings, session.link
         error: ConnectionLostError
@@ -329,7 +329,7 @@ class Supervisor:
                         error = await tasks.create_task(self._receive(link), name=name)
                     finally:
                         stop_watching()
-                    self._tell_of_loss(link, error)  # ends the jobs' waits too
+                    self._report_loss(link, error)  # ends the jobs' waits too
                 finally:
                     self._lock.end_session()
         finally:
@@ -352,7 +352,7 @@ class Supervisor:
         self._dispatch.dispatch_early(session.early)
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(None)
-        self._tell()
+        self._wake_waiters()
 
     async def _receive(self, link: Link) -> ConnectionLostError:
         """Dispatch each chunk until the link ends; return the reason of its end."""
@@ -366,7 +366,7 @@ class Supervisor:
             self._dispatch.dispatch(chunk)
             del chunk  # the next one may take its time
 
-    def _tell_of_loss(self, link: Link, error: ConnectionLostError) -> None:
+    def _report_loss(self, link: Link, error: ConnectionLostError) -> None:
         """End all waits, since a link has ended; all its events are dispatched."""
         restarting = self._restarting is link
         expected = self._closing or restarting
@@ -380,7 +380,7 @@ class Supervisor:
         self._listeners.publish(
             Disconnected(camera=self._name, at=datetime.now(UTC), reason=reason, expected=expected)
         )
-        self._tell()
+        self._wake_waiters()
 
     async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
         """Make a new session after a long pause, or as soon as the camera is to be taken back.
@@ -400,7 +400,7 @@ class Supervisor:
         return await self._reconnect(taken, at_once=True)
 
     async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
-        """Make a new session, as often as the policy says; ``at_once``: without a first pause.
+        """Try to make a new session until the policy ends it; ``at_once``: without a first pause.
 
         Raises:
             SmartCamError: the client gave up.
@@ -451,7 +451,7 @@ class Supervisor:
         doubled = min(self._times_taken, 16)  # more is far beyond the longest pause
         return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
 
-    def _tell(self) -> None:
+    def _wake_waiters(self) -> None:
         """Wake the tasks that wait for a change of the connection."""
         self._changed.set()
         self._changed = asyncio.Event()
@@ -460,8 +460,8 @@ class Supervisor:
 def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:
     """Return True if the loss may be another client's doing.
 
-    On TCP the camera closes the connection of the client that it serves no more, so nothing but
-    that counts. Over UDP it only falls silent. A broken frame, a fault of this program, and a
+    On TCP the camera closes the connection of the earlier client, so only a closed connection
+    counts. Over UDP it only falls silent. A broken frame, a fault of this program, and a
     network or a port that is gone never count.
     """
     cause = error.__cause__

@@ -214,7 +214,7 @@ class Triggers:
         features = connection.features
         if features.polled:
             await self._status.refresh(deadline)
-            correlation.heard()
+            correlation.note_query_answered()
         if state.bits & _SYSTEM_ERROR:
             raise self._fault()
         if request.input_data is not None and self._results.input_in_doubt:
@@ -230,14 +230,14 @@ class Triggers:
             await self._status.demand(deadline)
             await self._requests.fence(deadline)  # a status has come by then, or is lost again
             self._doubtful = None
-            correlation.heard()
+            correlation.note_query_answered()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
         # an older result shows by its number if each container has one
         decided = numbering is not None and numbering.always
         if correlation.doubted:  # the trigger before may not show in the status yet
             await self._requests.fence(deadline)
-            correlation.heard()
+            correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         waited = False  # in line with Queries, so that neither kind delays the other
@@ -248,7 +248,7 @@ class Triggers:
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
             elif features.fences and (
-                self._waits.owes(m.QueryAnswer)  # one can be open
+                self._waits.is_pending(m.QueryAnswer)  # one can be open
                 if waited
                 else not self._requests.is_free(m.QueryAnswer)
             ):
@@ -313,9 +313,9 @@ class Triggers:
         """Wait until a trigger may go out: another task may have asked meanwhile."""
         requests, features = self._requests, self._connection.features
         while True:
-            if features.acknowledged and self._waits.owes(m.TriggerAnswer):
-                await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
-            elif features.fences and self._waits.owes(m.QueryAnswer):
+            if features.acknowledged and self._waits.is_pending(m.TriggerAnswer):
+                await requests.await_pending(m.TriggerAnswer, _TRIGGER, deadline)
+            elif features.fences and self._waits.is_pending(m.QueryAnswer):
                 await requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
@@ -370,7 +370,7 @@ class Triggers:
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
         if features.acknowledged:
-            await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
+            await requests.await_pending(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
             await requests.command(m.SetInput(data=input_data), deadline)
         elif input_data is not None:
@@ -458,7 +458,7 @@ class Triggers:
 
     async def _end_stranger(self, deadline: float) -> None:
         """End a trigger of others, or one whose link broke: the camera never would."""
-        ours = self._waits.owes(m.TriggerAnswer)
+        ours = self._waits.is_pending(m.TriggerAnswer)
         if Status.BUSY in self._status.last and not ours:
             self._end_reading(self._connection.require_link())
             await self._requests.fence(deadline)  # a line of that trigger is not the next one's
@@ -526,8 +526,10 @@ def _is_not_overtriggered(status: Status) -> bool:
 def _evidence(features: Features) -> TriggerEvidence:
     """Return the evidence that a trigger needs before results count as its own."""
     if not features.fences:
-        told = features.acknowledged and features.ordered  # else an answer may be lost, or late
-        return EvidenceByAcknowledgement() if told else TriggerEvidence()
+        acknowledged = (
+            features.acknowledged and features.ordered
+        )  # else an answer may be lost, or late
+        return EvidenceByAcknowledgement() if acknowledged else TriggerEvidence()
     if not features.shows_triggers:
         return EvidenceByFence()
     return EvidenceByAnswer() if features.polled else EvidenceByStatus()

@@ -25,7 +25,7 @@ Answer = m.Message | SmartCamError
 ErrorT = TypeVar("ErrorT", bound=SmartCamError)
 
 
-def told(error: ErrorT) -> ErrorT:
+def copy_to_raise(error: ErrorT) -> ErrorT:
     """Return a copy of a kept error, to be raised.
 
     A raised error refers to the frames of its caller, and by them to the client: kept by the
@@ -37,7 +37,7 @@ def told(error: ErrorT) -> ErrorT:
     return made
 
 
-class OwedAnswer(asyncio.Future[Answer]):
+class PendingAnswer(asyncio.Future[Answer]):
     """A pending answer of the camera; it belongs to no single waiter.
 
     Attributes:
@@ -85,7 +85,7 @@ class Waits:
     def __init__(self, counters: ClientCounters) -> None:
         self.end: SmartCamError | None = None
         self._counters = counters
-        self.answers: dict[type[m.Message] | int, OwedAnswer] = {}
+        self.answers: dict[type[m.Message] | int, PendingAnswer] = {}
         self._asked_at: dict[object, float] = {}
         self._behind: dict[object, int] = {}  # deliveries received before the request was sent
         self._fences_open = 0  # Queries that went out with the last trigger and are not answered
@@ -106,7 +106,7 @@ class Waits:
             return False
         self.end = error
         if self.answers or self.statuses:
-            error = told(error)
+            error = copy_to_raise(error)
         for answer in self.answers.values():
             answer.set_result(error)
         self.answers.clear()
@@ -130,7 +130,7 @@ class Waits:
             LinkError: the reason why there is no session.
         """
         if self.end is not None:
-            raise told(self.end)
+            raise copy_to_raise(self.end)
 
     # ------------------------------------------------------------------ answers
 
@@ -141,28 +141,28 @@ class Waits:
         now: float,
         *,
         behind: int = 0,
-    ) -> OwedAnswer:
+    ) -> PendingAnswer:
         """Register for the next answer of this kind; errors come as a result, never raised.
 
         Messages in the delivery ``behind`` of the link, or in an earlier one, are no answer: they
         came before the request was sent, and wait to be passed on.
         """
-        future = OwedAnswer(loop)
+        future = PendingAnswer(loop)
         self.answers[key] = future
         self._behind[key] = behind
         if key is not m.SwitchAnswer:  # a switch takes long, which is no round trip
             self._asked_at[key] = now
         return future
 
-    def owed_answer(self, key: type[m.Message] | int) -> OwedAnswer:
-        """Return the future of a pending answer (:meth:`owes`)."""
-        owed = self.answers.get(key)
-        if owed is None:
+    def pending_answer(self, key: type[m.Message] | int) -> PendingAnswer:
+        """Return the future of a pending answer (:meth:`is_pending`)."""
+        answer = self.answers.get(key)
+        if answer is None:
             loop = asyncio.get_running_loop()
-            owed = self.next_answer(key, loop, loop.time())
-        return owed
+            answer = self.next_answer(key, loop, loop.time())
+        return answer
 
-    def owes(self, key: type[m.Message] | int) -> bool:
+    def is_pending(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""
         return key in self.answers or (key is m.QueryAnswer and self._fences_open > 0)
 
@@ -171,7 +171,7 @@ class Waits:
         self._fences_open = count
 
     def awaits_fences(self, count: int) -> bool:
-        """Return True if so many Queries of a trigger are open, and no task waits for anything."""
+        """Return True if ``count`` Queries of a trigger are open, and no task waits."""
         return self._fences_open == count and not self.answers and not self.statuses
 
     def take_fence(self) -> bool:

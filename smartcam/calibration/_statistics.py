@@ -1,4 +1,4 @@
-"""Tell noise from what it cannot cause: a sum of squares, offsets that are all alike."""
+"""Test whether noise alone explains residuals, and whether offsets share one move."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_MOVED_SPREAD: Final = 0.2
-"""Offsets are one move if each is at most this part of the move from their mean. A sheet pushed by
-3 to 50 mm before the last two to four of nine touches, or by 20 mm before the last three of
-fourteen views, was called good."""
+"""Largest distance of an offset from the mean offset, as a part of that mean, of offsets that count
+as one common move. Without this test a sheet pushed by 3 to 50 mm before the last two to four of
+nine touches, or by 20 mm before the last three of fourteen views, was called good."""
 
 
 class Noise(NamedTuple):
@@ -25,7 +25,10 @@ class Noise(NamedTuple):
     freedom: int | None = None
 
     def chance(self, squares: float, count: float) -> float:
-        """Return the probability that noise alone gives ``squares`` (m^2, of ``count``) or more.
+        """Return the p-value: the probability that noise gives ``squares`` (m^2) or more.
+
+        ``squares``: sum of ``count`` squared residuals.
+
 
         This is a chi-square test if the variance was given, and an F-test if it was estimated from
         other squares.

@@ -1,7 +1,7 @@
 """Describe printed targets: the pattern on a sheet, and the place of each of its points.
 
 The frame of a target lies on the sheet as it is read: origin at a corner of its points, x to the
-right along the ray A, y up along the ray B, z out of the sheet towards the reader. Points are
+right (ray A of the thesis), y up (ray B), z out of the sheet towards the reader. Points are
 numbered from the origin along x, then row by row along y.
 """
 

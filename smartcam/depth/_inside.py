@@ -15,7 +15,7 @@ if TYPE_CHECKING:
         TableSight,
         TowerTable,
         WoodenBlock,
-        laid,
+        random_table,
         to_robot,
     )
 
@@ -28,7 +28,7 @@ __all__ = [
     "TowerTable",
     "WoodenBlock",
     "hsv",
-    "laid",
+    "random_table",
     "to_robot",
 ]
 
@@ -37,6 +37,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_colours": "ColourRegion hsv",
-            "_simulation": "AXES BLOCK FOCAL TableSight TowerTable WoodenBlock laid to_robot",
+            "_simulation": "AXES BLOCK FOCAL TableSight TowerTable WoodenBlock random_table "
+            "to_robot",
         },
     )

@@ -216,21 +216,23 @@ class StereoMatcher:
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return OpenCV's disparities, NaN where there is none."""
         cv2 = load("cv2")
-        none = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
+        invalid = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
         sixteenths = self._padded(left, right)
         if self._smooth is not None:
             sixteenths = self._smooth(sixteenths, left, np.negative(self._reverse(left, right)))
         elif self._left_right is not None:
-            apart = _disagreement(sixteenths, self._reverse(left, right), none)
-            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = none
+            apart = _disagreement(sixteenths, self._reverse(left, right), invalid)
+            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = invalid
         column = np.arange(left.shape[1])
         there = column - np.round(sixteenths / SUBPIXELS)
-        sixteenths[(there < 0) | (there >= left.shape[1])] = none
+        sixteenths[(there < 0) | (there >= left.shape[1])] = invalid
         size = int(self.parameters["speckle_window_size"])
         if size:
             reach = int(self.parameters["speckle_range"]) * SUBPIXELS
-            cv2.filterSpeckles(sixteenths, none, size, reach)
-        return np.where(sixteenths > none, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan))
+            cv2.filterSpeckles(sixteenths, invalid, size, reach)
+        return np.where(
+            sixteenths > invalid, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan)
+        )
 
     def _reverse(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
         """Return disparities from right to left in 1/16 pixel, with the sign of left to right."""
@@ -289,19 +291,19 @@ def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
 
 
 def _disagreement(
-    there: NDArray[np.int16], back: NDArray[np.int16], none: int
+    forward: NDArray[np.int16], backward: NDArray[np.int16], invalid: int
 ) -> NDArray[np.float32]:
     """Return the differences between disparities of both directions at the same point.
 
     They are in 1/16 pixel, and infinite if a disparity is missing or the point is outside of the
     right picture.
     """
-    width = there.shape[1]
-    column = np.arange(width, dtype=np.int32)[None] - ((there.astype(np.int32) + 8) >> 4)
-    inside = (column >= 0) & (column < width) & (there > none)
-    other = np.take_along_axis(back, np.clip(column, 0, width - 1), axis=1)
-    apart = np.abs(other.astype(np.float32) - there)
-    return np.where(inside & (other > none), apart, np.float32(np.inf))
+    width = forward.shape[1]
+    column = np.arange(width, dtype=np.int32)[None] - ((forward.astype(np.int32) + 8) >> 4)
+    inside = (column >= 0) & (column < width) & (forward > invalid)
+    other = np.take_along_axis(backward, np.clip(column, 0, width - 1), axis=1)
+    apart = np.abs(other.astype(np.float32) - forward)
+    return np.where(inside & (other > invalid), apart, np.float32(np.inf))
 
 
 def _wls(wls: tuple[float, float]) -> Callable[..., Any]:

@@ -301,7 +301,7 @@ class _TableRays:
 # ---------------------------------------------------------------------- what lies there at first
 
 
-def laid(seed: int, supply: int = 5) -> TowerTable:
+def random_table(seed: int, supply: int = 5) -> TowerTable:
     """Return a table with a tower of two wooden blocks and other objects around it.
 
     ``supply``: number of black blocks within reach of a robot at (0, 0). One more is out of reach,

@@ -313,7 +313,7 @@ class LineCamera(WireCamera):
 
     def answer(self, line: str) -> str | None:
         """Return the answer to a line, None for none; override this or :meth:`hear`."""
-        raise NotImplementedError(f"{type(self).__name__} says no answer()")
+        raise NotImplementedError(f"{type(self).__name__} has no answer()")
 
     def hear(self, client: LineClient, line: str) -> None:
         """Carry out a line, and call ``client.answer()`` once, now or later."""

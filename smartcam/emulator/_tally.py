@@ -1,4 +1,4 @@
-"""Count events, and wait until an event has happened so many times."""
+"""Count events, and wait until an event has happened a number of times."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
+    from smartcam.fleet._agent.outlet_service import ReportedOutlet, ReportedStore
     from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.address import FleetAddress
@@ -43,10 +43,10 @@ __all__ = [
     "MadeCertificate",
     "OperationsSection",
     "RecordSection",
+    "ReportedOutlet",
+    "ReportedStore",
     "RosFleet",
     "RosSection",
-    "ToldOutlet",
-    "ToldStore",
     "ZenohEnd",
     "ends_soon",
     "exposition",
@@ -66,7 +66,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_agent.outlet_service": "ToldStore ToldOutlet",
+            "_agent.outlet_service": "ReportedStore ReportedOutlet",
             "_program.fleet": "FleetResults",
             "_agent.reload": "FleetChanges",
             "_agent.summary": "CameraSummary",

@@ -125,8 +125,8 @@ def fleet_camera(
     theirs = sorted(SESSIONS_OWN & options.keys())
     if theirs:
         raise UnsupportedError(
-            f"{url}: {', '.join(theirs)}: the session with the camera is its agent's: fleet.yaml "
-            "says how that is"
+            f"{url}: {', '.join(theirs)}: these are options of the camera's session, which its "
+            "agent has: set them in fleet.yaml"
         )
     program = Program(_end(address), address.fleet, address.camera, called=address.program)
     return FleetCamera(settings, address.camera, program, observers=observers)

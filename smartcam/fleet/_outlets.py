@@ -204,13 +204,13 @@ class _OutletObserver(Observer):
         def value() -> tuple[Any, int | None]:
             if read is None:
                 return None, None
-            said: dict[str, Any] = json.loads(cells) if cells else {}
-            texts = said.get("cells")
+            content: dict[str, Any] = json.loads(cells) if cells else {}
+            texts = content.get("cells")
             container = ResultContainer(
                 application=result.application,
                 data=result.raw,
                 cells=None if texts is None else tuple(texts),
-                fault=said.get("fault"),
+                fault=content.get("fault"),
             )
             at = result.received_at
             camera, number = result.camera, result.number

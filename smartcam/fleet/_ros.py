@@ -110,7 +110,7 @@ class RosFleet(Server):
         desks: CalibrationDesks | None = None,
     ) -> None:
         self._desks = desks
-        self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
+        self._section, self._camera_options, self._wanted = section, dict(cameras or {}), wanted
         self._settings, self._frames = settings or {}, frames or {}  # filled by other methods
         self._places, self._controls = places or {}, controls or {}
         self.context: RosContext | NativeContext = _context(bus, section)
@@ -182,13 +182,13 @@ class RosFleet(Server):
         return NativeNode(own, namespace=f"{above}/{namespace}", context=self.context)
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
-        said = self._said.get(name, RosCamera.model_validate({}))
+        options = self._camera_options.get(name, RosCamera.model_validate({}))
         return CameraNodeOptions(
-            frame_id=said.frame_id or as_name(name).replace("/", "_"),
-            parent_frame=said.parent_frame or "",
-            flange_frame=said.flange_frame or "",
+            frame_id=options.frame_id or as_name(name).replace("/", "_"),
+            parent_frame=options.parent_frame or "",
+            flange_frame=options.flange_frame or "",
             place=self._places.get(name),
-            calibrated_at=said.robot_pose(),
+            calibrated_at=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
             heard=lambda: camera.met,
@@ -218,8 +218,8 @@ def _context(bus: ZenohEnd, section: RosSection) -> RosContext | NativeContext:
     """Return the context of the nodes: the bus' own session, or a context of rclpy."""
     if section.through == "zenoh":
         return RosContext(bus, domain=section.domain, distribution=section.distribution)
-    said = section.distribution if "distribution" in section.model_fields_set else ""
-    return NativeContext(domain=section.domain, distribution=said, args=section.args)
+    distribution = section.distribution if "distribution" in section.model_fields_set else ""
+    return NativeContext(domain=section.domain, distribution=distribution, args=section.args)
 
 
 @contextlib.asynccontextmanager

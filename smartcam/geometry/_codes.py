@@ -80,7 +80,7 @@ class Code(enum.StrEnum):
     WRONG_TARGET = "WRONG_TARGET"
     """The image shows another target than the described one."""
     AMBIGUOUS_ORIGIN = "AMBIGUOUS_ORIGIN"
-    """The target's origin cannot be told clearly from its other corners."""
+    """The target's origin cannot be distinguished clearly from its other corners."""
     WRONG_SIZE = "WRONG_SIZE"
     """An image of another size than the camera's, or than the other images."""
     DIFFERENT_TARGETS = "DIFFERENT_TARGETS"

@@ -164,18 +164,18 @@ class Picture:
         sent = self._pixels.ndim == 3
         colours = self._pixels if sent or self.frame is None else self.frame.rgb()
         depth = min(self.depth, 8 * colours.dtype.itemsize)
-        made = 0 if sent else 1  # converted colours may be off by one level
+        off_by = 0 if sent else 1  # converted colours may be off by one level
         bright = colours.max(axis=2) > 2**depth // 4
         mask = np.zeros(bright.shape, dtype=bool)
         for one in range(3):
             black, white = _ends(colours[:, :, one], depth)
-            mask |= colours[:, :, one] >= white - made
-            mask |= bright & (colours[:, :, one] <= black + made)
+            mask |= colours[:, :, one] >= white - off_by
+            mask |= bright & (colours[:, :, one] <= black + off_by)
         return mask
 
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
-        """Brightness, (H, W), uint8: of more bits, the upper eight significant bits."""
+        """Brightness, (H, W), uint8: the upper eight significant bits of a sample."""
         return _eight_bits(self.levels, self.depth)
 
     @cached_property

@@ -50,7 +50,7 @@ _SIGMAS = ("sigma_x", "sigma_y", "sigma_theta")
 """Fields that are needed for the errors of a pose."""
 
 _CORRELATIONS = ("correlation_xy", "correlation_xt", "correlation_yt")
-"""Optional fields beside these; without them the errors are independent."""
+"""Optional correlations of the errors; without them the errors are independent."""
 
 MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
@@ -59,7 +59,7 @@ MAX_NAMES = 64
 """Largest number of feature names that are kept as texts. An application has a handful, but a peer
 could send any number."""
 
-# half the time of the NamedTuples' own; the cast because a bare tuple is generic
+# takes half the time of a NamedTuple's own constructor; a bare tuple is generic, so it is cast
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
@@ -190,9 +190,9 @@ class LocalizationsInterpreter(PlainInterpreter):
         return data[begin : begin + self.layout.size] == self._empty
 
     def _check_numbers(self, data: bytes, context: Context) -> None:
-        """Raise for the first impossible number, or for a bad text or bool before it.
+        """Raise for the first invalid number, or for an invalid text or bool before it.
 
-        NaN and infinity in a pose are impossible, and a quality that is not between 0 and 1.
+        Invalid are NaN and infinity in a pose, and a quality that is not between 0 and 1.
         """
         offset = self.layout.head_size
         for number, record in enumerate(self.layout.parse_records(data, context.byte_order)):
@@ -204,7 +204,7 @@ class LocalizationsInterpreter(PlainInterpreter):
 
 
 def _wrong(field: Field, value: float) -> str:
-    """Return the expectation that a number does not meet; "" for a possible number."""
+    """Return what was expected in place of an invalid number; "" for a valid number."""
     if field.name in _POSE and not math.isfinite(value):
         return "a finite number"
     if field.name == "quality" and not 0.0 <= value <= MAX_QUALITY:

@@ -210,7 +210,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     def _watch_refusals(self, client: Any) -> None:
         """Note which messages the broker refuses, which aiomqtt does not report."""
         inner = client._client  # noqa: SLF001
-        send, told, came = inner.publish, inner.on_publish, inner.on_connect
+        send, was_published, was_connected = inner.publish, inner.on_publish, inner.on_connect
         topics: dict[int, str] = {}  # topics of messages that are not acknowledged yet
 
         def publish(topic: str, *given: Any, **named: Any) -> Any:
@@ -228,13 +228,13 @@ class MqttOutlet(Outlet[MqttSettings]):
                         "outlet %s: the broker refused a message to %.120s: %s",
                         *(self.name, topic, reason),
                     )
-            told(of, data, number, reason, properties)
+            was_published(of, data, number, reason, properties)
 
         def on_connect(of: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
             largest = getattr(properties, "MaximumPacketSize", None)  # of all of the packet
             if largest is not None:
                 self._largest = min(self._largest, largest - MAX_HEADER_BYTES)
-            came(of, data, flags, reason, properties)
+            was_connected(of, data, flags, reason, properties)
 
         inner.publish, inner.on_publish, inner.on_connect = publish, on_publish, on_connect
 
@@ -358,12 +358,12 @@ class MqttOutlet(Outlet[MqttSettings]):
             str(message.topic).removeprefix(f"{self.settings.topic}/command/").partition("/")
         )
         reply = await self._do(verb, camera, message.payload)
-        said = message.properties
-        topic = getattr(said, "ResponseTopic", None)
+        requested = message.properties
+        topic = getattr(requested, "ResponseTopic", None)
         properties = None
         if not topic or "+" in topic or "#" in topic:
             topic = f"{self.settings.topic}/reply/{verb}/{camera}"
-        correlation = getattr(said, "CorrelationData", None)
+        correlation = getattr(requested, "CorrelationData", None)
         if correlation is not None:
             properties = load("paho.mqtt.properties").Properties(
                 load("paho.mqtt.packettypes").PacketTypes.PUBLISH

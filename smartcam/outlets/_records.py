@@ -9,17 +9,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | None:
+def picture_of(pattern: str, folder: Path, fields: Mapping[str, Any]) -> Path | None:
     """Return the file of a result's picture; None if there is none below the folder.
 
     Args:
         pattern: path of the file, with ``{camera}``, ``{application}``, ``{number}`` and
             ``{sequence}``.
         folder: folder of relative paths.
-        said: fields of the result.
+        fields: fields of the result.
     """
     for name in ("camera", "application", "number", "sequence"):
-        pattern = pattern.replace(f"{{{name}}}", str(said.get(name, "")))
+        pattern = pattern.replace(f"{{{name}}}", str(fields.get(name, "")))
     path = folder / pattern
     below = path.resolve().is_relative_to(folder.resolve())
     return path if below and path.is_file() else None
@@ -44,9 +44,9 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
     pose = record.get("pose")
     if not isinstance(pose, dict) or "orientation" not in pose:
         return record
-    told = cast("dict[str, dict[str, Any]]", pose)
-    turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
+    parts = cast("dict[str, dict[str, Any]]", pose)
+    turned = {f"q{axis}": value for axis, value in parts["orientation"].items()}
     rest = {name: one for name, one in record.items() if name != "pose"}
-    errors = (told.get("sigma") or {}).items()
+    errors = (parts.get("sigma") or {}).items()
     off = {name if "_" in name else f"sigma_{name}": one for name, one in errors}
-    return {**rest, **told["position"], **turned, **off}
+    return {**rest, **parts["position"], **turned, **off}

@@ -184,8 +184,8 @@ class Spool:
         if self._lock is None:
             return 0
         os.lseek(self._lock, 0, os.SEEK_SET)
-        said = os.read(self._lock, 20).strip()
-        return int(said) if said.isdigit() else 0
+        text = os.read(self._lock, 20).strip()
+        return int(text) if text.isdigit() else 0
 
     def _keep_epoch(self, epoch: int) -> None:
         if self._lock is not None:
@@ -432,7 +432,7 @@ def _check_versions(path: Path) -> None:
     """Check the versions in the file's header: SQLite opens a file with a damaged one read-only.
 
     Raises:
-        sqlite3.DatabaseError: they are damaged.
+        sqlite3.DatabaseError: the entries are damaged.
     """
     with path.open("rb") as file:
         versions = file.read(20)[18:]
@@ -448,7 +448,7 @@ def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
     """Return the counts.
 
     Raises:
-        sqlite3.DatabaseError: they are damaged.
+        sqlite3.DatabaseError: the entries are damaged.
     """
     counts = dict(database.execute("SELECT name, value FROM counts"))
     if not all(isinstance(one, int) and one >= 0 for one in counts.values()):
@@ -569,10 +569,10 @@ def _add_gap(
         entry = OutletEntry(*fields)
         if entry.kind != "gap" or _checksum(entry, there) != checksum:
             break
-        said = json.loads(entry.body)
-        count += said["lost"]
-        unknown = unknown or said["at_least"]
-        reasons.append(said["error"])
+        older = json.loads(entry.body)
+        count += older["lost"]
+        unknown = unknown or older["at_least"]
+        reasons.append(older["error"])
         gone.append((there,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
     each = dict.fromkeys(one for text in reversed(reasons) for one in text.split("; "))

@@ -242,24 +242,24 @@ class _StoreFile:
             raise OutletError(f"the store {self.path} was moved or deleted: it is begun anew")
 
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
-        said: dict[str, Any] = _readable(json.loads(entry.body))
-        value = said.get("value")
+        fields: dict[str, Any] = _readable(json.loads(entry.body))
+        value = fields.get("value")
         records = records_of(value)
         row = (
             entry.id,
             *entry[:4],
-            said.get("received_at") or _time(entry.at),
-            said.get("application"),
-            _cell(said.get("sequence")),
-            said.get("triggered_at"),
-            said.get("latency"),
-            said.get("error"),
-            said.get("kind"),
-            said.get("lost"),
+            fields.get("received_at") or _time(entry.at),
+            fields.get("application"),
+            _cell(fields.get("sequence")),
+            fields.get("triggered_at"),
+            fields.get("latency"),
+            fields.get("error"),
+            fields.get("kind"),
+            fields.get("lost"),
             None if value is None else json.dumps(value, separators=(",", ":")),
             None if records is None else len(records),
-            self._picture(entry, said),
-            said.get("at_least"),
+            self._picture(entry, fields),
+            fields.get("at_least"),
         )
         marks = ", ".join("?" * len(row))
         written = database.execute(f"INSERT OR IGNORE INTO results VALUES ({marks})", row).rowcount  # noqa: S608
@@ -337,11 +337,11 @@ class _StoreFile:
         )
         known[name] = column
 
-    def _picture(self, entry: OutletEntry, said: Mapping[str, Any]) -> str | None:
+    def _picture(self, entry: OutletEntry, fields: Mapping[str, Any]) -> str | None:
         pattern, folder = self.settings.pictures, self.path.parent
         if pattern is None or entry.kind == "gap":
             return None
-        found = picture_of(pattern, folder, said)
+        found = picture_of(pattern, folder, fields)
         return None if found is None else str(found.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:

@@ -32,14 +32,14 @@ class JudgedResult(NamedTuple):
     Attributes:
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
-        told: True if the picture was recorded for this result, as after ``read_image()``; False
+        reported: True if the picture was recorded for this result, as after ``read_image()``; False
             if it was found by its time. Without a trigger of this client it cannot be found by
             time: the picture is None.
     """
 
     result: Result[Any]
     picture: Frame | None
-    told: bool
+    reported: bool
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
@@ -95,13 +95,13 @@ class PictureMatcher:
         """Yield the results whose picture is known, or cannot come any more."""
         while self.results:
             result = self.results[0]
-            found = self._told(result)
-            told = found is not None
-            if not (told or over or self._is_late(result)):
+            found = self._reported_picture(result)
+            reported = found is not None
+            if not (reported or over or self._is_late(result)):
                 return
             self.results.popleft()
             picture = self._by_time(result) if found is None else found.frame
-            yield JudgedResult(result, picture, told)
+            yield JudgedResult(result, picture, reported)
 
     def settled_by_time(self) -> Iterator[JudgedResult]:
         """Yield the results as soon as their picture is found by its time."""
@@ -118,7 +118,7 @@ class PictureMatcher:
         """Return True if a result should not wait for a picture any more."""
         return self._latest > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
 
-    def _told(self, result: Result[Any]) -> RecordedPicture | None:
+    def _reported_picture(self, result: Result[Any]) -> RecordedPicture | None:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
         return next(

@@ -150,8 +150,7 @@ class Recording:
             )
         if name is None and len(self.cameras) != 1:
             raise ConfigurationError(
-                f"recording {self.path}: {len(self.cameras)} cameras are in it, say which one: "
-                f"{names}"
+                f"recording {self.path}: {len(self.cameras)} cameras are in it, choose one: {names}"
             )
         return self.cameras[next(iter(self.cameras)) if name is None else name]
 
@@ -347,8 +346,8 @@ class _FolderLook:
             _check_cameras(self.path, self.facts)
             self.version = scan.file_facts.get("version", self.version)
         if scan.remark:
-            said = scan.remark if scan.path == self.path else f"{scan.path.name}: {scan.remark}"
-            self.remarks.append(said)
+            remark = scan.remark if scan.path == self.path else f"{scan.path.name}: {scan.remark}"
+            self.remarks.append(remark)
 
     def _take_item(self, item: Item) -> None:
         at = _when(item)
@@ -502,14 +501,14 @@ class _Scan:
                 elif name in (ANNOTATIONS_SCHEMA, *PICTURE_SCHEMAS):
                     kinds[number] = name
             case McapMessage(channel, sequence, data) if channel in kinds:
-                said = kinds[channel]
-                if isinstance(said, str):
-                    return self._picture(said, sequence, data, reader)
+                reader_of = kinds[channel]
+                if isinstance(reader_of, str):
+                    return self._picture(reader_of, sequence, data, reader)
                 body = bytes(data)
                 self._count_values(count_values(body), reader.place)
                 fields = message_fields(body)
                 self._find_raw(fields, reader)
-                item = said.from_json(fields)
+                item = reader_of.from_json(fields)
                 if isinstance(item, TraceEntry) and (hex_data := body_of(item)):
                     self.bodies.add((item.camera, sequence), hex_data, len(hex_data))
                 return item

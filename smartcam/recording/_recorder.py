@@ -719,5 +719,5 @@ def address_facts(url: str) -> dict[str, str]:
     except ConfigurationError:  # a plug-in that is no longer installed
         return {"url": url}
     quirks = ",".join(address.quirks)
-    said = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}
-    return {"url": address.url, **{name: text for name, text in said.items() if text}}
+    facts = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}
+    return {"url": address.url, **{name: text for name, text in facts.items() if text}}

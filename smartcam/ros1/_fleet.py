@@ -26,13 +26,13 @@ class RosbridgeFleet(RosFleet):
         bridge: the URL of the rosbridge.
         on_change: function called with a node whose bridge was connected or lost.
         *given: arguments of :class:`RosFleet`.
-        **said: arguments of :class:`RosFleet` by name.
+        **options: arguments of :class:`RosFleet` by name.
     """
 
     def __init__(
-        self, bridge: str, on_change: Callable[[RosbridgeNode], None], *given: Any, **said: Any
+        self, bridge: str, on_change: Callable[[RosbridgeNode], None], *given: Any, **options: Any
     ) -> None:
-        super().__init__(*given, **said)
+        super().__init__(*given, **options)
         self._bridge, self._on_change = bridge, on_change
 
     def _node(self, name: str) -> Any:
@@ -64,7 +64,7 @@ async def bridged(
     on_change: Callable[[RosbridgeNode], None],
     address: FleetAddress,
     section: RosSection,
-    **said: Any,
+    **options: Any,
 ) -> AsyncIterator[RosbridgeFleet]:
     """Run nodes of ROS 1 for the cameras of a running fleet.
 
@@ -73,7 +73,7 @@ async def bridged(
         on_change: function called with a node whose bridge was connected or lost.
         address: address of the fleet.
         section: settings of the nodes of the cameras.
-        **said: arguments of :class:`RosFleet` about single cameras.
+        **options: arguments of :class:`RosFleet` about single cameras.
 
     Raises:
         ConfigurationError: the URL is not valid.
@@ -84,7 +84,7 @@ async def bridged(
     await bus.open(TIMEOUT)
     try:
         given = (bus, address.fleet, address, section)
-        async with RosbridgeFleet(bridge, on_change, *given, **said) as ros:
+        async with RosbridgeFleet(bridge, on_change, *given, **options) as ros:
             yield ros
     finally:
         await bus.close()

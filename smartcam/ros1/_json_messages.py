@@ -85,13 +85,13 @@ def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
 
 def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
     names = RENAMED.get(kind.name, {})
-    said = dict(ONLY_ROS1.get(kind.name, {}))
+    made = dict(ONLY_ROS1.get(kind.name, {}))
     for field in kind.fields:
         value = getattr(message, field.attribute)
-        said[names.get(field.name, field.name)] = _value(kind, field, value)
-    if kind.name == "builtin_interfaces/msg/Time" and said["secs"] < 0:
+        made[names.get(field.name, field.name)] = _value(kind, field, value)
+    if kind.name == "builtin_interfaces/msg/Time" and made["secs"] < 0:
         raise RosMessageError(f"{kind.name}: sec: ROS 1 has no time before 1970, got {message!r}")
-    return said
+    return made
 
 
 def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
@@ -111,40 +111,40 @@ def _signed(value: int) -> int:
     return value - 256 if value > 127 else int(value)
 
 
-def from_json(kind: MessageType, said: Any) -> Any:
+def from_json(kind: MessageType, data: Any) -> Any:
     """Return the message of a JSON value; missing fields are zero.
 
     Args:
         kind: type of the message.
-        said: object of the fields, or array of the first fields' values in order.
+        data: object of the fields, or array of the first fields' values in order.
 
     Raises:
         RosMessageError: the type does not have a field, or a value does not fit.
     """
-    if isinstance(said, list):
-        if len(said) > len(kind.fields):
+    if isinstance(data, list):
+        if len(data) > len(kind.fields):
             raise RosMessageError(
-                f"{kind.name}: expected up to {len(kind.fields)} values, got {len(said)}"
+                f"{kind.name}: expected up to {len(kind.fields)} values, got {len(data)}"
             )
         names = RENAMED.get(kind.name, {})
         ordered = [names.get(one.name, one.name) for one in kind.fields]
-        said = dict(zip(ordered, said, strict=False))
-    message = kind.new(**_said(kind, said, "", _MAX_LEVELS))
+        data = dict(zip(ordered, data, strict=False))
+    message = kind.new(**_checked_fields(kind, data, "", _MAX_LEVELS))
     return kind.decode(kind.encode(message))  # makes numpy arrays and bytes, as in ROS 2
 
 
-def _said(kind: MessageType, said: Any, where: str, depth: int) -> dict[str, Any]:
+def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dict[str, Any]:
     """Return the fields of an object under their names in ROS 2; encoding checks the values."""
-    if not isinstance(said, dict):
+    if not isinstance(data, dict):
         raise RosMessageError(
-            f"{kind.name}: {where or 'the whole'}: expected an object, got {said!r:.80}"
+            f"{kind.name}: {where or 'the whole'}: expected an object, got {data!r:.80}"
         )
     if not depth:
         raise RosMessageError(f"{kind.name}: {where}: nested too deep")
     names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
     fields = {names.get(field.name, field.name): field for field in kind.fields}
     found = dict[str, Any]()
-    for name, value in said.items():
+    for name, value in data.items():
         if name in only:
             continue
         field = fields.get(name)
@@ -176,8 +176,8 @@ def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth
         return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:
-        return _said(inner, value, f"{where}.", depth - 1)
-    return [_said(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
+        return _checked_fields(inner, value, f"{where}.", depth - 1)
+    return [_checked_fields(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
 
 
 def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:

@@ -45,13 +45,13 @@ MAX_MESSAGE_BYTES = 8 << 20
 class LinkListener(Protocol):
     """The receiver of a link's events."""
 
-    def came(self) -> None:
+    def on_connected(self) -> None:
         """Handle a new connection; advertise the topics."""
 
-    def heard(self, operation: dict[str, Any]) -> None:
+    def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation; never wait."""
 
-    async def lost(self, was: bool) -> None:
+    async def on_lost(self, was: bool) -> None:
         """Handle a lost connection, or a failed attempt if ``was`` is False."""
 
 
@@ -181,7 +181,7 @@ class BridgeLink:
             async with web_socket(self.url) as web:
                 logger.info("%s: connected", self.url)
                 await self._set(connected=True)
-                self._listener.came()
+                self._listener.on_connected()
                 await self._carry(web)
         except link_errors() as exc:
             return str(getattr(exc, "os_error", exc)) or type(exc).__name__
@@ -209,9 +209,9 @@ class BridgeLink:
 
     async def _tell_lost(self, reason: str) -> bool:
         """Log that the link is lost; return True if there was one."""
-        told_before = self.failure
+        previous_failure = self.failure
         was = await self.end(f"{self.url}: {reason}")
-        level = logging.DEBUG if told_before == self.failure else logging.WARNING
+        level = logging.DEBUG if previous_failure == self.failure else logging.WARNING
         logger.log(level, "%s: no rosbridge: %s", self.url, reason)
         return was
 
@@ -220,7 +220,7 @@ class BridgeLink:
         was = self.connected
         await self._set(connected=False, failure=failure)
         self.outbox.clear()
-        await self._listener.lost(was)
+        await self._listener.on_lost(was)
         return was
 
     async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
@@ -256,7 +256,7 @@ class BridgeLink:
             operation = None
         if isinstance(operation, dict) and isinstance(operation.get("op"), str):
             try:
-                self._listener.heard(operation)
+                self._listener.on_operation(operation)
             except ENDS_PROGRAM:
                 raise
             except BaseException:

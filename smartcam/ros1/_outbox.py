@@ -66,7 +66,7 @@ class Lane:
         self._waiting.clear()
         self.waiting_bytes = 0
 
-    def say_again(self) -> None:
+    def repeat(self) -> None:
         """Queue a latched topic's last message for a new bridge."""
         if self._last is not None and not self._waiting:
             self.put(self._last, connected=True)
@@ -83,7 +83,7 @@ class Outbox:
         self._room.set()
         self._flushed = asyncio.Event()
 
-    def say(self, parts: tuple[Part, ...]) -> None:
+    def add_operation(self, parts: tuple[Part, ...]) -> None:
         """Queue an operation."""
         self._operations.append(parts)
         self.wake()

@@ -68,14 +68,14 @@ class RosbridgePublisher:
         """
         if message is not None and fields:
             raise RosMessageError("expected a message or its fields, got both")
-        said: dict[str, Any] = {"op": "publish", "topic": self.name}
+        operation: dict[str, Any] = {"op": "publish", "topic": self.name}
         if self.lane.latched:
-            said["latch"] = True  # otherwise the bridge takes this for another publisher
-        said["msg"] = to_json(self.type, fields if message is None else message)
+            operation["latch"] = True  # otherwise the bridge takes this for another publisher
+        operation["msg"] = to_json(self.type, fields if message is None else message)
         if not self._node.has(self):
             raise RosError(f"{self.name}: this publisher is closed")
         if self.exists:
-            self.lane.put(encoded(said), connected=self._node.connected)
+            self.lane.put(encoded(operation), connected=self._node.connected)
             self._node.wake()
 
     def publish_encoded(self, data: bytes) -> None:

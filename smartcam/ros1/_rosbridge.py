@@ -31,7 +31,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 FLUSH_TIMEOUT = 1.0
 """Seconds to send waiting operations at the end."""
 ASK_TIMEOUT = 5.0
-"""Seconds of the timeout of a call by smartcam."""
+"""Seconds that the bridge may take to answer a call by smartcam."""
 REPEAT_INTERVAL = 10.0
 """Seconds between two repetitions of a latched message on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
@@ -92,7 +92,7 @@ class RosbridgeNode(NamedNode):
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "publish": self._published,
-            "status": self._told,
+            "status": self._log_status,
             "service_response": self._answered,
         }
 
@@ -162,7 +162,7 @@ class RosbridgeNode(NamedNode):
         while self._changing is not None:
             await asyncio.wait((self._changing,))
 
-    # ------------------------------------------------------------------ what it has
+    # ------------------------------------------------------------------ topics and services
 
     def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgePublisher:
         """Publish on a topic.
@@ -179,9 +179,9 @@ class RosbridgeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
         publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
-        if self._told_absent(publisher.exists, name, kind.name):
+        if self._log_if_absent(publisher.exists, name, kind.name):
             self._outbox.add(publisher.lane)
-            self.say(encoded(publisher.advertisement()))
+            self.send(encoded(publisher.advertisement()))
         return publisher
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgeSubscription:
@@ -198,7 +198,7 @@ class RosbridgeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         heard = RosbridgeSubscription(self, name, kind, qos)
-        if self._told_absent(heard.exists, name, kind.name):
+        if self._log_if_absent(heard.exists, name, kind.name):
             self._subscriptions.append(heard)
             heard.ask()
         return heard
@@ -231,7 +231,7 @@ class RosbridgeNode(NamedNode):
         kind, name = self.types.service(type), self._new_name(service, "service", self._services)
         served = RosbridgeService(self, name, kind, handler, timeout)
         self._services[name] = served
-        if self._told_absent(served.exists, name, kind.name):
+        if self._log_if_absent(served.exists, name, kind.name):
             self._new.append(served)
             self._change()
         return served
@@ -242,7 +242,7 @@ class RosbridgeNode(NamedNode):
             raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
         return full
 
-    def _told_absent(self, exists: bool, name: str, kind: str) -> bool:
+    def _log_if_absent(self, exists: bool, name: str, kind: str) -> bool:
         if not exists:
             logger.info("%s: left out, ROS 1 has no %s", name, kind)
         return exists
@@ -261,7 +261,7 @@ class RosbridgeNode(NamedNode):
             del self._publishers[end.name]
             if end.exists:
                 self._outbox.remove(end.lane)
-                self.say(encoded({"op": "unadvertise", "topic": end.name}))
+                self.send(encoded({"op": "unadvertise", "topic": end.name}))
             return
         del self._services[end.name]
         end.end_turn()
@@ -282,10 +282,10 @@ class RosbridgeNode(NamedNode):
         self._new.append(service)
         self._change()
 
-    def say(self, parts: tuple[Part, ...]) -> None:
-        """Send an operation to the connected bridge; a later one gets all advertisements."""
+    def send(self, parts: tuple[Part, ...]) -> None:
+        """Send an operation, if the bridge is connected; a later bridge gets all advertisements."""
         if self.connected:
-            self._outbox.say(parts)
+            self._outbox.add_operation(parts)
 
     def wake(self) -> None:
         """Wake the task that sends, since a message waits."""
@@ -300,13 +300,13 @@ class RosbridgeNode(NamedNode):
 
     # ------------------------------------------------------------------ events of the link
 
-    def came(self) -> None:
+    def on_connected(self) -> None:
         """Advertise everything to a new bridge."""
         self._tell_change()
         for publisher in self._publishers.values():
             if publisher.exists:
-                self.say(encoded(publisher.advertisement()))
-                publisher.lane.say_again()
+                self.send(encoded(publisher.advertisement()))
+                publisher.lane.repeat()
         for subscription in self._subscriptions:
             subscription.ask()
         self.begin(self._repeat_shared())
@@ -328,11 +328,11 @@ class RosbridgeNode(NamedNode):
             await asyncio.sleep(REPEAT_INTERVAL)
             for publisher in self._publishers.values():
                 if publisher.exists and not publisher.name.startswith(within):
-                    publisher.lane.say_again()
+                    publisher.lane.repeat()
                     self._outbox.wake()
 
     def _change(self) -> None:
-        """Withdraw and advertise services one after another, those of this turn together."""
+        """Start to withdraw and advertise services, in one task for all of a turn of the loop."""
         if self.connected and self._changing is None and (self._new or self._leaving):
             self._changing = self.begin(self._change_services())
             self._changing.add_done_callback(self._changed)
@@ -364,7 +364,7 @@ class RosbridgeNode(NamedNode):
         self._asked[asked["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
-                self.say(encoded(asked))
+                self.send(encoded(asked))
                 return await answer
         except TimeoutError:
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
@@ -377,7 +377,7 @@ class RosbridgeNode(NamedNode):
         if answer is not None and not answer.done():
             answer.set_result(operation)
 
-    def heard(self, operation: dict[str, Any]) -> None:
+    def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation of the bridge."""
         hear = self._hears.get(operation["op"])
         if hear is None:
@@ -385,7 +385,7 @@ class RosbridgeNode(NamedNode):
         else:
             hear(operation)
 
-    async def lost(self, was: bool) -> None:
+    async def on_lost(self, was: bool) -> None:
         """End calls and tasks for a lost bridge."""
         if self._running is not None and was:
             self._tell_change()
@@ -409,7 +409,7 @@ class RosbridgeNode(NamedNode):
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
-            self.say(encoded(refusal))
+            self.send(encoded(refusal))
         elif service.ready:  # otherwise the bridge aborts the call
             service.call(identity, operation.get("args"))
 
@@ -418,8 +418,8 @@ class RosbridgeNode(NamedNode):
             if subscription.name == operation.get("topic"):
                 subscription.take(operation.get("msg"))
 
-    def _told(self, operation: dict[str, Any]) -> None:
+    def _log_status(self, operation: dict[str, Any]) -> None:
         level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)
         about = f" ({operation['id']})" if operation.get("id") else ""
-        said = operation.get("msg")
-        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, said)
+        text = operation.get("msg")
+        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, text)

@@ -102,20 +102,20 @@ class RosbridgeService:
         if left > 0:
             await asyncio.sleep(left)
 
-    def call(self, identity: object, said: object) -> None:
+    def call(self, identity: object, arguments: object) -> None:
         """Carry out a call, which is cancelled if the bridge is lost."""
         self.calls += 1
         busy = len(self._tasks) >= MAX_CONCURRENT_CALLS
-        task = self._node.begin(self._carry_out(identity, said, busy=busy))
+        task = self._node.begin(self._carry_out(identity, arguments, busy=busy))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     # ------------------------------------------------------------------ inside
 
-    async def _carry_out(self, identity: object, said: object, *, busy: bool) -> None:
+    async def _carry_out(self, identity: object, arguments: object, *, busy: bool) -> None:
         turn = self._turn
         try:
-            parts = await self._response(identity, said, busy=busy)
+            parts = await self._response(identity, arguments, busy=busy)
         except SmartCamError as exc:
             self._refuse(turn, identity, str(exc))
         except TimeoutError:
@@ -130,10 +130,12 @@ class RosbridgeService:
         else:
             self._respond(turn, parts)
 
-    async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
+    async def _response(
+        self, identity: object, arguments: object, *, busy: bool
+    ) -> tuple[Part, ...]:
         if busy:
             raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most")
-        request = from_json(self.type.request, {} if said is None else said)
+        request = from_json(self.type.request, {} if arguments is None else arguments)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)
         return self._encoded(identity, to_json(self.type.response, response), result=True)
@@ -152,20 +154,20 @@ class RosbridgeService:
             self._node.renew(self)
 
     def _encoded(self, identity: object, values: object, *, result: bool) -> tuple[Part, ...]:
-        said = {"op": "service_response", "service": self.name, "result": result}
+        operation = {"op": "service_response", "service": self.name, "result": result}
         if identity is not None:
-            said["id"] = identity
+            operation["id"] = identity
         if values is not None:
-            said["values"] = values
-        return encoded(said)
+            operation["values"] = values
+        return encoded(operation)
 
     def _respond(self, turn: int, parts: tuple[Part, ...]) -> None:
         if turn == self._turn:
             self._responded = asyncio.get_running_loop().time()
-            self._node.say(parts)
+            self._node.send(parts)
 
     def _send(self, operation: dict[str, Any]) -> None:
-        self._node.say(encoded({**operation, "service": self.name}))
+        self._node.send(encoded({**operation, "service": self.name}))
 
 
 def error_field(kind: MessageType) -> str:

@@ -15,7 +15,7 @@ SERVICE: Final = "/rosapi/subscribers"
 """Service of the node ``rosapi``, which rosbridge's launch file starts beside the bridge."""
 PERIOD = 2.0
 """Seconds between two calls of rosapi."""
-LONG: Final = frozenset(
+LARGE_TYPES: Final = frozenset(
     {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"}
 )
 """Types of messages that are long enough for a call of rosapi."""
@@ -28,7 +28,7 @@ async def listen_for_subscribers(
     for publisher in publishers.values():
         publisher.subscribed = True
     while True:
-        for publisher in [one for one in publishers.values() if one.type.name in LONG]:
+        for publisher in [one for one in publishers.values() if one.type.name in LARGE_TYPES]:
             answer = await node.ask(SERVICE, {"topic": publisher.name})
             values = answer.get("values") if answer else None
             found = values.get("subscribers") if isinstance(values, dict) else None

@@ -46,16 +46,16 @@ class RosbridgeSubscription(TopicReader[object]):
     def ask(self) -> None:
         """Subscribe at the bridge."""
         operation = {"op": "subscribe", "topic": self.name, "type": ros1_name(self.type.name)}
-        self._node.say(encoded({**operation, "id": self._id, "queue_length": self._depth}))
+        self._node.send(encoded({**operation, "id": self._id, "queue_length": self._depth}))
 
     def leave(self) -> None:
         """Unsubscribe at the bridge."""
         operation = {"op": "unsubscribe", "topic": self.name, "id": self._id}
-        self._node.say(encoded(operation))
+        self._node.send(encoded(operation))
 
-    def take(self, said: object) -> None:
+    def take(self, message: object) -> None:
         """Handle a message from the bridge."""
-        self._queue.offer(said, 0.0, 0)
+        self._queue.offer(message, 0.0, 0)
 
     @property
     def _id(self) -> str:

@@ -235,7 +235,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.inject, *faults)
 
     def clear_faults(self) -> None:
-        """Forget the faults that wait, and end those that last."""
+        """Remove the faults that wait, and end those that go on."""
         self._thread.run(self._emulator.clear_faults)
 
     def command(self, name: str) -> None:
@@ -264,7 +264,7 @@ class ThreadedCamera(_InLoop):
     def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
     ) -> None:
-        """Wait until clients have sent that many messages of a kind; the device has handled them.
+        """Wait until the device has handled ``count`` messages of a kind from clients.
 
         In a coroutine use :meth:`received`, since this method blocks the calling event loop.
 

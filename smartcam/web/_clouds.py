@@ -38,7 +38,7 @@ PROTOCOL: Final = "smartcam.cloud"
 PART_BYTES: Final = 1 << 16
 """Bytes of a message that are written at a time."""
 
-SLOW: Final = 60.0
+SHOW_TIMEOUT: Final = 60.0
 """Seconds within which a page must have received and shown a cloud."""
 
 Up: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -52,7 +52,7 @@ class _Packed(NamedTuple):
 
 
 class CloudSite(ThreadedSite):
-    """A page that shows a cloud, to be turned, and HTTP calls.
+    """A page that shows a cloud that the viewer can turn, and HTTP calls.
 
     ::
 
@@ -128,7 +128,7 @@ class CloudSite(ThreadedSite):
         if self._packing is None or self._packing[0] != self._number:
             loop = asyncio.get_running_loop()
             made = loop.run_in_executor(self._threads, packed, self._cloud)
-            made.add_done_callback(_seen)
+            made.add_done_callback(_mark_handled)
             self._packing = (self._number, made)
         found, job = self._packing
         return found, await asyncio.shield(job)
@@ -144,9 +144,9 @@ class CloudSite(ThreadedSite):
         }
 
 
-def _seen(made: asyncio.Future[_Packed]) -> None:
+def _mark_handled(made: asyncio.Future[_Packed]) -> None:
     if not made.cancelled():
-        made.exception()  # marks the error as handled if all callers are gone
+        made.exception()  # the callers may be gone
 
 
 def packed(cloud: Cloud) -> _Packed:
@@ -184,14 +184,14 @@ def _packed(cloud: Cloud) -> _Packed:
 
 
 def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
-    """Return a cloud of at most so many points, and the voxels' size in metres if thinned."""
+    """Return a cloud of at most ``most`` points, and the voxels' size in metres if thinned."""
     if len(cloud) <= most:
         return cloud, None
     reach = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
     # not below the precision of float32 at this distance from the origin
     size = max(reach / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
     while len(thin := voxel_grid(cloud, size)) > most:
-        size *= max(1.05, (len(thin) / most) ** 0.5)  # surfaces have as many as 1 / size**2
+        size *= max(1.05, (len(thin) / most) ** 0.5)  # a surface has about 1 / size**2 voxels
     return thin, size
 
 
@@ -199,8 +199,8 @@ class CloudViewer(PageSocket):
     """The WebSocket of a page that shows the cloud."""
 
     def __init__(self, site: CloudSite, request: web.Request) -> None:
-        # a page that vanished while nothing was sent gives its place back
-        super().__init__(request, PROTOCOL, "cloud", heartbeat=SLOW)
+        # the heartbeat frees the place of a page that vanished
+        super().__init__(request, PROTOCOL, "cloud", heartbeat=SHOW_TIMEOUT)
         self._site = site
 
     async def serve(self) -> web.WebSocketResponse:
@@ -217,7 +217,7 @@ class CloudViewer(PageSocket):
         while True:
             number, cloud = await self._site.newer(number)
             self._shown.clear()
-            async with asyncio.timeout(SLOW):
+            async with asyncio.timeout(SHOW_TIMEOUT):
                 await self._socket.send_str(json.dumps({"number": number, **cloud.about}))
                 for start in range(0, len(cloud.body), PART_BYTES):
                     await self._socket.send_bytes(cloud.body[start : start + PART_BYTES])

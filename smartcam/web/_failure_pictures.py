@@ -18,8 +18,8 @@ PERIOD: Final = 0.2
 CAMERA_PERIOD: Final = 10.0
 """Seconds that must pass between two pictures of one camera."""
 
-SETTLING: Final = 0.2
-"""Seconds to wait for a newer result that the camera had when it sent the picture."""
+NEWER_RESULT_TIMEOUT: Final = 0.2
+"""Seconds after a picture within which a newer result may still arrive, if the camera had one."""
 
 MAX_BYTES: Final = 1 << 28
 """Largest number of bytes that the pictures of all cameras may have together."""
@@ -64,7 +64,7 @@ class FailurePictures:
             data = await camera.read_image()
         except SmartCamError:
             return  # the live page shows the camera's error
-        await asyncio.sleep(SETTLING)
+        await asyncio.sleep(NEWER_RESULT_TIMEOUT)
         if row.failure != serial:
             return
         row.history.attach(serial, data)

@@ -13,7 +13,7 @@ from smartcam.web._errors import RefusedError
 
 if TYPE_CHECKING:
     from smartcam.fleet import Fleet
-    from smartcam.fleet._inside import ToldOutlet, ToldStore
+    from smartcam.fleet._inside import ReportedOutlet, ReportedStore
 
 ANSWER_AGE: Final = 2.0
 """Seconds for which one answer is used for all pages."""
@@ -42,12 +42,12 @@ class OutletsView:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._accounts: list[ToldOutlet] = []
+        self._accounts: list[ReportedOutlet] = []
         self._at = -ANSWER_AGE
         self._turn = asyncio.Lock()
         self._stores = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
-    async def accounts(self) -> list[ToldOutlet]:
+    async def accounts(self) -> list[ReportedOutlet]:
         """Return the accounts of all outlets, at most :data:`ANSWER_AGE` seconds old.
 
         Raises:
@@ -63,7 +63,7 @@ class OutletsView:
                 self._at = loop.time()
             return self._accounts
 
-    async def stored(self, wanted: StoredRows) -> list[ToldStore]:
+    async def stored(self, wanted: StoredRows) -> list[ReportedStore]:
         """Return the answers of the stores.
 
         Raises:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from smartcam.web._fleet_view import PERIOD, Filter, RowQuery, Sort
 from smartcam.web._sockets import PageSocket
-from smartcam.web._streams import SLOW
+from smartcam.web._streams import SHOW_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,7 +73,9 @@ class FleetSocket(PageSocket):
     """
 
     def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
-        super().__init__(request, PROTOCOL, "row", heartbeat=SLOW, longest=MAX_MESSAGE_BYTES)
+        super().__init__(
+            request, PROTOCOL, "row", heartbeat=SHOW_TIMEOUT, longest=MAX_MESSAGE_BYTES
+        )
         self._view = view
         self._about = about
         self._sight = RowsInSight()
@@ -112,7 +114,7 @@ class FleetSocket(PageSocket):
 
     async def _send(self, text: str) -> None:
         self._shown.clear()
-        async with asyncio.timeout(SLOW):
+        async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_str(text)
             await self._shown.wait()
 

@@ -26,7 +26,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.web._sockets import PageSocket, check_websocket
-from smartcam.web._streams import SLOW
+from smartcam.web._streams import SHOW_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -57,7 +57,7 @@ ACCOUNT_PERIOD: Final = 1.0
 THREADS: Final = 2
 """Threads that make JPEGs; more threads would wait for the processor."""
 
-AGAIN: Final = Backoff(initial=0.5, maximum=5.0)
+REOPEN_BACKOFF: Final = Backoff(initial=0.5, maximum=5.0)
 """Delays before a source that ended with an error is read again."""
 
 
@@ -250,7 +250,7 @@ class Viewer(PageSocket):
 
         A lost source stays lost for the page until a picture of it comes.
         """
-        delays, lost = AGAIN.delays(), False
+        delays, lost = REOPEN_BACKOFF.delays(), False
         while True:
             before = self._sent
             try:
@@ -270,7 +270,7 @@ class Viewer(PageSocket):
                 await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
                 await asyncio.Event().wait()  # a second message would make the page play it again
             if self._sent > before:
-                delays = AGAIN.delays()
+                delays = REOPEN_BACKOFF.delays()
             await asyncio.sleep(next(delays))
 
     async def _show_frames(self, reader: FrameReader) -> None:
@@ -298,13 +298,13 @@ class Viewer(PageSocket):
         """Send a picture after its JSON, and wait until it is shown; TimeoutError: too late."""
         head = json.dumps({"frame": frame, "account": account}).encode()
         self._shown.clear()
-        async with asyncio.timeout(SLOW):
+        async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_bytes(len(head).to_bytes(4, "little") + head + picture)
             self._sent += 1
             await self._shown.wait()
 
     async def _send(self, value: dict[str, Any]) -> None:
-        async with asyncio.timeout(SLOW):
+        async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_str(json.dumps(value))
 
 

@@ -33,14 +33,14 @@ MAX_VALUES_BYTES = 2048
 """Largest number of bytes of a result that a list of log entries shows decoded; a single entry has
 no bound."""
 
-MAX_TOLD_BYTES = 1 << 18
+MAX_REPLY_BYTES = 1 << 18
 """Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
 faults: the list ends there, so an answer stays a few megabytes of JSON."""
 
 MAX_LISTED = 1000
 """Largest number of faults that a list shows."""
 
-LOOKING = {"tangram": False, "tangram_pixels": True}
+TABLE_GENERATORS = {"tangram": False, "tangram_pixels": True}
 """Generators that use the table, and whether they report pixels."""
 
 
@@ -120,14 +120,14 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 
 
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
-    """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_TOLD_BYTES.
+    """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_REPLY_BYTES.
 
     ``next`` is the serial to go on with, ``missed`` the number of dropped entries.
     """
     entries, count = emulator.log.since(since, limit)
     first = min(max(since, count - len(emulator.log)), count)
     listed: list[dict[str, Any]] = []
-    room = MAX_TOLD_BYTES
+    room = MAX_REPLY_BYTES
     for serial, entry in enumerate(entries, first):
         listed.append(camera_entry(serial, entry, emulator))
         room -= min(listed[-1]["size"], MAX_VALUES_BYTES)
@@ -169,7 +169,7 @@ def camera_entry(
 
 
 def _search(data: str) -> str | None:
-    """Return the dialect of a greeting by a client that searches for the camera's, or None."""
+    """Return the dialect that a client tries, by the first bytes it sends; None: no dialect."""
     return next((name for hello, name in _greetings() if data.startswith(hello)), None)
 
 
@@ -229,15 +229,15 @@ def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any
     waiting, fired = emulator.faults, list(emulator.fired)
     last = (one.fault for one in reversed(fired))
     return {
-        "waiting": [_fault(one) for one in waiting[: _as_many(waiting, limit)]],
+        "waiting": [_fault(one) for one in waiting[: _shown_count(waiting, limit)]],
         "waiting_count": len(waiting),
-        "fired": [_fired(one) for one in fired[len(fired) - _as_many(last, limit) :]],
+        "fired": [_fired(one) for one in fired[len(fired) - _shown_count(last, limit) :]],
     }
 
 
-def _as_many(faults: Iterable[BaseFault], limit: int) -> int:
-    """Return the number of faults shown: ``limit``, or MAX_TOLD_BYTES of inserted data."""
-    count, room = 0, MAX_TOLD_BYTES
+def _shown_count(faults: Iterable[BaseFault], limit: int) -> int:
+    """Return the number of faults shown: ``limit``, or MAX_REPLY_BYTES of inserted data."""
+    count, room = 0, MAX_REPLY_BYTES
     for fault in faults:
         room -= len(getattr(fault, "data", None) or b"")
         if count == limit or room < 0:
@@ -325,7 +325,9 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
     if last is None or application is None or layout is None or not _looks(application):
         return None
     records = layout.parse_records(last.result.data, last.byte_order)
-    found = [_pose(one, scene, pixels=LOOKING[str(application.generator)]) for one in records]
+    found = [
+        _pose(one, scene, pixels=TABLE_GENERATORS[str(application.generator)]) for one in records
+    ]
     parts = [one for one in found if one is not None]
     return {"application": application.id, "time": round(last.time, 6), "parts": parts}
 
@@ -334,7 +336,7 @@ def _looks(application: Application) -> bool:
     """Return True if an application sees the table and reports the places of the parts."""
     layout = application.result_layout
     fields = set[str]() if layout is None else {field.name for field in layout.fields}
-    return str(application.generator) in LOOKING and {"x", "y", "theta"} <= fields
+    return str(application.generator) in TABLE_GENERATORS and {"x", "y", "theta"} <= fields
 
 
 def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | None:

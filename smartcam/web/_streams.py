@@ -29,7 +29,7 @@ MAX_STREAMS = 16
 PERIOD = 0.1
 """Seconds between two looks for news."""
 
-SLOW = 10.0
+SHOW_TIMEOUT = 10.0
 """Seconds that a reader has to accept written events; then its stream ends."""
 
 
@@ -111,7 +111,7 @@ def is_open(request: web.Request) -> bool:
 
 async def _write(response: web.StreamResponse, text: str | None) -> None:
     """Write some text, or the end for None."""
-    async with asyncio.timeout(SLOW):
+    async with asyncio.timeout(SHOW_TIMEOUT):
         if text is None:
             await response.write_eof()
         elif text:

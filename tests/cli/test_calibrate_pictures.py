@@ -145,10 +145,12 @@ def test_calibrate_by_a_folder_if_nothing_comes_keeps_the_step(
     assert [line.get("step") for line in done.lines[-3:]] == ["picture", "picture", None]
     assert "within 0.3 s" in done.lines[-2]["errors"]["base"]
     asked = done.lines[2]
-    assert f"the next file that comes into {tmp_path / 'ftp'} counts" in asked["description"]
+    assert (
+        f"the first file written to {tmp_path / 'ftp'} from now on counts" in asked["description"]
+    )
     assert asked["notes"] == ["picture 1 of 1; to end without it, abort"]
-    assert asked["waiting"].startswith("Waiting: the next file that comes into ")
-    assert "earlier files do not count. It is waited for 0.3 s" in asked["waiting"]
+    assert asked["waiting"].startswith("Waiting: the first file written to ")
+    assert "The step waits 0.3 s for it" in asked["waiting"]
 
 
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(

@@ -12,7 +12,7 @@ import pytest
 from smartcam._cli import demo_tower
 from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
 from smartcam.depth import ColourRange
-from smartcam.depth._inside import BLOCK, TowerTable, WoodenBlock, laid, to_robot
+from smartcam.depth._inside import BLOCK, TowerTable, WoodenBlock, random_table, to_robot
 from smartcam.exceptions import FrameFormatError
 from tests.cli.commandline import run
 from tests.cli.inside import Options
@@ -33,7 +33,7 @@ async def built(capsys: pytest.CaptureFixture[str], seed: int, **other: Any) -> 
 
 
 async def test_block_is_found_picked_and_put_on_top(capsys: pytest.CaptureFixture[str]) -> None:
-    table = laid(3, 2)
+    table = random_table(3, 2)
     told = await built(capsys, 3, table=table, layers=1)
     (rows,) = (line["compared"] for line in told if "compared" in line)
     assert [row["what"] for row in rows] == ["block", "tower's top"]
@@ -75,19 +75,19 @@ async def test_wrong_colour_finds_no_block_and_says_what_there_is(
 
 
 async def test_missing_block_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    table = laid(2, 1)
+    table = random_table(2, 1)
     table.blocks = [one for one in table.blocks if one.colour != "black" or one.size != BLOCK]
     with pytest.raises(FrameFormatError, match=r"got [12] regions of it") as caught:
         await tower(Options(as_json=True), 2, table=table)  # a square and a stick are black, too
     assert caught.value.source == demo_tower.ARM
-    too_far = laid(2, 0)
+    too_far = random_table(2, 0)
     with pytest.raises(FrameFormatError, match=r"within 0.15 to 0.5 m .* got 1 that are not"):
         await tower(Options(as_json=True), 2, table=too_far)
     assert [line for line in lines(capsys) if "compared" in line] == []
 
 
 async def test_missing_tower_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    table = laid(2, 1)
+    table = random_table(2, 1)
     table.remove()
     with pytest.raises(FrameFormatError, match="expected a tower, got nothing that is higher"):
         await tower(Options(as_json=True), 2, table=table)

@@ -54,7 +54,7 @@ async def say(camera: Camera, box: HandmadeCamera, *frames: bytes, together: boo
 
 async def behind_its_answers(camera: Camera) -> None:
     """Wait until the Queries that went out with a trigger are answered."""
-    await until(lambda: not inside(camera)._waits.owes(m.QueryAnswer))
+    await until(lambda: not inside(camera)._waits.is_pending(m.QueryAnswer))
 
 
 def bursts(camera: Camera) -> list[int]:

@@ -443,7 +443,7 @@ def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> No
     line.give_up("streamed")
     line.answer()
     line.answer()
-    line.at.heard()
+    line.at.note_query_answered()
     assert not line.at.doubted
     assert [one.fate for one in line.at.owed] == ["late"]
     line.hear(WORKING)
@@ -458,7 +458,7 @@ def test_debt_stays_where_not_every_status_is_told(kind: str) -> None:
         line.hear(READY)
         line.trigger_answer()
     line.give_up()
-    line.at.heard()
+    line.at.note_query_answered()
     assert not line.at.doubted
     assert line.result() == LATE
 

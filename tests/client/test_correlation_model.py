@@ -240,7 +240,7 @@ class CameraAndClient(RuleBasedStateMachine):
         kind = data.draw(st.sampled_from(self.kinds), "kind")
         if at.doubted:
             self.round_trip(data)
-            at.heard()
+            at.note_query_answered()
         if at.debt is not None and kind != "number":
             self.settle(data)
         self.go_on(data, lambda: not self.owes)
@@ -636,7 +636,7 @@ class CameraAndClientThatAnswers(CameraAndClient):
         at = self.line.at
         self.wake()
         self.refresh(data)
-        at.heard()
+        at.note_query_answered()
         if at.debt is not None:
             self.go_on(data, lambda: self.asks_until_ready())
             self.round_trip(data)

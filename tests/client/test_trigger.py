@@ -734,7 +734,7 @@ async def test_result_that_comes_while_its_caller_is_being_cancelled_is_late() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], box.takes
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
-        await until(lambda: not inside(camera)._waits.owes(m.QueryAnswer))
+        await until(lambda: not inside(camera)._waits.is_pending(m.QueryAnswer))
         triggering.cancel()
         inside(camera)._dispatch.dispatch(
             Chunk(0.0, [m.ResultContainer(application=7, data=b"late")])
@@ -754,7 +754,7 @@ async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
-        await until(lambda: not inside(camera)._waits.owes(m.QueryAnswer))
+        await until(lambda: not inside(camera)._waits.is_pending(m.QueryAnswer))
         inside(camera)._dispatch.dispatch(
             Chunk(0.0, [BEGUN, m.ResultContainer(application=7, data=b"ours")])
         )

@@ -108,14 +108,14 @@ async def test_say(ends: Ends) -> None:
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.subscribe(pattern, seen)
     mark = KEYS.ask(role, MARK, MARK)
-    for key in keys_of("say"):
+    for key in keys_of("put"):
         end.put(key, b"")
     end.put("smartcam/plant/*/x/line1/cam3", b"")  # a pattern means commands, too
     end.put("smartcam/**", b"")
     end.put(mark, b"")
     came = await seen.mark(mark)
     patterns = {key for key in came if "*" in key}
-    assert came - patterns == expected(role, "say")
+    assert came - patterns == expected(role, "put")
     assert bool(patterns) == (role == "router")
 
 
@@ -123,15 +123,17 @@ async def test_hear(ends: Ends) -> None:
     role, end, guard = ends
     seen = Seen()
     mark = KEYS.states(MARK)
-    for key in [*keys_of("hear"), mark]:
+    for key in [*keys_of("subscribe"), mark]:
         end.subscribe(key, seen)
     everything = Seen()
     end.subscribe("smartcam/**", everything)
     await known(end, guard, role)
-    for key in [*keys_of("hear"), mark]:
+    for key in [*keys_of("subscribe"), mark]:
         guard.put(key, b"")
-    assert await seen.mark(mark) == expected(role, "hear")
-    assert {*everything.keys} - {mark} <= expected(role, "hear")  # a wide pattern brings no more
+    assert await seen.mark(mark) == expected(role, "subscribe")
+    assert {*everything.keys} - {mark} <= expected(
+        role, "subscribe"
+    )  # a wide pattern brings no more
 
 
 async def test_ask(ends: Ends) -> None:
@@ -146,11 +148,11 @@ async def test_ask(ends: Ends) -> None:
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.answer(pattern, answer)
     mark = KEYS.listing(MARK)
-    asking = {key: asyncio.ensure_future(end.ask(key, b"", PATIENCE)) for key in keys_of("ask")}
+    asking = {key: asyncio.ensure_future(end.ask(key, b"", PATIENCE)) for key in keys_of("query")}
     await asyncio.sleep(0)  # they ask
     assert await end.ask(mark, b"", PATIENCE) == [(mark, b"yes")]
-    assert await seen.mark(mark) == expected(role, "ask")
-    for key in expected(role, "ask"):
+    assert await seen.mark(mark) == expected(role, "query")
+    for key in expected(role, "query"):
         assert await asking[key] == [(key, b"yes")]
     for one in asking.values():
         one.cancel()
@@ -180,10 +182,10 @@ async def test_appear(ends: Ends) -> None:
     seen = Seen()
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.watch(pattern, seen)
-    for key in keys_of("appear"):
+    for key in keys_of("present"):
         end.be_present(key)
     end.be_present(KEYS.program(f"{role}-{MARK}"))
-    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "appear")
+    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "present")
 
 
 async def test_watch(ends: Ends) -> None:
@@ -244,19 +246,19 @@ def test_each_call(role: str, do: str) -> None:
     key = KEYS.command("line1", "line1/cam3")
     if do not in COMMANDS:
         key = KEYS.ask(role, "line1", "line1/cam3")
-    assert allowed(role, "say", key) == (do in QUESTIONS or role == "operator")
+    assert allowed(role, "put", key) == (do in QUESTIONS or role == "operator")
     assert may_command(role) == (role == "operator")
 
 
 @pytest.mark.parametrize("role", ROLES[:3])
 def test_each_service(role: str) -> None:
     for name in SERVICES:
-        may = allowed(role, "ask", KEYS.service("line1/cam3", name))
+        may = allowed(role, "query", KEYS.service("line1/cam3", name))
         assert may == (name in LOOKING or role == "operator"), name
     for name in THESIS:
-        assert allowed(role, "ask", KEYS.thesis(name)) == (role == "operator")
+        assert allowed(role, "query", KEYS.thesis(name)) == (role == "operator")
     camera_named_so = KEYS.service("line1/status", "trigger")
-    assert allowed(role, "ask", camera_named_so) == (role == "operator")
+    assert allowed(role, "query", camera_named_so) == (role == "operator")
 
 
 async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Path) -> None:
@@ -277,7 +279,7 @@ async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Pat
         seen, heard = Seen(), Seen()
         guard.subscribe("**", heard)
         end.watch("**", seen)
-        for key in keys_of("say"):
+        for key in keys_of("put"):
             end.put(key, b"")
         asked = asyncio.ensure_future(end.present(KEYS.agent("*"), PATIENCE))
         assert await viewer.present(KEYS.agent("*"), PATIENCE) == [KEYS.agent("line1")]
@@ -353,12 +355,12 @@ async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends:
     await asyncio.sleep(0)
     await known(end, guard, role)
     end.put(mark, b"")
-    assert await said.mark(mark) <= {one for one in WIDE if covered(role, "say", one)}
+    assert await said.mark(mark) <= {one for one in WIDE if covered(role, "put", one)}
     assert await end.ask(KEYS.listing(MARK), b"", PATIENCE) == []  # which came behind
-    allowed_to_ask = {one for one in WIDE if covered(role, "ask", one)} | {KEYS.listing(MARK)}
+    allowed_to_ask = {one for one in WIDE if covered(role, "query", one)} | {KEYS.listing(MARK)}
     assert {*asked.keys} <= allowed_to_ask
     own = {KEYS.program(f"{role}-{MARK}")}
-    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "appear", one)}
+    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "present", one)}
     for key in (KEYS.service("line1/cam3", "trigger"), KEYS.summary("line1"), KEYS.reload("x")):
         forged = [(key, b"forged")] if allowed(role, "answer", key) else []
         assert await guard.ask(key, b"", 1.0) in ([], forged)

@@ -9,7 +9,12 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.fleet._frames.pace import MAX_WAIT_SHARE, MIN_WAIT_SECONDS, PATIENCE, FramePace
+from smartcam.fleet._frames.pace import (
+    MAX_WAIT_PERIODS,
+    MAX_WAIT_SHARE,
+    MIN_WAIT_SECONDS,
+    FramePace,
+)
 from smartcam.frames import FrameSource
 from tests.frames.drivers import ScriptedDriver, frame
 
@@ -65,7 +70,7 @@ def test_last_frame_of_a_source_that_stops_gets_there(
 ) -> None:
     came, at = follow(period, way, stops=stops, frames=10**6)[-1]
     assert came == stops * period
-    assert at - came <= max(way, PATIENCE * period) + 1e-6
+    assert at - came <= max(way, MAX_WAIT_PERIODS * period) + 1e-6
 
 
 @given(rest=st.floats(0.04, 1.0))

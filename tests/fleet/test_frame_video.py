@@ -175,7 +175,7 @@ async def test_one_frame_is_no_video() -> None:
         for call in (camera.newest_frame(encoding=wrong), camera.frame_after(encoding=wrong)):
             error = await gone(call)
             assert isinstance(error, ConfigurationError)
-            assert "no frame of it is a picture by itself" in str(error)
+            assert "its frames depend on each other" in str(error)
         # and not at the agent either, whoever asks
         error = await gone(camera.frame_caller._caller.call("frame", 60.0, {"encoding": "h264"}))
         assert isinstance(error, ConfigurationError)

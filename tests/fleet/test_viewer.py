@@ -52,19 +52,19 @@ VIEWER_DOES: dict[str, set[str]] = {
     "command": set(),
     "ask": set(),
     "reload": set(),
-    "reply": {"hear"},
-    "frames": {"hear"},
-    "states": {"hear"},
-    "results": {"hear"},
-    "bundle": {"hear"},
-    "summary": {"ask"},
-    "outlets": {"ask"},
-    "listing": {"ask"},
-    "topic": {"hear"},
+    "reply": {"subscribe"},
+    "frames": {"subscribe"},
+    "states": {"subscribe"},
+    "results": {"subscribe"},
+    "bundle": {"subscribe"},
+    "summary": {"query"},
+    "outlets": {"query"},
+    "listing": {"query"},
+    "topic": {"subscribe"},
     "service": set(),
     "start": set(),
     "thesis": set(),
-    "thesis_topic": {"hear"},
+    "thesis_topic": {"subscribe"},
 }
 """Rights of a viewer to each key of the bus as it is for an operator. Nothing that is said or
 answered there, nobody's presence: those have keys of a viewer's own."""
@@ -102,7 +102,7 @@ def test_viewer_may_do_nothing_at_a_key_of_an_operator_but_hear_and_look() -> No
     assert found == VIEWER_DOES
 
 
-@pytest.mark.parametrize("does", ["say", "answer", "appear"])
+@pytest.mark.parametrize("does", ["put", "answer", "present"])
 def test_roles_share_no_key_under_which_anything_is_said_or_present(does: str) -> None:
     """Whoever could say it could say it in the place of another role's program."""
     of = [
@@ -122,7 +122,7 @@ def test_viewer_asks_agents_only_what_changes_nothing() -> None:
     may = [
         one
         for right in RIGHTS
-        if right.does == "ask" and "viewer" in right.roles
+        if right.does == "query" and "viewer" in right.roles
         for one in right.keys
     ]
     asked = {ANY.summary("*"), ANY.listing("**"), ANY.outlets("*", "*")}

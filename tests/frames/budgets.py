@@ -35,10 +35,10 @@ from tests.frames.inside import (
     options_of,
     parse_rtcp,
     picture_size,
+    requested_transport,
     target_of,
     units,
     url_of,
-    wish_of,
 )
 from tests.frames.inside import MAX_PIXEL_BYTES as MAX_BITMAP
 from tests.frames.inside import _parts as digest_parts
@@ -60,7 +60,7 @@ def _rtsp(pieces: list[bytes]) -> None:
             if isinstance(request, RtspRequest):
                 try:
                     target_of(request.url)
-                    wish_of(request.headers.get("transport", ""), "10.0.0.1")
+                    requested_transport(request.headers.get("transport", ""), "10.0.0.1")
                     digest_parts(request.headers.get("authorization", ""))
                 except RtspError:
                     pass

@@ -48,7 +48,12 @@ from smartcam.frames._streaming.rtp.parameters import size_in as parameters_size
 from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY, RtpStatistics
 from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970, ntp_time
 from smartcam.frames._streaming.rtsp import delivery, messages
-from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
+from smartcam.frames._streaming.rtsp.addresses import (
+    RequestedTransport,
+    RtspTarget,
+    requested_transport,
+    target_of,
+)
 from smartcam.frames._streaming.rtsp.authentication import (
     MAX_WRONG_ANSWERS,
     Authentication,

@@ -160,9 +160,9 @@ def test_planes_of_y_u_and_v(name: str, bits: int, to: str) -> None:
     ("name", "to"), [("nv12", "NV12"), ("nv21", "I420"), ("nv16", "I422"), ("nv24", "I444")]
 )
 def test_woven_planes(name: str, to: str) -> None:
-    video, (y, woven) = filled(name)
+    video, (y, interleaved) = filled(name)
     found, (first, u, v) = planes_of(video)
-    pairs = woven[:, : 2 * u.shape[1]].reshape(u.shape[0], -1, 2)
+    pairs = interleaved[:, : 2 * u.shape[1]].reshape(u.shape[0], -1, 2)
     assert found.name == to
     assert np.array_equal(first, y[:, :WIDTH])
     for one, place in ((u, 0), (v, 1)):
@@ -170,14 +170,14 @@ def test_woven_planes(name: str, to: str) -> None:
 
 
 def test_woven_planes_of_ten_bits_in_the_high_bits() -> None:
-    video, (y, woven) = filled("p010le", 16)
-    y, woven = y & 0xFFC0, woven & 0xFFC0
-    for plane, samples in zip(video.planes, (y, woven), strict=True):
+    video, (y, interleaved) = filled("p010le", 16)
+    y, interleaved = y & 0xFFC0, interleaved & 0xFFC0
+    for plane, samples in zip(video.planes, (y, interleaved), strict=True):
         plane.update(samples.tobytes())
     found, (first, u, _) = planes_of(video)
     assert found.name == "I420_10"
     assert np.array_equal(first, y[:, :WIDTH] >> 6)
-    assert np.array_equal(u, woven[:, : 2 * u.shape[1] : 2] >> 6)
+    assert np.array_equal(u, interleaved[:, : 2 * u.shape[1] : 2] >> 6)
 
 
 @pytest.mark.parametrize(

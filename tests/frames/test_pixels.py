@@ -307,8 +307,8 @@ def test_colours_of_known_values_are_those_of_the_formulas(name: str) -> None:
             samples = ([u, y, v, y] if first else [y, u, y, v]) * 2
         else:
             shared = (found.size(2, 2) // (1 if found.depth == 8 else 2) - 4) // 2
-            woven = name.startswith("NV")
-            samples = [y] * 4 + ([u, v] * shared if woven else [u] * shared + [v] * shared)
+            interleaved = name.startswith("NV")
+            samples = [y] * 4 + ([u, v] * shared if interleaved else [u] * shared + [v] * shared)
         data = np.array(samples, kind).tobytes()
         got = found.rgb(data, 2, 2, found.stride(2)).astype(float)
         wanted = np.broadcast_to(expected_rgb(y, u, v, name, found.depth), (2, 2, 3))

@@ -146,7 +146,7 @@ async def test_a_killed_agent_ends_triggers_and_frames_and_is_found_again(tmp_pa
         frame = await camera.newest_frame(max_age=math.inf, timeout=PATIENCE)
         assert (frame.width, frame.height) == (320, 240)
         again.send_signal(signal.SIGSTOP)
-        with pytest.raises(TriggerTimeoutError, match=r"the agent .* said nothing within"):
+        with pytest.raises(TriggerTimeoutError, match=r"the agent .* did not answer within"):
             await camera.trigger(timeout=0.5)
         again.send_signal(signal.SIGCONT)
         async with asyncio.timeout(PATIENCE):

@@ -152,7 +152,7 @@ STRETCHED = NO_UNIT.replace("viewBox", 'width="10mm" height="20mm" viewBox')
 @pytest.mark.parametrize(
     ("name", "text", "why", "said"),
     [
-        ("a.svg", f"{NO_UNIT}{SQUARE}</svg>", "UNIT", "say no unit"),
+        ("a.svg", f"{NO_UNIT}{SQUARE}</svg>", "UNIT", "have no unit"),
         ("a.svg", f"{STRETCHED}{SQUARE}</svg>", "UNIT", "0.1 and 0.2 mm for a unit"),
         ("a.svg", f"{HEAD}</svg>", "NO_OUTLINE", "no line at all"),
         ("a.svg", f'{HEAD}<path d="M1 1H9V9"/></svg>', "NO_OUTLINE", "meets no other one"),

@@ -70,7 +70,7 @@ async def told_to_end() -> None:
     await reader.readline()
 
 
-class ToldCamera(NumberedCamera):
+class ReportedCamera(NumberedCamera):
     """A camera that says at which host its session is.
 
     Args:
@@ -106,7 +106,7 @@ async def cameras(count: int, host: str = "127.0.0.1") -> None:
     async with contextlib.AsyncExitStack() as stack:
         boxes = [
             await stack.enter_async_context(
-                ToldCamera(number, active=WITH_INPUT, time=0.005, host=host)
+                ReportedCamera(number, active=WITH_INPUT, time=0.005, host=host)
             )
             for number in range(count)
         ]

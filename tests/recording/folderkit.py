@@ -17,12 +17,12 @@ from smartcam.recording import FleetRecorder, Recording, load_recording
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
 from tests.recording.inside import (
     MAX_WAITING_BYTES,
+    ApplicationRuns,
     FileName,
     PictureMatcher,
     RecordedPicture,
+    RecordedRun,
     ReplayedPictures,
-    Take,
-    TakeList,
     files_of,
 )
 from tests.recording.inside import _recorder as recorder
@@ -33,11 +33,11 @@ from tests.recording.inside import writer as folder_writer
 __all__ = [
     "MAX_WAITING_BYTES",
     "NAME",
+    "ApplicationRuns",
     "PictureMatcher",
     "RecordedPicture",
+    "RecordedRun",
     "ReplayedPictures",
-    "Take",
-    "TakeList",
     "all_runs",
     "files",
     "folder_files",

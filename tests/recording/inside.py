@@ -26,4 +26,10 @@ from smartcam.recording._pictures.messages import picture_message
 from smartcam.recording._recorder import MAX_WAITING_BYTES
 from smartcam.recording._replays import schedule
 from smartcam.recording._replays.pictures import ReplayedPictures
-from smartcam.recording._replays.schedule import Change, ReplayPlan, Take, TakeList, plan_replay
+from smartcam.recording._replays.schedule import (
+    ApplicationRuns,
+    Change,
+    RecordedRun,
+    ReplayPlan,
+    plan_replay,
+)

@@ -23,11 +23,11 @@ from tests.frames.drivers import ScriptedDriver, frame
 from tests.recording.folderkit import (
     MAX_WAITING_BYTES,
     NAME,
+    ApplicationRuns,
     PictureMatcher,
     RecordedPicture,
+    RecordedRun,
     ReplayedPictures,
-    Take,
-    TakeList,
     files,
     folder_files,
     folder_pictures,
@@ -260,10 +260,10 @@ async def test_replayed_fleet_shows_the_picture_of_each_result(
     assert shown == found.counts.pictures
 
 
-def _lists(*takes: tuple[bool, bytes]) -> dict[int, TakeList]:
-    made = TakeList(5)
+def _lists(*takes: tuple[bool, bytes]) -> dict[int, ApplicationRuns]:
+    made = ApplicationRuns(5)
     for triggered, data in takes:
-        (made.triggered if triggered else made.unasked).append(Take([data], 0.1))
+        (made.triggered if triggered else made.untriggered).append(RecordedRun([data], 0.1))
     return {5: made}
 
 
@@ -276,7 +276,7 @@ def test_results_that_are_alike_have_pictures_only_in_one_order(tmp_path: Path) 
             recorder.add_picture(shot(number), result=made)
     found = load_recording(path)
 
-    def shown(applications: dict[int, TakeList], *given: bytes) -> list[int | None]:
+    def shown(applications: dict[int, ApplicationRuns], *given: bytes) -> list[int | None]:
         pictures = ReplayedPictures(found, "left", applications, 1.0)
         numbers: list[int | None] = []
         for data in given:

@@ -472,7 +472,7 @@ async def test_pictures_of_several_cameras_have_to_be_chosen_from(tmp_path: Path
     with Recorder(path) as recorder:
         recorder.add_picture(shot(1), camera="a")
         recorder.add_picture(shot(2), camera="b")
-    with pytest.raises(FrameFormatError, match=r"pictures of a, b: say which.*#camera=a") as told:
+    with pytest.raises(FrameFormatError, match=r"pictures of a, b: choose one.*#camera=a") as told:
         await played(str(path))
     assert told.value.available == ("a", "b")
     assert [one.sequence for one in await played(f"{path}#camera=b")] == [2]

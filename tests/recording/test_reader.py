@@ -34,7 +34,7 @@ async def test_load_recording_gives_what_was_recorded(tmp_path: Path) -> None:
 def test_recording_camera_is_named_where_there_are_several(tmp_path: Path) -> None:
     other = frame(0, "> Connect")._replace(camera="right")
     recording = write(tmp_path / "run.mcap", [frame(0, "> Connect"), other])
-    with pytest.raises(ConfigurationError, match="2 cameras are in it, say which one: left, right"):
+    with pytest.raises(ConfigurationError, match="2 cameras are in it, choose one: left, right"):
         recording.camera()
     with pytest.raises(ConfigurationError, match="no camera 'up' is in it; there are: left, right"):
         recording.camera("up")

@@ -22,7 +22,7 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.observers import TraceEntry
-from tests.recording.inside import Change, ReplayPlan, Take, plan_replay
+from tests.recording.inside import Change, RecordedRun, ReplayPlan, plan_replay
 from tests.recording.recordingkit import URL, at, container, frame, session, status, write
 
 WAITS = ("RUNNING", "WAITING_FOR_TRIGGER")
@@ -48,7 +48,7 @@ def plan(
     return plan_replay(write(path / "run.mcap", [*session(URL, *first), *chain(*read)]))
 
 
-def rounded(takes: list[Take]) -> list[tuple[list[bytes], float, float, int]]:
+def rounded(takes: list[RecordedRun]) -> list[tuple[list[bytes], float, float, int]]:
     return [
         (take.containers, round(take.seconds, 6), round(take.gap, 6), take.drops) for take in takes
     ]
@@ -58,7 +58,7 @@ def test_plan_trigger_has_its_container_and_latency(tmp_path: Path) -> None:
     made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1.25 'a', 1.25 WAITS, 2 > Trigger, 2.5 'b'")
     app = made.applications[5]
     assert rounded(app.triggered) == [([b"a"], 0.25, 0, 0), ([b"b"], 0.5, 0, 0)]
-    assert (app.unasked, app.waits) == ([], True)
+    assert (app.untriggered, app.waits) == ([], True)
     assert (made.active, made.running, made.dialect, made.transport) == (5, True, "handbook", "tcp")
     assert round(made.seconds, 6) == 2.5
 
@@ -69,7 +69,7 @@ def test_plan_from_a_time_on_has_what_came_then_also_where_the_clock_was_set_bac
     items = happened("1 'a', 5 'b', 3 'c', 6 'd'")
     recording = write(tmp_path / "run.mcap", [*session(URL, "RUNNING"), *items])
     made = plan_replay(dataclasses.replace(recording, since=at(4)))
-    taken = [take.containers for take in made.applications[5].unasked]
+    taken = [take.containers for take in made.applications[5].untriggered]
     assert taken == [[b"b"], [b"d"]]
 
 
@@ -135,21 +135,21 @@ def test_plan_sensor_result_counts_from_the_one_before(tmp_path: Path) -> None:
     made = plan(tmp_path, "1 RUNNING, 1.25 'a', 1.25 WAITS, 3 'b'")  # no status showed the last
     app = made.applications[5]
     assert (app.triggered, app.waits) == ([], True)
-    assert rounded(app.unasked) == [([b"a"], 0.25, 1, 0), ([b"b"], 0, 1.75, 0)]
+    assert rounded(app.untriggered) == [([b"a"], 0.25, 1, 0), ([b"b"], 0, 1.75, 0)]
 
 
 def test_plan_trigger_dropped_by_a_sensor_leaves_the_container_to_it(tmp_path: Path) -> None:
     made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1 RUNNING OVERTRIGGERED, 1.5 'sensor'")
     app = made.applications[5]
     assert app.triggered == []
-    assert rounded(app.unasked) == [([b"sensor"], 0.5, 1, 0)]
+    assert rounded(app.untriggered) == [([b"sensor"], 0.5, 1, 0)]
 
 
 def test_plan_free_run_counts_from_its_start_and_ignores_triggers(tmp_path: Path) -> None:
     made = plan(tmp_path, "1 > Start, 2 RUNNING, 2 > Trigger, 2.5 'a', 3.5 'b'", first=())
     app = made.applications[5]
     assert (app.triggered, app.waits) == ([], False)
-    assert rounded(app.unasked) == [([b"a"], 0, 0.5, 0), ([b"b"], 0, 1, 0)]
+    assert rounded(app.untriggered) == [([b"a"], 0, 0.5, 0), ([b"b"], 0, 1, 0)]
 
 
 def test_plan_switch_has_its_time_and_each_application_its_list(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_plan_application_id_nobody_can_have_is_refused(tmp_path: Path) -> None:
         ([frame(0, "> Connect")], "there was no session with camera 'left'"),
         (
             [*session(), frame(1, "< ResultContainer", application=5)],
-            "a ResultContainer has not the fields of one: {'application': 5}",
+            "wrong fields of a ResultContainer: {'application': 5}",
         ),
         (
             [Connected(camera="left", at=at(0), url="bvs://h:1?dialect=new")],
@@ -272,8 +272,8 @@ def test_plan_of_a_fleets_camera_has_its_results_whatever_the_agents_clock_says(
     made = plan_replay(write(tmp_path / "run.mcap", items, dialect="b16", endian=1))
     app = made.applications[5]
     assert rounded(app.triggered) == [([b"a", b"b"], 0.5, 0, 0), ([b"d"], 0.25, 0, 0)]
-    assert [take.containers for take in app.unasked] == [[b"c"]]
-    assert app.unasked[0].gap == pytest.approx(3.0, abs=0.05)
+    assert [take.containers for take in app.untriggered] == [[b"c"]]
+    assert app.untriggered[0].gap == pytest.approx(3.0, abs=0.05)
     assert (made.active, made.running, made.endian) == (5, True, 1)
     assert (made.dialect, made.transport) == ("b16", "tcp")
     assert [(one.condition, one.on) for one in made.changes] == [(Status.OVERHEAT, True)]
@@ -284,7 +284,7 @@ def test_plan_of_a_fleets_free_run_counts_from_the_one_before(tmp_path: Path) ->
     items = [*met(Status.RUNNING), shared(-0.001, b"a"), shared(0.1, b"b"), shared(0.3, b"c")]
     app = plan_replay(write(tmp_path / "run.mcap", items)).applications[5]
     assert not app.waits
-    gaps = [take.gap for take in app.unasked]
+    gaps = [take.gap for take in app.untriggered]
     assert gaps == pytest.approx([0.0, 0.101, 0.2], abs=1e-6)
 
 
@@ -304,10 +304,10 @@ def test_plan_unasked_under_a_constant_waiting_are_each_for_itself(tmp_path: Pat
     """The status says nothing of them: 20,000 of them are no single inspection of that many."""
     items = [container(1 + place / 1000, place.to_bytes(4, "little")) for place in range(200)]
     app = plan(tmp_path, *items).applications[5]
-    assert [take.containers for take in app.unasked] == [
+    assert [take.containers for take in app.untriggered] == [
         [place.to_bytes(4, "little")] for place in range(200)
     ]
-    assert {round(take.gap, 6) for take in app.unasked[1:]} == {0.001}
+    assert {round(take.gap, 6) for take in app.untriggered[1:]} == {0.001}
     assert (app.triggered, app.waits) == ([], True)
 
 
@@ -315,4 +315,4 @@ def test_plan_unasked_behind_a_trigger_under_a_constant_waiting(tmp_path: Path) 
     made = plan(tmp_path, "1 > Trigger, 1.2 'a', 1.25 'b', 2 'c', 3 'd', 4 > Trigger, 4.1 'e'")
     app = made.applications[5]
     assert [take.containers for take in app.triggered] == [[b"a", b"b"], [b"e"]]
-    assert [take.containers for take in app.unasked] == [[b"c"], [b"d"]]
+    assert [take.containers for take in app.untriggered] == [[b"c"], [b"d"]]

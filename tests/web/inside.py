@@ -13,7 +13,7 @@ from smartcam.web import (
     _serialize,
     _streams,
 )
-from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SLOW, packed, thinned
+from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, packed, thinned
 from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD_BYTES, Visitor, Visitors
 from smartcam.web._emulator import CALLS as EMULATOR_CALLS
 from smartcam.web._emulator import MAX_PARTS as EMULATOR_MAX_PARTS
@@ -48,8 +48,8 @@ from smartcam.web._pictures import MAX_VIEWERS as PICTURES_MAX_VIEWERS
 from smartcam.web._pictures import PROTOCOL as PICTURES_PROTOCOL
 from smartcam.web._pictures import Press
 from smartcam.web._routes import MAX_BODY_BYTES, CallBody, _parsed, _validate
-from smartcam.web._serialize import MAX_HEX_BYTES, MAX_TOLD_BYTES, MAX_VALUES_BYTES
+from smartcam.web._serialize import MAX_HEX_BYTES, MAX_REPLY_BYTES, MAX_VALUES_BYTES
 from smartcam.web._site import Site
 from smartcam.web._streams import MAX_STREAMS, News, Streams
-from smartcam.web._streams import SLOW as STREAMS_SLOW
+from smartcam.web._streams import SHOW_TIMEOUT as STREAMS_SHOW_TIMEOUT
 from smartcam.web._verdicts import judged, verdicts

@@ -17,7 +17,7 @@ from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import CloudSite
 from tests.handmade import until
-from tests.web.inside import MAX_VIEWERS, PROTOCOL, SLOW, packed, thinned
+from tests.web.inside import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, packed, thinned
 from tests.web.inside import _clouds as clouds_module
 from tests.web.sitekit import TOKEN, Caller
 
@@ -36,7 +36,7 @@ class Looker:
 
     async def cloud(self) -> tuple[dict[str, Any], Any, Any]:
         """Return the description of the next cloud, its points and colours."""
-        async with asyncio.timeout(2 * SLOW):
+        async with asyncio.timeout(2 * SHOW_TIMEOUT):
             about = json.loads(await self.socket.receive_str())
             body = b""
             while len(body) < about["bytes"]:
@@ -172,7 +172,7 @@ async def test_thinned_cloud_is_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -
 
 
 async def test_page_that_shows_nothing_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clouds_module, "SLOW", 0.05)
+    monkeypatch.setattr(clouds_module, "SHOW_TIMEOUT", 0.05)
     async with world(line(3)) as one, one.looking() as looker:
         await looker.cloud()
         async with asyncio.timeout(60):

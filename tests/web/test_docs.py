@@ -74,7 +74,7 @@ def test_fleet_page_has_its_numbers() -> None:
     said = {
         f"for {BAD_SECONDS:g} s after a loss",
         f"that it shows, {MAX_ROWS} at most",
-        f"shows nothing for {streams.SLOW:g} s",
+        f"shows nothing for {streams.SHOW_TIMEOUT:g} s",
         f"may be {MAX_FLEET_VIEWERS} browsers at a time, and {MAX_CAMERAS} cameras",
         f"and {LINGER:g} s longer",
         f"two updates, {MAX_QUEUE} are shown",
@@ -91,7 +91,7 @@ def _listed(words: Sequence[str]) -> str:
 
 def test_frames_page_has_its_numbers() -> None:
     assert f"At most {MAX_VIEWERS} WebSockets are open" in FRAMES_PAGE
-    assert f"takes no picture for {streams.SLOW:g} s" in FRAMES_PAGE
+    assert f"takes no picture for {streams.SHOW_TIMEOUT:g} s" in FRAMES_PAGE
 
 
 def test_bounds_are_those_of_the_code() -> None:
@@ -99,7 +99,7 @@ def test_bounds_are_those_of_the_code() -> None:
         f"did not come within {routes.READ_TIMEOUT:g} s",
         f"more than {routes.MAX_BODY_BYTES >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
-        f"nothing for {streams.SLOW:g} s",
+        f"nothing for {streams.SHOW_TIMEOUT:g} s",
         f"long payloads to {serialize.MAX_HEX_BYTES} bytes "
         f"and decode results up to {serialize.MAX_VALUES_BYTES}",
     }

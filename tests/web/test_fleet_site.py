@@ -31,7 +31,7 @@ from tests.web.inside import (
 )
 from tests.web.inside import FLEET_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import FLEET_SOCKET_PROTOCOL as PROTOCOL
-from tests.web.inside import STREAMS_SLOW as SLOW
+from tests.web.inside import STREAMS_SHOW_TIMEOUT as SHOW_TIMEOUT
 from tests.web.inside import _fleet as site_module
 from tests.web.inside import _fleet_view as view_module
 from tests.web.madeup import AT, READY, MadeUpFleet, names
@@ -426,7 +426,7 @@ async def test_who_does_not_read_holds_up_nobody_and_gets_the_newest() -> None:
 async def test_who_never_reads_is_disconnected() -> None:
     async with served(3) as world, world.looking() as quick, world.looking() as slow:
         await slow.listen(3.0)
-        for number in range(2 * int(SLOW)):
+        for number in range(2 * int(SHOW_TIMEOUT)):
             world.fleet["line01/cam000"].send(GOOD)
             await quick.listen(1.0)
             assert quick.rows["line01/cam000"]["count"] == number + 1

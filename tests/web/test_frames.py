@@ -25,7 +25,7 @@ from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.handmade import until
 from tests.web.inside import PICTURES_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import PICTURES_PROTOCOL as PROTOCOL
-from tests.web.inside import STREAMS_SLOW as SLOW
+from tests.web.inside import STREAMS_SHOW_TIMEOUT as SHOW_TIMEOUT
 from tests.web.inside import Press
 from tests.web.inside import _pictures as pictures_module
 from tests.web.sitekit import TOKEN, Caller, Raw
@@ -157,7 +157,9 @@ async def test_looker_that_shows_nothing_more_is_disconnected() -> None:
         await all_of.driver.streams()
         all_of.driver.give(plain(1))
         await looker.picture()
-        message = await looker.socket.receive()  # takes no time of ours, but pictures_module.SLOW
+        message = (
+            await looker.socket.receive()
+        )  # takes no time of ours, but pictures_module.SHOW_TIMEOUT
         assert message.type in {aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR}
         await all_of.driver.rests()
 
@@ -178,7 +180,7 @@ async def test_looker_that_reads_nothing_holds_up_nobody_and_is_disconnected() -
             all_of.driver.give(frame(number, data=noise, **large))
             assert (await looker.picture()).frame["sequence"] == number
             await looker.next()
-        await asyncio.sleep(SLOW + 1)
+        await asyncio.sleep(SHOW_TIMEOUT + 1)
         assert all_of.source.statistics().readers == 1
 
 

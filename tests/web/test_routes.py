@@ -23,7 +23,7 @@ from tests.web.inside import EMULATOR_MAX_PARTS as MAX_PARTS
 from tests.web.inside import (
     MAX_BODY_BYTES,
     MAX_HEX_BYTES,
-    MAX_TOLD_BYTES,
+    MAX_REPLY_BYTES,
     MAX_VALUES_BYTES,
     Streams,
 )
@@ -368,7 +368,7 @@ async def test_log_ends_where_it_told_enough_and_goes_on_from_there() -> None:
         answers = 0
         while len(seen) < count:
             part = await world.caller.get(f"log?since={len(seen)}")
-            assert sum(one["size"] for one in part["entries"]) <= MAX_TOLD_BYTES + MAX_VALUES_BYTES
+            assert sum(one["size"] for one in part["entries"]) <= MAX_REPLY_BYTES + MAX_VALUES_BYTES
             seen += [one["serial"] for one in part["entries"]]
             answers += 1
     assert seen == list(range(count))

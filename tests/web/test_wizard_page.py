@@ -454,7 +454,7 @@ async def test_page_says_which_file_it_waits_for(page: Page, tmp_path: Path) -> 
         await answer(page, "Was the sheet printed true to size?")
         await page.locator("#notes li").filter(has_text="picture 1 of 1").wait_for()
         await answer(page, "The sheet in the camera's field")
-        said = f"Waiting: the next file that comes into {inbox} counts"
+        said = f"Waiting: the first file written to {inbox} from now on counts"
         await page.locator("#waiting").filter(has_text=said).wait_for()
         data = load("cv2").imencode(".png", render(TARGET, CAMERA, SEEN))[1].tobytes()
         title = page.locator("#title").filter(has_text="Touch point 1")

@@ -29,7 +29,7 @@ COLOURS: Final = (
 Source: S. van der Walt and N. Smith, viridis (public domain).
 """
 
-STEPS: Final = 24
+COLOUR_COUNT: Final = 24
 """Number of colours of a map; neighbouring cells of one colour become one rectangle."""
 
 MAX_DECADES: Final = 3.0
@@ -75,7 +75,7 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
         starts = np.flatnonzero(np.diff(levels[row], prepend=-2))
         for start, end in zip(starts, [*starts[1:], columns], strict=True):
             level = int(levels[row, start])
-            fill = 'fill="none"' if level < 0 else f'fill="{_colour(level / (STEPS - 1))}"'
+            fill = 'fill="none"' if level < 0 else f'fill="{_colour(level / (COLOUR_COUNT - 1))}"'
             place = (left + start * cell[0], HEAD + row * cell[1])
             yield rectangle(place, ((end - start) * cell[0], cell[1]), fill)
     yield "</g>"
@@ -113,7 +113,7 @@ def _levels(values: Array, least: float, most: float) -> Array:
     """Return the number of each value's colour, by its logarithm; -1 for none."""
     safe = np.where(np.isfinite(values), np.clip(values, least, most), least)
     parts = np.log(safe / least) / math.log(most / least)
-    levels = np.clip(np.round(parts * (STEPS - 1)), 0, STEPS - 1)
+    levels = np.clip(np.round(parts * (COLOUR_COUNT - 1)), 0, COLOUR_COUNT - 1)
     found: Array = np.where(np.isfinite(values), levels, -1)
     return found
 
@@ -127,10 +127,10 @@ def _colour(part: float) -> str:
 
 
 def _legend(y: float, least: float, most: float, unit: str) -> Iterator[str]:
-    wide = WIDTH / STEPS
+    wide = WIDTH / COLOUR_COUNT
     yield '<g shape-rendering="crispEdges">'
-    for step in range(STEPS):
-        fill = f'fill="{_colour(step / (STEPS - 1))}"'
+    for step in range(COLOUR_COUNT):
+        fill = f'fill="{_colour(step / (COLOUR_COUNT - 1))}"'
         yield rectangle((BORDER + step * wide, y - 12), (wide, 12), fill)
     yield "</g>"
     for tick in range(TICKS):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from smartcam.geometry._inside import Array
 
-ENOUGH: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
+SUFFICIENT_RANGES: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
 """Range of each quantity that is enough.
 
 Source: ROS' camera_calibration, calibrator.py (published).
@@ -20,7 +20,7 @@ Source: ROS' camera_calibration, calibrator.py (published).
 
 
 class Coverage(NamedTuple):
-    """Bars from 0 to 1; a bar of 1 is good enough.
+    """Coverage of each quantity, from 0 to 1; 1 is good enough.
 
     Attributes:
         x: range of places from left to right.
@@ -36,25 +36,25 @@ class Coverage(NamedTuple):
 
     @property
     def lacking(self) -> tuple[str, ...]:
-        """Names of the bars that are not full."""
+        """Names of the quantities below 1."""
         bars = self._asdict().items()
         return tuple(name for name, value in bars if value < 1.0)
 
 
 def coverage(outlines: Sequence[Array], size: tuple[int, int]) -> Coverage:
-    """Return the bars of views.
+    """Return how well views cover places, sizes and tilts of the target.
 
     For each view, x and y are the place of the target's centre within the range that it can have
     without leaving the image, size is the square root of its part of the image's area, and skew is
-    twice the angle, in radians, by which its first corner differs from a right angle. A bar is the
-    range of one of these over the views, divided by its value in :data:`ENOUGH`.
+    twice the angle, in radians, by which its first corner differs from a right angle. A coverage is
+    the range of a quantity over the views, divided by its value in :data:`SUFFICIENT_RANGES`.
 
     ``outlines``: the target's four outer points in order (4, 2), pixels, of each view. ``size``:
     width and height of the images, pixels.
     """
     seen = np.array([_quantities(outline, size) for outline in outlines])
     ranges = np.ptp(seen, axis=0) if len(seen) else np.zeros(4)
-    full = np.array(list(ENOUGH.values()))
+    full = np.array(list(SUFFICIENT_RANGES.values()))
     return Coverage(*np.minimum(ranges / full, 1.0).tolist())
 
 

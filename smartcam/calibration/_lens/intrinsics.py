@@ -317,11 +317,11 @@ def calibrate_intrinsics(
     found = examined(found, again, drop=drop_bad)
     if not turned:
         return found
-    said = Code.SHEET_NOT_EXACT.remark(
+    remark = Code.SHEET_NOT_EXACT.remark(
         f"the target looks the same after half a turn, and its shape shows that {', '.join(turned)}"
         " numbered it from its other end than the rest; they are numbered as the rest here"
     )
-    return dataclasses.replace(found, warnings=(*found.warnings, said))
+    return dataclasses.replace(found, warnings=(*found.warnings, remark))
 
 
 def _numbered_alike(

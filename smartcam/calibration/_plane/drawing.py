@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FIELD_WIDTH_PX: Final = 900.0
 """Width of the drawn field, pixels; its height follows from the points."""
 
-BORDER: Final = 60.0
+BORDER_PX: Final = 60.0
 LEGEND_HEIGHT_PX: Final = 130.0
 """Height of the legend below the field, pixels."""
 
@@ -41,7 +41,7 @@ ELLIPSE_POINTS: Final = 24
 """An ellipse is drawn with this many points."""
 
 MIN_ENLARGED_RATIO: Final = 1e-9
-"""Errors below this part of the field's width are not drawn larger."""
+"""Errors below this part of the field's width are not enlarged."""
 
 LOW_COLOUR, HIGH_COLOUR = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
@@ -80,11 +80,11 @@ class _DrawnPlane:
         width, height = (self.high - self.low).tolist()
         self.zoom: float = FIELD_WIDTH_PX / width
         self.height: float = height * self.zoom
-        self.foot: float = 2 * BORDER + self.height
+        self.foot: float = 2 * BORDER_PX + self.height
 
     def pixels(self, points: Array) -> Array:
         """Map points (..., 2) to pixels."""
-        corner = np.array([BORDER, BORDER + self.height])
+        corner = np.array([BORDER_PX, BORDER_PX + self.height])
         pixels: Array = corner + (points - self.low) * self.zoom * [1.0, -1.0]
         return pixels
 
@@ -115,7 +115,7 @@ def draw(
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
     largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
-    larger = (
+    enlargement = (
         round_down(0.06 * FIELD_WIDTH_PX / largest)
         if largest > MIN_ENLARGED_RATIO * FIELD_WIDTH_PX
         else 1.0
@@ -126,13 +126,13 @@ def draw(
         *_axes(calibration, field),
         *(
             polygon(field.pixels(one), "ellipse")
-            for one in both[: len(outlines), None] + larger * outlines
+            for one in both[: len(outlines), None] + enlargement * outlines
         ),
-        *_touches(calibration, field, points + larger * residuals),
+        *_touches(calibration, field, points + enlargement * residuals),
         *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
-        *_legend(calibration, field, larger, title),
+        *_legend(calibration, field, enlargement, title),
     ]
-    return document(FIELD_WIDTH_PX + 2 * BORDER, field.foot + LEGEND_HEIGHT_PX, shapes, STYLE)
+    return document(FIELD_WIDTH_PX + 2 * BORDER_PX, field.foot + LEGEND_HEIGHT_PX, shapes, STYLE)
 
 
 def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
@@ -172,16 +172,16 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     parts = (errors - low) / (high - low) if high > low else np.zeros_like(errors)
     yield '<g shape-rendering="crispEdges">'
     for (x, y), part in zip(corners, parts.tolist(), strict=True):
-        yield _cell(BORDER + x, BORDER + y, cell, tall, part)
+        yield _cell(BORDER_PX + x, BORDER_PX + y, cell, tall, part)
     yield "</g>"
     for step in range(11):
-        yield _cell(BORDER + 20 * step, field.foot + 45, 20, 14, step / 10)
+        yield _cell(BORDER_PX + 20 * step, field.foot + 45, 20, 14, step / 10)
     label = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
-    yield _text((BORDER + 232, field.foot + 57), label)
+    yield _text((BORDER_PX + 232, field.foot + 57), label)
 
 
 def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
-    """Return a cell; its colour goes in steps, so that rounding does not change it."""
+    """Return a cell, in one of 21 colours: tiny differences of an error do not change it."""
     level = round(20 * part) / 20
     channels = (round(a + level * (b - a)) for a, b in zip(LOW_COLOUR, HIGH_COLOUR, strict=True))
     colour = "".join(f"{channel:02x}" for channel in channels)
@@ -197,7 +197,7 @@ def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     start = field.pixels(np.clip(np.zeros(2), field.low, field.high))
     yield from _axis(start, np.array([70.0, 0.0]), "camera", "camera x")
     yield from _axis(start, np.array([0.0, -70.0]), "camera", "y")
-    start = np.array([BORDER + FIELD_WIDTH_PX - 90, field.foot + 35])
+    start = np.array([BORDER_PX + FIELD_WIDTH_PX - 90, field.foot + 35])
     for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
         if np.linalg.norm(axis) < 0.05:  # the axis is at a right angle to the plane
             yield circle(start, 4, "robot")
@@ -236,25 +236,25 @@ def _part(part: Localization, place: Array) -> str:
 
 
 def _legend(
-    calibration: PlaneCalibration, field: _DrawnPlane, larger: float, title: str
+    calibration: PlaneCalibration, field: _DrawnPlane, enlargement: float, title: str
 ) -> Iterator[str]:
     if title:
-        yield _text((BORDER, 30), title, "title")
+        yield _text((BORDER_PX, 30), title, "title")
     error, count = calibration.held_out_error, len(calibration.camera_points)
     left_out = len(calibration.outliers)
     yield _text(
-        (BORDER, field.foot),
+        (BORDER_PX, field.foot),
         f"{calibration.model}, {f'{count - left_out} of ' if left_out else ''}{count} touches; "
         f"held-out error {'not known' if error is None else f'{1e3 * error:.3f} mm rms'}",
     )
     yield _text(
-        (BORDER, field.foot + 25),
-        f"residuals (red) and 95 % ellipses (violet) {larger:g} times larger than they are"
+        (BORDER_PX, field.foot + 25),
+        f"residuals (red) and 95 % ellipses (violet) {enlargement:g} times larger than they are"
         f"{'; crosses: left out' if left_out else ''}",
     )
     per_metre = field.zoom / calibration.scale
     metres = round_down(0.2 * FIELD_WIDTH_PX / per_metre)
-    end = np.array([BORDER + FIELD_WIDTH_PX - 220, field.foot])
+    end = np.array([BORDER_PX + FIELD_WIDTH_PX - 220, field.foot])
     start = end - [metres * per_metre, 0.0]
     yield line(start, end, "camera")
     yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))

@@ -119,8 +119,10 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     """
     poses = [part.pose for part in parts]
     if len(poses) < 2:
-        raise Code.TOO_FEW.unexpected("rotation centre: expected two sights or more", 2, len(poses))
-    _check_same([pose.header.frame_id for pose in poses], "rotation centre: expected sights")
+        raise Code.TOO_FEW.unexpected(
+            "rotation centre: expected two localizations or more", 2, len(poses)
+        )
+    _check_same([pose.header.frame_id for pose in poses], "rotation centre: expected localizations")
     # as complex numbers, for which a turn is a product
     places = np.array([complex(pose.position.x, pose.position.y) for pose in poses])
     turns = np.exp(1j * np.array([pose.orientation.theta for pose in poses]))

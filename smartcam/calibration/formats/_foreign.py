@@ -1,7 +1,7 @@
 """Read lenses from other programs' files that smartcam does not write.
 
-Each function returns the contents of a file as :class:`ForeignLens`, ..., from which the table of
-``_cameras.py`` makes cameras. Pixels count from the centre of the upper left pixel; COLMAP counts
+Each function returns lenses as :class:`ForeignLens`, and transforms; ``_cameras.py`` makes cameras
+of them. Pixels count from the centre of the upper left pixel; COLMAP counts
 from its corner, which is half a pixel more.
 
 Source: dkogan/mrcal, ``doc/cameramodels.org``; colmap/colmap, ``sensor/models.h`` and
@@ -221,11 +221,11 @@ def parse_ros_ini(text: str) -> Found:
         else:
             found.setdefault(title, []).extend(line.split())
     data = mapping(found, "file", ["width", "height", "camera matrix", "distortion"])
-    straight = np.reshape(reals(data["camera matrix"], "camera matrix", 9), (3, 3))
+    matrix = np.reshape(reals(data["camera matrix"], "camera matrix", 9), (3, 3))
     coefficients = reals(data["distortion"], "distortion")
     model: DistortionModel = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
     size = [*data["width"], *data["height"]]
-    return [ForeignLens(section, size, _focal(straight), model, coefficients)], [], None
+    return [ForeignLens(section, size, _focal(matrix), model, coefficients)], [], None
 
 
 def _focal(matrix: np.ndarray[Any, Any]) -> list[float]:
@@ -277,11 +277,13 @@ def parse_multical(text: str) -> Found:
         part = mapping(one, name, ["model", "K", "dist"])
         matrix = matrix_of(part["K"], f"{name}.K", (3, 3))
         flat = [value for row in sequence(part["dist"], f"{name}.dist") for value in _flat(row)]
-        bent = reals(flat, f"{name}.dist")
+        coefficients = reals(flat, f"{name}.dist")
         size = (
             sequence(part["image_size"], f"{name}.image_size", 2) if "image_size" in part else None
         )
-        lenses.append(_lens("multical", part["model"], [*_focal(matrix), *bent], name, size))
+        lenses.append(
+            _lens("multical", part["model"], [*_focal(matrix), *coefficients], name, size)
+        )
     if len(lenses) < 2:
         return lenses, [], None
     # "b_to_a" is the motion from a's frame into b's; a single name is the master, or the pose of

@@ -107,7 +107,7 @@ def how_to_take(awaited: str) -> str:
     """Return the last sentence of a step's description, which explains how to take the picture."""
     if not awaited:
         return ""
-    return f" Go on here first, then have the camera take its picture: {awaited}."
+    return f" Press the button here before the camera takes its picture: {awaited}."
 
 
 class PictureFolder:
@@ -134,9 +134,8 @@ class PictureFolder:
     def awaited(self) -> str:
         """Text, for people, that describes the picture that :meth:`take` waits for."""
         return (
-            f"the next file that comes into {self.path} counts, one that ends in "
-            f"{', '.join(sorted(SUFFIXES))}; earlier files do not count. It is waited for "
-            f"{self.deadline:g} s"
+            f"the first file written to {self.path} from now on counts, if its name ends in "
+            f"{', '.join(sorted(SUFFIXES))}. The step waits {self.deadline:g} s for it"
         )
 
     async def take(self) -> NDArray[Any]:
@@ -171,7 +170,7 @@ class PictureFolder:
             raise Code.NO_PICTURE.refusal(
                 f"no picture came into {self.path} within {self.deadline:g} s"
                 f"{self._others(before, others)}; expected a file that ends in one of "
-                f"{', '.join(sorted(SUFFIXES))}, written after the button",
+                f"{', '.join(sorted(SUFFIXES))}, written after the button was pressed",
                 sorted(SUFFIXES),
             ) from exc
 

@@ -114,7 +114,7 @@ def _unfit(camera: CameraUnderTest, item: Item) -> str:
     except Differs as exc:
         if item.name == CONNECT_CHECK:
             raise
-        raise NotObserved(f"no dialect is answered: {exc.came}") from exc
+        raise NotObserved(f"the camera answers in no dialect: {exc.came}") from exc
     if camera.gone and item.name != CONNECT_CHECK and dialect in item.dialects:
         raise NotObserved(f"the camera is gone: {camera.gone}")
     if dialect not in item.dialects:

@@ -283,7 +283,7 @@ class EmulatedInSight(LineCamera):
             one.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
-        """Wait until clients have sent a command so many times since the beginning.
+        """Wait until clients have sent a command ``count`` times since the beginning.
 
         On return, the camera has begun to carry the command out. The timeout runs in real time,
         whatever the emulator's clock is.

@@ -38,10 +38,10 @@ def check_image(image: Any) -> NDArray[np.uint8]:
     try:
         array: NDArray[Any] = np.asarray(image)
     except Exception as exc:
-        raise wrong_argument("image", "a table of uint8", image) from exc
+        raise wrong_argument("image", "a 2-D array of uint8", image) from exc
     if array.dtype != np.uint8 or array.ndim != 2:
         raise ConfigurationError(
-            f"an image is a table of uint8, got {array.ndim} axes of {array.dtype}"
+            f"an image is a 2-D array of uint8, got {array.ndim} axes of {array.dtype}"
         )
     if not 0 < array.size <= MAX_PIXELS:
         raise ConfigurationError(f"an image has 1 to {MAX_PIXELS} pixels, got {array.size}")
@@ -51,7 +51,7 @@ def check_image(image: Any) -> NDArray[np.uint8]:
 def bitmap(image: NDArray[np.uint8]) -> bytes:
     """Return an image as a BMP file: 8 bits per pixel, a palette of greys, the last row first.
 
-    That the camera sends a standard BMP is published; the form of the BMP is not.
+    The documents say that the camera sends a standard BMP; these details are inferred.
     """
     height, width = image.shape
     rows = np.pad(image[::-1], ((0, 0), (0, -width % 4))).tobytes()

@@ -22,7 +22,7 @@ class Stage:
     """The object that faults act on."""
 
     device: Any
-    refuse: Callable[[float], None]  # closes the port for so many seconds
+    refuse: Callable[[float], None]  # closes the port for a number of seconds
     let_second_client_in: Callable[[], None]  # lets another client connect
     clear: Callable[[], None]  # forgets the faults that wait, and ends those that last
 

@@ -140,7 +140,7 @@ class Guest:
         tasks: running calls, by kind (True: a command) and number.
         under_way: counts of questions and of commands among ``tasks``.
         entered: applications to go back to after the program's temporary switches.
-        told: number of the last state in the program's replies, by camera.
+        last_state: number of the last state in the program's replies, by camera.
     """
 
     who: ProgramName
@@ -153,7 +153,7 @@ class Guest:
     )
     under_way: list[int] = field(default_factory=lambda: [0, 0])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
-    told: dict[str, int] = field(default_factory=dict[str, int])
+    last_state: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
     def last(self) -> int:
@@ -318,9 +318,9 @@ class Agent:
         self._summaries.close()
         for handle in declared:
             handle.close()
-        said = "another agent has its name"
+        reason = "another agent has its name"
         try:
-            await close_all(functools.partial(self.unshare, name, said) for name in [*self.hosts])
+            await close_all(functools.partial(self.unshare, name, reason) for name in [*self.hosts])
         except Exception:
             logger.exception("%s ! a camera did not close", self.name)
         finally:
@@ -341,9 +341,9 @@ class Agent:
         if frames_of is not None:
             self._frames[name] = frames_of
         found = self._frames.get(name, NO_FRAMES)
-        teller = found.teller
+        reporter = found.reporter
         frames = SharedFrames(
-            name, found.make, self._sender, self._encoder, found.url, teller is not None
+            name, found.make, self._sender, self._encoder, found.url, reporter is not None
         )
         events = self._on_camera_event
         host = Host(
@@ -357,7 +357,7 @@ class Agent:
             topics,
             frames,
             self._bundle,
-            self._observers if teller is None else (teller, *self._observers),
+            self._observers if reporter is None else (reporter, *self._observers),
         )
         host.numbers = self._numbers_at.pop(name, host.numbers)
         host.began, host.final = host.results.following, not self.stands_by
@@ -404,7 +404,7 @@ class Agent:
         Cancellation: takes effect at the end.
         """
         host = self.hosts.pop(name)
-        host.say_removed(why)  # before its presence ends, which alone would mean a lost agent
+        host.announce_removed(why)  # before its presence ends, which alone would mean a lost agent
         self.leaving.add(host)
         token, running = self._shared.pop(name)
         try:
@@ -591,15 +591,15 @@ class Agent:
             self._cancel(host, who.name, int(fields["cancel"]), command)
             self._reply(who.name, number, {"answer": {}})
             return
-        said, timeout = str(fields["do"]), fields.get("timeout", 1.0)
+        action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(who, number) if said == "hello" else self._known(who)
+        guest = self._guest(who, number) if action == "hello" else self._known(who)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
         left = self._admit(
-            host, guest, who.name, number, epoch, said, deadline, timeout, command, reservation
+            host, guest, who.name, number, epoch, action, deadline, timeout, command, reservation
         )
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
@@ -607,10 +607,10 @@ class Agent:
             call = ProgramCall(
                 host, who.name, owner, arguments, blobs, left, entered, None, reservation
             )
-            self._start(said, call, guest, command)
+            self._start(action, call, guest, command)
 
     def _on_order(self, host: Host, token: str, order: TriggerOrder) -> None:
-        number, said = order.call, "trigger"
+        number, action = order.call, "trigger"
         program, _, secret = token.partition(".")
         guest = self._programs.get(program)
         if guest is None or guest.who.secret != secret:
@@ -618,14 +618,14 @@ class Agent:
         epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
         reservation = order.reservation
         left = self._admit(
-            host, guest, program, number, epoch, said, deadline, timeout, True, reservation
+            host, guest, program, number, epoch, action, deadline, timeout, True, reservation
         )
         if guest is not None and left is not None:
             owner, entered = Owner(guest.number, number), guest.entered
             call = ProgramCall(host, program, owner, {}, [], left, entered, order, reservation)
             worker = self._workers.take()
             guest.begin(True, number, worker.task)
-            worker.do(partial(self._do, said, call, guest, True))
+            worker.do(partial(self._do, action, call, guest, True))
 
     def _admit(
         self,
@@ -634,7 +634,7 @@ class Agent:
         program: str,
         number: int,
         epoch: int,
-        said: str,
+        action: str,
         deadline: float | None,
         timeout: float,
         command: bool,
@@ -645,7 +645,7 @@ class Agent:
             kind = ConnectionLostError if reservation is None else ReservationLostError
             stranger = kind(
                 f"{host.name}: the agent {self.name} was restarted, or took this program for "
-                f"gone{'' if reservation is None else ', and lost its reservation'}; {said} was "
+                f"gone{'' if reservation is None else ', and lost its reservation'}; {action} was "
                 "not done"
             )
             self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
@@ -660,22 +660,22 @@ class Agent:
                 left = check_moment(deadline, "deadline", host.name) + grace(timeout) / 2 - now()
         except ConfigurationError as exc:
             error = exc
-        error = error or self._refusal(host, guest, said, left, command)
+        error = error or self._refusal(host, guest, action, left, command)
         if error is not None:
-            if said == "trigger":
+            if action == "trigger":
                 host.triggers[outcome_of(error)] += 1
             self._reply(program, number, {"error": to_fields(error)})
             return None
         return min(timeout, left)
 
     def _refusal(
-        self, host: Host, guest: Guest, said: str, left: float, command: bool
+        self, host: Host, guest: Guest, action: str, left: float, command: bool
     ) -> SmartCamError | None:
         """Return the error that refuses a call, None if it is accepted."""
-        if said not in ACTIONS or (said in COMMANDS) != command:
-            return UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
+        if action not in ACTIONS or (action in COMMANDS) != command:
+            return UnsupportedError(f"{host.name}: the agent {self.name} cannot {action!r:.40}")
         if left < 0:
-            return late(said, f"{host.name}: {said} came after its deadline; it was not done")
+            return late(action, f"{host.name}: {action} came after its deadline; it was not done")
         cameras = len(self.hosts)
         if not command and self._questions[guest.who.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
             return LocalProtocolError(
@@ -688,9 +688,9 @@ class Agent:
             )
         return None
 
-    def _start(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+    def _start(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         task = asyncio.get_running_loop().create_task(
-            self._do(said, call, guest, command), name=f"smartcam.fleet.{call.host.name}.{said}"
+            self._do(action, call, guest, command), name=f"smartcam.fleet.{call.host.name}.{action}"
         )
         guest.begin(command, call.owner.call, task)
         if not command:
@@ -717,34 +717,34 @@ class Agent:
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+    async def _do(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         """Carry out a call, and reply; a program that has cancelled gets no reply."""
         host = call.host
         inside, outcome = False, "cancelled"
         try:
             if call.reservation is not None:
-                host.check_reserved((call.program, call.reservation), said)
-            if said in PASSES_GATE:
+                host.check_reserved((call.program, call.reservation), action)
+            if action in PASSES_GATE:
                 if not host.gate.goes_in(call.program):
                     begun = now()
-                    await host.enter(call.program, said, call.timeout)
+                    await host.enter(call.program, action, call.timeout)
                     call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
                 inside = True
-            fields, blobs = await ACTIONS[said](call)
+            fields, blobs = await ACTIONS[action](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
-                logger.exception("%s ! %s failed", host.name, said)
+                logger.exception("%s ! %s failed", host.name, action)
             reply: dict[str, Any] = {"error": to_fields(exc)}
             blobs, outcome = [], outcome_of(exc)
         else:
             reply, outcome = {"answer": fields}, RESULT
         finally:
-            if said == "trigger":
+            if action == "trigger":
                 host.triggers[outcome] += 1
             if inside:
                 host.gate.leave(call.program)
             guest.end(command, call.owner.call)
-        if said == "trigger" and blobs:
+        if action == "trigger" and blobs:
             self._reply_to_trigger(call, guest, blobs[0])
             return
         host.flush()
@@ -754,16 +754,16 @@ class Agent:
     def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
         """Reply, with the states that were not sent yet; other programs get them a little later."""
         host, following = call.host, call.host.states.following
-        told = host.untold(guest.told.get(host.name, 0))
-        guest.told[host.name] = following
-        host.flush(states=not told)
-        if told and len(self._programs) == 1:
+        states = host.untold(guest.last_state.get(host.name, 0))
+        guest.last_state[host.name] = following
+        host.flush(states=not states)
+        if states and len(self._programs) == 1:
             host.forget_fresh()
-        reply = encode_outcome(call.owner.call, self.epoch, now(), following, told, runs)
+        reply = encode_outcome(call.owner.call, self.epoch, now(), following, states, runs)
         self._bus.put(self._keys.reply(call.program), reply)
 
     def _reply(
         self, program: str, number: int, fields: dict[str, Any], blobs: list[bytes] | None = None
     ) -> None:
-        said = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
-        self._bus.put(self._keys.reply(program), encode(said, blobs or ()))
+        reply = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
+        self._bus.put(self._keys.reply(program), encode(reply, blobs or ()))

@@ -201,12 +201,12 @@ class Claims:
         there: list[tuple[str, str, Address]] = []
         for _, payload in answers:
             try:
-                said = json.loads(payload)
-                address = parse_address(str(said["url"]))
+                listed = json.loads(payload)
+                address = parse_address(str(listed["url"]))
                 if address.port in ports:
-                    there.append((str(said["camera"]), str(said["agent"]), address))
+                    there.append((str(listed["camera"]), str(listed["agent"]), address))
             except (ValueError, TypeError, KeyError, SmartCamError) as exc:
-                logger.warning("! what an agent says of a camera cannot be read: %s", exc)
+                logger.warning("! an agent's message about a camera cannot be read: %s", exc)
         hosts = {one.address.host for one in cameras.values()}
         hosts |= {address.host for _, _, address in there}
         hosts |= {one.settings.address.host for one in self._agent.hosts.values()}
@@ -259,16 +259,16 @@ class Claims:
             there = {(name, other) for name, others in self._others.items() for other in others}
             if not there:
                 return
-            told = {
+            standby_of = {
                 (one.summary.camera, one.summary.agent): one.standby
                 for agent in sorted({agent for _, agent in there})
                 for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
-            if all(told.get(one) for one in there):
+            if all(standby_of.get(one) for one in there):
                 return
-            silent = not there & told.keys()
+            silent = not there & standby_of.keys()
             if not silent or loop.time() > patience:
-                name, agent = min(one for one in there if not told.get(one))
+                name, agent = min(one for one in there if not standby_of.get(one))
                 more = f", and {len(there) - 1} more cameras" if len(there) > 1 else ""
                 says = ", which does not answer" if silent else ""
                 raise ConfigurationError(
@@ -410,10 +410,10 @@ class Claims:
         Of two agents without a session the first one by name continues.
         """
         agent, name = self._agent, host.name
-        told = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
+        cameras = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
         if host.connected or agent.hosts.get(name) is not host:
             return False
-        yields = bool(told) and (told[0].summary.connected or other < agent.name)
+        yields = bool(cameras) and (cameras[0].summary.connected or other < agent.name)
         return yields and other in self._others.get(name, ())
 
     async def _give_up(self, name: str, other: str) -> None:
@@ -446,10 +446,10 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
     async def resolve(host: str) -> None:
         loop = asyncio.get_running_loop()
         try:
-            told = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+            addresses = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             return  # the client reports an unknown host
-        found[host] |= {str(one[4][0]) for one in told}
+        found[host] |= {str(one[4][0]) for one in addresses}
 
     if names:
         tasks = [asyncio.create_task(resolve(one)) for one in names]

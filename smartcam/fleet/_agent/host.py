@@ -126,7 +126,7 @@ class Host:
         self.epoch: int = epoch
         self.began: int = 1
         self.final: bool = True
-        self._tell, self._bundle, self._observers = on_event, bundle, observers
+        self._report_event, self._bundle, self._observers = on_event, bundle, observers
         # programs decide about that
         Interpretation(settings.interpret_as, lenient=True, y_down=False)
         self.topics: CameraTopics = CameraTopics(self, topics)
@@ -197,7 +197,7 @@ class Host:
                     return
         finally:
             self._opened.set()
-            self._say({"kind": "Tried"})
+            self._publish_state({"kind": "Tried"})
 
     async def tried(self, timeout: float) -> None:
         """Wait until the first attempt has ended, with or without success; bounded."""
@@ -227,7 +227,7 @@ class Host:
             error = ConnectionLostError(f"{self.name}: {error}")
         self.failure = error
         self._opened.set()
-        self._say({"kind": "Absent"})
+        self._publish_state({"kind": "Absent"})
 
     def require(self) -> SharedCamera:
         """Return the camera.
@@ -243,8 +243,8 @@ class Host:
         return self._camera
 
     @contextlib.contextmanager
-    def counted(self, said: str) -> Iterator[None]:
-        """Count the outcome of the trigger in the block, if ``said`` is a trigger."""
+    def counted(self, action: str) -> Iterator[None]:
+        """Count the outcome of the trigger in the block, if ``action`` is a trigger."""
         outcome = RESULT
         try:
             yield
@@ -252,10 +252,10 @@ class Host:
             outcome = outcome_of(exc)
             raise
         finally:
-            if "trigger" in said.lower():
+            if "trigger" in action.lower():
                 self.triggers[outcome] += 1
 
-    async def enter(self, program: str, said: str, timeout: float) -> None:
+    async def enter(self, program: str, action: str, timeout: float) -> None:
         """Let a command of ``program`` begin, as :meth:`Gate.enter` does.
 
         Raises:
@@ -265,7 +265,7 @@ class Host:
         try:
             await self.gate.enter(program, timeout)
         except TimeoutError as exc:
-            raise self._not_granted(said, timeout) from exc
+            raise self._not_granted(action, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
@@ -287,7 +287,7 @@ class Host:
                 "reserve was not done"
             )
 
-    def check_reserved(self, reservation: Hashable, said: str) -> None:
+    def check_reserved(self, reservation: Hashable, action: str) -> None:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
@@ -295,9 +295,9 @@ class Host:
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(
-                f"{self.name}: the agent does not know the reservation in whose block {said} was "
+                f"{self.name}: the agent does not know the reservation in whose block {action} was "
                 "called: it was lost, and commands of others may have come between; "
-                f"{said} was not done"
+                f"{action} was not done"
             )
 
     async def keeps(self, reservation: Hashable, timeout: float) -> bool:
@@ -322,16 +322,16 @@ class Host:
     def _on_reservation(self, change: Change, program: str) -> None:
         self.topics.on_reservation(change, program)
         if change == "ReservationLost" and self._opened.is_set():
-            self._say({"kind": change, "by": program})
+            self._publish_state({"kind": change, "by": program})
         else:
             self.topics.on_state()
 
-    def _not_granted(self, said: str, timeout: float) -> SmartCamError:
+    def _not_granted(self, action: str, timeout: float) -> SmartCamError:
         """Return the error for a program that waited in vain for others to let go of the camera."""
         holder = self.gate.holder
         who = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
-        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {said} was not done"
-        return late(said, text)
+        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {action} was not done"
+        return late(action, text)
 
     # ------------------------------------------------------------------ what the camera is
 
@@ -387,46 +387,46 @@ class Host:
         self.topics.on_status(status)
         camera, number = self._camera, self.states.following
         if not (camera.connected and self._opened.is_set()):
-            self._say({"kind": "Status"}, hold=STATUS_DELAY)
+            self._publish_state({"kind": "Status"}, hold=STATUS_DELAY)
             return
         data = encode_status(number, int(status), camera.endian, camera.active_application)
-        self._have_said(data, asyncio.get_running_loop().time(), STATUS_DELAY)
+        self._add_state(data, asyncio.get_running_loop().time(), STATUS_DELAY)
 
     def _on_event(self, event: CameraEvent) -> None:
-        self._tell(event)
+        self._report_event(event)
         if isinstance(event, StatusChanged):
             return  # a status reports that
         self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
-        said: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
+        state: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
         if isinstance(event, (Connected, Reconnected)):
-            said["about"] = self.about()
-        self._say(said)
+            state["about"] = self.about()
+        self._publish_state(state)
         if isinstance(event, Disconnected) and not (event.expected or self.final):
             self.lose_reservation()  # another agent may have the camera meanwhile
 
     def _on_end(self) -> None:
         if self._opened.is_set() and self.failure is None:
             self._over = True
-            self._say({"kind": "Over"})
+            self._publish_state({"kind": "Over"})
         self.lose_reservation()
 
-    def say_removed(self, why: str) -> None:
+    def announce_removed(self, why: str) -> None:
         """Announce that this agent no longer shares the camera, and why."""
-        self._say({"kind": "Removed", "why": why})
+        self._publish_state({"kind": "Removed", "why": why})
 
     def _on_taken(self) -> None:
         """Announce that another client has the camera, which is tried again at intervals."""
-        self._say({"kind": "Taken"})
+        self._publish_state({"kind": "Taken"})
 
-    def _say(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
+    def _publish_state(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
         """Send an event with the camera's state, within ``hold`` seconds or with the next event."""
         clock = asyncio.get_running_loop().time()
-        said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        self._have_said(encode_state(said), clock, hold)
+        state = {**fields, **self.state(), "number": self.states.following, "clock": clock}
+        self._add_state(encode_state(state), clock, hold)
 
-    def _have_said(self, data: bytes, clock: float, hold: float) -> None:
+    def _add_state(self, data: bytes, clock: float, hold: float) -> None:
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
         if not hold:
@@ -508,11 +508,11 @@ class Host:
         if self._fresh:
             self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
-            said = encode_runs(self.epoch, self.results.following, fresh)
+            payload = encode_runs(self.epoch, self.results.following, fresh)
             if self._bundle.heard:
-                self._bundle.add(self.name, said)
+                self._bundle.add(self.name, payload)
             if self._results_out.heard:
-                self._results_out.put(said)
+                self._results_out.put(payload)
                 self._remind(0)
 
     def _on_heard(self, heard: bool) -> None:

@@ -41,7 +41,7 @@ ROW_BYTES = 300
 """Approximate number of bytes of a row besides its value and its error."""
 
 
-class ToldOutlet(NamedTuple):
+class ReportedOutlet(NamedTuple):
     """An outlet's account from its agent: ``results == delivered + spooled + dropped``.
 
     Attributes:
@@ -63,7 +63,7 @@ class ToldOutlet(NamedTuple):
     trouble: str
 
 
-class ToldStore(NamedTuple):
+class ReportedStore(NamedTuple):
     """The answer of a store of results, from its agent.
 
     Attributes:
@@ -156,33 +156,33 @@ class OutletService:
                 name: {**state.account.fields(), "trouble": state.trouble}
                 for name, state in self._states().items()
             }
-            self._say(question, name, {"error": "", "outlets": accounts})
+            self._reply(question, name, {"error": "", "outlets": accounts})
         elif name != "results":
             error = ConfigurationError(f"outlets: expected accounts or results, got {name!r:.80}")
-            self._say(question, name, failure(error))
+            self._reply(question, name, failure(error))
         elif self._under_way >= MAX_STORE_QUESTIONS:
             text = f"{self._under_way} questions to the stores are under way"
-            self._say(question, name, failure(LocalProtocolError(text)))
+            self._reply(question, name, failure(LocalProtocolError(text)))
         else:
             self._under_way += 1
             self._agent.begin(self._answer(question), "smartcam.fleet.outlets")
 
     async def _answer(self, question: BusQuestion) -> None:
-        said = failure(SmartCamError("the agent ends"))
+        outcome = failure(SmartCamError("the agent ends"))
         try:
             given, error = request_fields(question.payload)
             if error is not None:
                 raise error
             request = validated(StoredRequest, given or {}, "outlets: results")
             found = await self._stored(request)
-            said = {"error": "", "stores": {name: _bounded(one) for name, one in found.items()}}
+            outcome = {"error": "", "stores": {name: _bounded(one) for name, one in found.items()}}
         except SmartCamError as exc:
-            said = failure(exc)
+            outcome = failure(exc)
         finally:
             self._under_way -= 1
-            self._say(question, "results", said)
+            self._reply(question, "results", outcome)
 
-    def _say(self, question: BusQuestion, name: str, fields: dict[str, Any]) -> None:
+    def _reply(self, question: BusQuestion, name: str, fields: dict[str, Any]) -> None:
         agent = self._agent.name
         key = question.key if "*" not in question.key else self._keys.outlets(agent, name)
         question.reply(key, as_json({"agent": agent, **fields}))
@@ -200,17 +200,17 @@ def _bounded(store: dict[str, Any]) -> dict[str, Any]:
     return {**store, "rows": rows[::-1]}
 
 
-T = TypeVar("T", ToldOutlet, ToldStore)
+T = TypeVar("T", ReportedOutlet, ReportedStore)
 
 
-async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ToldOutlet]:
+async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ReportedOutlet]:
     """Return the accounts of all agents' outlets that came within ``timeout`` seconds."""
     return await _ask(bus, keys.outlets("*", "accounts"), b"", timeout, _accounts)
 
 
 async def ask_stores(
     bus: Bus, keys: Keys, request: StoredRequest, timeout: float
-) -> list[ToldStore]:
+) -> list[ReportedStore]:
     """Return the answers of all agents' stores that came within ``timeout`` seconds."""
     payload = request.model_dump_json().encode()
     return await _ask(bus, keys.outlets("*", "results"), payload, timeout, _stores)
@@ -228,11 +228,11 @@ async def _ask(
     return sorted(found, key=lambda one: one[:2])
 
 
-def _accounts(answer: bytes) -> list[ToldOutlet]:
-    said: Any = json.loads(answer)
+def _accounts(answer: bytes) -> list[ReportedOutlet]:
+    report: Any = json.loads(answer)
     return [
-        ToldOutlet(
-            str(said["agent"]),
+        ReportedOutlet(
+            str(report["agent"]),
             str(name),
             int(one["results"]),
             int(one["delivered"]),
@@ -240,17 +240,17 @@ def _accounts(answer: bytes) -> list[ToldOutlet]:
             {str(why): int(count) for why, count in one["dropped"].items()},
             str(one["trouble"]),
         )
-        for name, one in said["outlets"].items()
+        for name, one in report["outlets"].items()
     ]
 
 
-def _stores(answer: bytes) -> list[ToldStore]:
-    said: Any = json.loads(answer)
-    agent = str(said["agent"])
-    if said["error"]:
-        return [ToldStore(agent, "", [], error=str(said["error"]))]
+def _stores(answer: bytes) -> list[ReportedStore]:
+    report: Any = json.loads(answer)
+    agent = str(report["agent"])
+    if report["error"]:
+        return [ReportedStore(agent, "", [], error=str(report["error"]))]
     return [
-        ToldStore(
+        ReportedStore(
             agent,
             str(name),
             [dict(row) for row in one["rows"]],
@@ -261,5 +261,5 @@ def _stores(answer: bytes) -> list[ToldStore]:
             lost=int(one["lost"]),
             at_least=bool(one["at_least"]),
         )
-        for name, one in said["stores"].items()
+        for name, one in report["stores"].items()
     ]

@@ -158,7 +158,7 @@ class Reloader:
         sources: sources of the cameras' sessions, by name.
         last: changes, or error, of the last reload; None before the first.
         outcomes: numbers of successful and of refused reloads.
-        tell: callback for the start of a reload (None) and for its end (changes or error).
+        on_reload: callback for the start of a reload (None) and for its end (changes or error).
     """
 
     def __init__(
@@ -171,7 +171,7 @@ class Reloader:
         self.sources: dict[str, CameraSource] = {}
         self.last: FleetChanges | SmartCamError | None = None
         self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
-        self.tell: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
+        self.on_reload: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
         self._folder, self._make = folder, make
         self._one = asyncio.Lock()
         self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
@@ -187,7 +187,7 @@ class Reloader:
     async def reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
         """Apply ``file`` to a running agent, like :meth:`FleetServer.reload`."""
         async with self._one:
-            self.tell(None)
+            self.on_reload(None)
             try:
                 changes = await self._typed(agent, file)
             except SmartCamError as exc:
@@ -208,7 +208,7 @@ class Reloader:
             finally:
                 done = isinstance(self.last, FleetChanges)
                 self.outcomes["done" if done else "refused"] += 1
-                self.tell(self.last)
+                self.on_reload(self.last)
 
     async def _typed(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
         try:

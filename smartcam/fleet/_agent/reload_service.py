@@ -50,7 +50,7 @@ class ReloadService:
     def _on_question(self, question: BusQuestion) -> None:
         if self._waiting >= MAX_WAITING_QUESTIONS:
             text = f"{self._agent.name}: {self._waiting} reloads are under way; nothing was done"
-            self._say(question, {"error": to_fields(LocalProtocolError(text))})
+            self._reply(question, {"error": to_fields(LocalProtocolError(text))})
             return
         self._waiting += 1
         self._agent.begin(self._answer(question), "smartcam.fleet.reload")
@@ -65,9 +65,9 @@ class ReloadService:
             fields = {"error": to_fields(exc)}
         finally:
             self._waiting -= 1
-            self._say(question, fields)
+            self._reply(question, fields)
 
-    def _say(self, question: BusQuestion, fields: dict[str, Any]) -> None:
+    def _reply(self, question: BusQuestion, fields: dict[str, Any]) -> None:
         question.reply(question.key.replace("*", self._agent.name), as_json(fields))
         question.close()
 
@@ -96,8 +96,8 @@ def _read(agent: str, payload: bytes) -> FleetChanges | SmartCamError:
         fields = json.loads(payload)
         if "error" in fields:
             return from_fields(fields["error"])
-        said = cast("dict[str, Any]", fields["changes"])
-        names = {name: tuple(map(str, said[name])) for name in ("added", "removed", "changed")}
-        return FleetChanges(agent=agent, kept=int(said["kept"]), **names)
+        changes = cast("dict[str, Any]", fields["changes"])
+        names = {name: tuple(map(str, changes[name])) for name in ("added", "removed", "changed")}
+        return FleetChanges(agent=agent, kept=int(changes["kept"]), **names)
     except (ValueError, KeyError, TypeError, RecursionError) as exc:
         return SmartCamError(f"reload: the agent {agent} answers what cannot be read: {exc!r:.200}")

@@ -291,15 +291,15 @@ class FleetServer(Server):
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
         file, own = self.file, self.file.agent_name
-        said = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        found = {name: one.load_calibration(self.folder) for name, one in said.items()}
-        places = {name: one.load_hand_eye(self.folder) for name, one in said.items()}
+        cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
+        found = {name: one.load_calibration(self.folder) for name, one in cameras.items()}
+        places = {name: one.load_hand_eye(self.folder) for name, one in cameras.items()}
         return RosFleet(
             bus,
             file.fleet,
             self.address,
             file.ros2 or RosSection.model_validate({}),
-            cameras=said,
+            cameras=cameras,
             settings=self._settings,
             frames=self._ros_frames,
             controls=self._controls,
@@ -403,14 +403,14 @@ class FleetServer(Server):
         drawn = bool(given.get("drawn", True))
         make = functools.partial(judged_source, device.inspector, drawn=drawn)
         observers = Observers(self.observers)
-        teller = JudgedResults(
+        reporter = JudgedResults(
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
             lambda result, judged: observers.picture(result, judged.marked_frame),
             max_kept=0,
         )
-        device.inspector.viewers.add(teller.take)
-        return device, FramesOf(make, masked(camera.frames), teller)
+        device.inspector.viewers.add(reporter.take)
+        return device, FramesOf(make, masked(camera.frames), reporter)
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
         """Start an emulated camera; return its URL."""

@@ -68,8 +68,8 @@ class Carrier(Interpretation):
     ) -> Interpreted:
         if container.cells is None and container.fault is None:
             return Interpreted(self._carried, None, 0)
-        said = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
-        return Interpreted(self._carried._replace(cells=said), None, 0)
+        text = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
+        return Interpreted(self._carried._replace(cells=text), None, 0)
 
     def burst(
         self,

@@ -55,7 +55,7 @@ class CameraSummary:
     reason: str | None
 
 
-class ToldCamera(NamedTuple):
+class ReportedCamera(NamedTuple):
     """One camera in an answer.
 
     Attributes:
@@ -105,12 +105,12 @@ class Summaries:
             hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
             for begin in range(0, len(hosts), IN_A_TURN):
                 cameras = [_row(one) for one in hosts[begin : begin + IN_A_TURN]]
-                said = {
+                summary = {
                     "agent": self._agent.name,
                     "standby": self._agent.stands_by,
                     "cameras": cameras,
                 }
-                question.reply(key, as_json(said))
+                question.reply(key, as_json(summary))
                 await asyncio.sleep(0)
         finally:
             question.close()
@@ -132,7 +132,7 @@ def _row(host: Host) -> list[Any]:
 
 async def ask_cameras(
     bus: Bus, keys: Keys, agent: str, pattern: str, timeout: float
-) -> list[ToldCamera]:
+) -> list[ReportedCamera]:
     """Return agents' answers on their cameras that come within ``timeout`` seconds.
 
     Args:
@@ -143,7 +143,7 @@ async def ask_cameras(
         timeout: seconds to wait for the answers.
     """
     answers = await bus.ask(keys.summary(agent), pattern.encode(), timeout)
-    found: list[ToldCamera] = []
+    found: list[ReportedCamera] = []
     for _, payload in answers:
         try:
             found += _read(payload)
@@ -153,21 +153,23 @@ async def ask_cameras(
     return found
 
 
-def _read(payload: bytes) -> Iterable[ToldCamera]:
-    said: Any = json.loads(payload)
-    agent, standby = str(said["agent"]), bool(said.get("standby"))
-    found: list[ToldCamera] = []
-    for name, connected, status, application, holder, reason, epoch, following in said["cameras"]:
+def _read(payload: bytes) -> Iterable[ReportedCamera]:
+    listed: Any = json.loads(payload)
+    agent, standby = str(listed["agent"]), bool(listed.get("standby"))
+    found: list[ReportedCamera] = []
+    for name, connected, status, application, holder, reason, epoch, following in listed["cameras"]:
         word = None if status is None else Status(status)
         summary = CameraSummary(name, agent, bool(connected), word, application, holder, reason)
-        found.append(ToldCamera(summary, int(epoch), int(following), standby))
+        found.append(ReportedCamera(summary, int(epoch), int(following), standby))
     return found
 
 
-def by_name(told: Iterable[ToldCamera], better: Callable[[ToldCamera], Any]) -> dict[str, Any]:
+def by_name(
+    cameras: Iterable[ReportedCamera], better: Callable[[ReportedCamera], Any]
+) -> dict[str, Any]:
     """Return one camera for each name: if two agents have it for a moment, the better one."""
-    found: dict[str, ToldCamera] = {}
-    for one in told:
+    found: dict[str, ReportedCamera] = {}
+    for one in cameras:
         known = found.get(one.summary.camera)
         if known is None or better(one) > better(known):
             found[one.summary.camera] = one

@@ -136,28 +136,28 @@ class FleetAddress(NamedTuple):
         for part, there in wrong.items():
             if there:
                 raise ConfigurationError(f"{what} has {part}, which means nothing")
-        said: dict[str, str] = {}
+        query: dict[str, str] = {}
         for key, value in parse_qsl(parts.query, keep_blank_values=True):
             if key not in _PARAMETERS:
                 raise ConfigurationError(
                     f"{what}: unknown {key!r}; known are {', '.join(map(repr, _PARAMETERS))}"
                     f"{did_you_mean(key, _PARAMETERS)}"
                 )
-            if key in said:
+            if key in query:
                 raise ConfigurationError(f"{what} names two {key}")
-            said[key] = value
+            query[key] = value
         camera = parts.path.strip("/")
         if camera:
             check_name(camera, f"{what}: camera")
-        fleet = check_word(said["fleet"], f"{what}: fleet") if "fleet" in said else None
-        called = check_word(said["program"], f"{what}: program") if "program" in said else None
+        fleet = check_word(query["fleet"], f"{what}: fleet") if "fleet" in query else None
+        called = check_word(query["program"], f"{what}: program") if "program" in query else None
         tls = parts.scheme == "fleet+tls"
-        certificates = said.get("certificates") or (os.environ.get(CERTIFICATES) if tls else None)
+        certificates = query.get("certificates") or (os.environ.get(CERTIFICATES) if tls else None)
         if tls and not certificates:
             raise ConfigurationError(
                 f"{what}: expected certificates: ?certificates=DIR, or the variable {CERTIFICATES}"
             )
-        if "certificates" in said and not tls:
+        if "certificates" in query and not tls:
             raise ConfigurationError(f"{what}: certificates are for fleet+tls://")
         return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates, called)
 
@@ -170,12 +170,12 @@ class FleetAddress(NamedTuple):
 
     def of(self, camera: str) -> Address:
         """Return the address of a camera of the fleet."""
-        said = {} if self.fleet is None else {"fleet": self.fleet}
+        given = {} if self.fleet is None else {"fleet": self.fleet}
         if self.certificates is not None:
-            said["certificates"] = self.certificates
+            given["certificates"] = self.certificates
         if self.program is not None:
-            said["program"] = self.program
-        parameters = tuple(said.items())
+            given["program"] = self.program
+        parameters = tuple(given.items())
         return Address("fleet", self.scheme, self.host, self.port, None, (), parameters, camera)
 
     @property

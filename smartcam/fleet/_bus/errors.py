@@ -32,7 +32,7 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         fields = {"kind": known, "text": str(text)}
     own = vars(error) if isinstance(error, SmartCamError) else {}
-    attributes = {name: _said(value) for name, value in own.items() if name[0] != "_"}
+    attributes = {name: _as_json(value) for name, value in own.items() if name[0] != "_"}
     if attributes:
         fields["attributes"] = attributes
     if error.__cause__ is not None and depth:
@@ -51,19 +51,19 @@ def from_fields(fields: Any) -> SmartCamError:
 def _from_fields(fields: Any) -> BaseException:
     if not isinstance(fields, dict):
         return RemoteProtocolError(f"the agent's error is not valid: {fields!r:.80}")
-    said = cast("dict[str, Any]", fields)
-    error = _KINDS.get(str(said.get("kind")), SmartCamError)(str(said.get("text", "")))
-    attributes: Any = said.get("attributes")
+    known = cast("dict[str, Any]", fields)
+    error = _KINDS.get(str(known.get("kind")), SmartCamError)(str(known.get("text", "")))
+    attributes: Any = known.get("attributes")
     if isinstance(attributes, dict):
         for name, value in cast("dict[str, Any]", attributes).items():
             if name in vars(error):  # the class's own attributes, with their defaults
                 setattr(error, name, _meant(value))
-    if "cause" in said:
-        error.__cause__ = _from_fields(said["cause"])
+    if "cause" in known:
+        error.__cause__ = _from_fields(known["cause"])
     return error
 
 
-def _said(value: object) -> Any:
+def _as_json(value: object) -> Any:
     """Return an attribute's value as JSON, which has no tuples and no bytes."""
     if isinstance(value, (tuple, bytes)):
         return {type(value).__name__: jsonable(value)}
@@ -72,12 +72,12 @@ def _said(value: object) -> Any:
 
 def _meant(value: Any) -> Any:
     if isinstance(value, dict):
-        said = cast("dict[str, Any]", value)
-        if said.keys() == {"tuple"} and isinstance(said["tuple"], list):
-            return tuple(said["tuple"])
-        if said.keys() == {"bytes"} and isinstance(said["bytes"], str):
+        pair = cast("dict[str, Any]", value)
+        if pair.keys() == {"tuple"} and isinstance(pair["tuple"], list):
+            return tuple(pair["tuple"])
+        if pair.keys() == {"bytes"} and isinstance(pair["bytes"], str):
             with contextlib.suppress(ValueError):
-                return bytes.fromhex(said["bytes"])
+                return bytes.fromhex(pair["bytes"])
     return cast("object", value)
 
 
@@ -97,7 +97,7 @@ _KINDS: dict[str, type[BaseException]] = {
 """Classes of errors from the bus: smartcam's and, for causes, the system's."""
 
 
-def late(said: str, text: str) -> SmartCamError:
+def late(action: str, text: str) -> SmartCamError:
     """Return the error of a call whose deadline has passed before it was carried out."""
-    kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
+    kind = TriggerTimeoutError if "trigger" in action.lower() else ResponseTimeoutError
     return kind(text)

@@ -174,7 +174,7 @@ class Feed(Generic[NumberedT]):
         self._returns = returns
         self._announced = 0  # the highest next number of this epoch from the agent
         self._places: dict[int, int] = {}  # next expected number, by earlier epoch
-        self._said: dict[int, int] = {}  # next number from the agent, by other epoch
+        self._next_numbers: dict[int, int] = {}  # next number from the agent, by other epoch
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Take messages with ``expected`` or a later number, of this epoch of the agent.
@@ -188,7 +188,7 @@ class Feed(Generic[NumberedT]):
                 expected = self._places.get(epoch, expected)
             self.epoch, self.expected = epoch, expected
             self._announced = 0
-            following = max(following, self._said.pop(epoch, 0))
+            following = max(following, self._next_numbers.pop(epoch, 0))
         if epoch != self._held_epoch:
             self._drop_held()
         self._go_on(following)
@@ -227,9 +227,9 @@ class Feed(Generic[NumberedT]):
         if epoch == self.epoch and self.expected:
             self._announced = max(self._announced, following)
         else:  # begin() requests messages that are not held
-            self._said[epoch] = max(following, self._said.get(epoch, 0))
-            if len(self._said) > MAX_EPOCHS_REMEMBERED:
-                del self._said[next(iter(self._said))]
+            self._next_numbers[epoch] = max(following, self._next_numbers.get(epoch, 0))
+            if len(self._next_numbers) > MAX_EPOCHS_REMEMBERED:
+                del self._next_numbers[next(iter(self._next_numbers))]
         if epoch >= self.epoch:
             for thing in things:
                 self._hold(epoch, thing)
@@ -258,7 +258,7 @@ class Feed(Generic[NumberedT]):
         """Stop taking messages."""
         self.expected = self._announced = 0
         self._places.clear()
-        self._said.clear()
+        self._next_numbers.clear()
         self.lacking = False
         self._drop_held()
 

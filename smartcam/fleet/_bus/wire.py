@@ -78,10 +78,10 @@ def decode_state(data: bytes) -> dict[str, Any]:
             "endian": endian,
             "application": None if application == _NONE else application,
         }
-    said: Any = json.loads(str(data, "utf-8"))
-    if not isinstance(said, dict) or not isinstance(cast("Any", said).get("number"), int):
+    state: Any = json.loads(str(data, "utf-8"))
+    if not isinstance(state, dict) or not isinstance(cast("Any", state).get("number"), int):
         raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
-    return cast("dict[str, Any]", said)
+    return cast("dict[str, Any]", state)
 
 
 def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
@@ -422,7 +422,7 @@ class TriggerReply(NamedTuple):
         epoch: number of the agent's start.
         clock: time of the agent's clock, seconds.
         states: number of the agent's next event.
-        told: events that were not sent before.
+        new_states: events that were not sent before.
         batch: results of the trigger, and the agent's next number.
     """
 
@@ -430,18 +430,18 @@ class TriggerReply(NamedTuple):
     epoch: int
     clock: float
     states: int
-    told: list[bytes]
+    new_states: list[bytes]
     batch: Batch
 
 
 def encode_outcome(
-    call: int, epoch: int, clock: float, states: int, told: Sequence[bytes], runs: bytes
+    call: int, epoch: int, clock: float, states: int, new_states: Sequence[bytes], runs: bytes
 ) -> bytes:
     """Return a reply as bytes; ``runs`` is in the form of :func:`encode_runs`."""
-    count = len(told)
+    count = len(new_states)
     head = _OUTCOME.pack(_IS_OUTCOME, call, epoch, clock, states, count)
-    lengths = struct.pack(f"<{count}I", *map(len, told))
-    return b"".join((head, lengths, *told, runs))
+    lengths = struct.pack(f"<{count}I", *map(len, new_states))
+    return b"".join((head, lengths, *new_states, runs))
 
 
 def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
@@ -457,15 +457,15 @@ def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
         place = _OUTCOME.size
         lengths = struct.unpack_from(f"<{count}I", payload, place)
         place += 4 * count
-        told: list[bytes] = []
+        new_states: list[bytes] = []
         for length in lengths:
-            told.append(payload[place : place + length])
+            new_states.append(payload[place : place + length])
             place += length
         if place > len(payload):
             raise ValueError(f"{place} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return TriggerReply(call, epoch, clock, states, told, decode_runs(payload[place:], what))
+    return TriggerReply(call, epoch, clock, states, new_states, decode_runs(payload[place:], what))
 
 
 def timestamp(at: datetime | None) -> float:

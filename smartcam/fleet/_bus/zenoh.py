@@ -83,7 +83,7 @@ class ZenohEnd(ZenohSession, Bus):
         self._sending = 0
         self._doubtful = 0  # messages that may have been dropped, and are not sent again yet
         self._behind: collections.Counter[str] = collections.Counter()
-        self._calm_since, self._said = -BURST_PERIOD, 0
+        self._calm_since, self._burst_messages = -BURST_PERIOD, 0
         # keys that are used again and again, in the order of their last use
         self._frequent: dict[str, _FrequentKey] = {}
         zenoh = self._zenoh
@@ -160,10 +160,10 @@ class ZenohEnd(ZenohSession, Bus):
         identity = await loop.run_in_executor(None, read_identity, folder)
         if identity.expired:
             raise self._failed(identity.expired)
-        said = identity.digest, identity.urgency
-        if identity.urgency and said != self._warned:
+        warning = identity.digest, identity.urgency
+        if identity.urgency and warning != self._warned:
             logger.warning("%s ! %s", self._link.place, identity.warning)
-        self._warned, self.identity = said, identity
+        self._warned, self.identity = warning, identity
         return identity
 
     async def _look_now_and_then(self) -> None:
@@ -214,10 +214,10 @@ class ZenohEnd(ZenohSession, Bus):
             return
         begun = self._loop.time()
         if begun - self._calm_since > BURST_PERIOD:
-            self._calm_since, self._said = begun, 0
-        self._said += 1
+            self._calm_since, self._burst_messages = begun, 0
+        self._burst_messages += 1
         # a single message is sent at once, a burst together: there is not room for many
-        express = self._said <= MAX_EXPRESS_MESSAGES
+        express = self._burst_messages <= MAX_EXPRESS_MESSAGES
         waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
         if waits or (self._behind and self._way(key) in self._behind):
             self._hand_over(self._way(key), session, key, payload, express)
@@ -261,16 +261,16 @@ class ZenohEnd(ZenohSession, Bus):
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         if self._session is not None:
-            said = bytes(data) if isinstance(data, memoryview) else data
-            quietly(self._session.put, key, said, attachment=head, **self._behind_all)
+            payload = bytes(data) if isinstance(data, memoryview) else data
+            quietly(self._session.put, key, payload, attachment=head, **self._behind_all)
 
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
         def on_sample(sample: Any) -> None:
             head = sample.attachment
             data = sample.payload.to_bytes()
             if head is not None and not self.full(len(data)):
-                said, key = head.to_bytes(), str(sample.key_expr)
-                self.in_loop(declared.call, len(data), hear, key, said, data)
+                part_head, key = head.to_bytes(), str(sample.key_expr)
+                self.in_loop(declared.call, len(data), hear, key, part_head, data)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
@@ -310,7 +310,7 @@ class ZenohEnd(ZenohSession, Bus):
             sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
         how = self._waiting_for_room[express]
 
-        def say() -> None:
+        def send() -> None:
             try:
                 _put(session, key, payload, how)
             finally:
@@ -325,7 +325,7 @@ class ZenohEnd(ZenohSession, Bus):
             self._sending += size
             self._doubtful += doubtful
             self._behind[way] += 1
-        sender.submit(say)
+        sender.submit(send)
 
     def publisher(
         self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
@@ -343,8 +343,8 @@ class ZenohEnd(ZenohSession, Bus):
         def on_sample(sample: Any) -> None:
             payload = sample.payload.to_bytes()
             if not full(len(payload)):
-                said = key or str(sample.key_expr)
-                in_loop(declared.call, len(payload), hear, said, payload)
+                key_text = key or str(sample.key_expr)
+                in_loop(declared.call, len(payload), hear, key_text, payload)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
@@ -510,7 +510,7 @@ class _ZenohPublisher(Publisher):
         zenoh = end.engine
         self._end = end
         self._heard = False
-        self._told = on_heard
+        self._on_change = on_heard
         self._urgent_key = key if urgent else None
 
         def declare(session: Any) -> Any:
@@ -541,8 +541,8 @@ class _ZenohPublisher(Publisher):
     def _on_heard(self, heard: bool) -> None:
         if heard != self._heard:
             self._heard = heard
-        if self._told is not None:
-            self._told(heard)
+        if self._on_change is not None:
+            self._on_change(heard)
 
     @property
     def heard(self) -> bool:
@@ -573,9 +573,9 @@ class _ZenohQuestion(BusQuestion):
             )
 
 
-def place_of(said: str) -> tuple[str, int] | None:
+def place_of(text: str) -> tuple[str, int] | None:
     """Return address and port in the engine's text; None if there are none."""
-    there = LINK.match(said)
+    there = LINK.match(text)
     return None if there is None else (plain_host(there["host"]), int(there["port"]))
 
 

@@ -18,17 +18,17 @@ CURE = "smartcam fleet certificates makes certificates: then listen: tls/..., ce
 Mistake = tuple[tuple[str, ...], str]
 
 
-def access_of(said: Access | None, listen: Sequence[str]) -> Access | None:
+def access_of(given: Access | None, listen: Sequence[str]) -> Access | None:
     """Return the effective access: with TLS roles, or any certificate could command."""
     tls = any(one.startswith("tls/") for one in listen)
-    return said or ("roles" if tls else None)
+    return given or ("roles" if tls else None)
 
 
-def access_mistakes(said: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
+def access_mistakes(given: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
     """Yield the mistakes in the access of a fleet file."""
     plain = [one for one in listen if not one.startswith("tls/")]
     open_to_all = [one for one in plain if not is_loopback(one[4:].rpartition(":")[0])]
-    access = access_of(said, listen)
+    access = access_of(given, listen)
     if access == "roles" and plain:
         yield (
             ("listen",),
@@ -41,5 +41,5 @@ def access_mistakes(said: Access | None, listen: Sequence[str]) -> Iterator[Mist
             f"{open_to_all[0]} accepts every program without a certificate, and each may command "
             f"the cameras. {CURE}. If this is wanted: access: {ANYONE}",
         )
-    elif said in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
-        yield ("access",), f"{said} needs listen: tls/... and certificates"
+    elif given in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
+        yield ("access",), f"{given} needs listen: tls/... and certificates"

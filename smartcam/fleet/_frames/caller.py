@@ -24,8 +24,8 @@ from smartcam.geometry import CameraModel
 
 if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Data
+    from smartcam.fleet._frames.stream_form import StreamForm
     from smartcam.fleet._frames.wire import FleetFrame, FrameForm
-    from smartcam.fleet._frames.wish import StreamWish
     from smartcam.fleet._program.caller import Caller
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -45,9 +45,9 @@ class StreamCounts:
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
-    def since(self, said: dict[str, Any], came: int = 1) -> tuple[int, int]:
+    def since(self, reply: dict[str, Any], came: int = 1) -> tuple[int, int]:
         """Return the numbers of skipped and lost frames since the last reply; ``came`` came."""
-        now = int(said["stream"]), int(said["sent"]), int(said["skipped"]), int(said["lost"])
+        now = int(reply["stream"]), int(reply["sent"]), int(reply["skipped"]), int(reply["lost"])
         last, self._last = self._last, now
         if last is None or last[0] != now[0]:  # the first reply, or of a new stream at the agent
             last = now[0], 0, 0, 0
@@ -69,7 +69,7 @@ class FrameCaller:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def about(self, wish: StreamWish) -> StreamFormat:
+    async def about(self, request: StreamForm) -> StreamFormat:
         """Return the format of the frames from the device, which is opened for that.
 
         Raises:
@@ -77,11 +77,11 @@ class FrameCaller:
         """
         loop = asyncio.get_running_loop()
         reply = await self._caller.call("about_frames", loop.time() + OPEN_TIMEOUT)
-        said = reply.fields["answer"]
+        answer = reply.fields["answer"]
         try:
-            rates = tuple(float(rate) for rate in said["rates"])
-            size = int(said["width"]), int(said["height"])
-            return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
+            rates = tuple(float(rate) for rate in answer["rates"])
+            size = int(answer["width"]), int(answer["height"])
+            return StreamFormat(find_format(request.pixels(str(answer["format"]))), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
@@ -187,20 +187,20 @@ class FrameCaller:
         caller.require()
         number = caller.program.next_call()
         incoming = caller.program.frames.expect(caller, number)
-        said_at = asyncio.get_running_loop().time()
+        sent_at = asyncio.get_running_loop().time()
         try:
             reply = await caller.call(do, deadline, arguments, number=number, timeout=timeout)
             answer = reply.fields["answer"]
-            said = answer.get("frame")
-            if said is None:
+            fields = answer.get("frame")
+            if fields is None:
                 return answer, []
-            data = await incoming.whole(int(said["size"]))
+            data = await incoming.whole(int(fields["size"]))
             if data is None:
                 return answer, []
-            caller.bound(float(answer["came"]), said_at)
-            units = answer.get("units", [said])
+            caller.bound(float(answer["came"]), sent_at)
+            units = answer.get("units", [fields])
             stream = "stream" in answer
-            skipped, lost = counts.since(answer, len(units)) if stream else (0, int(said["lost"]))
+            skipped, lost = counts.since(answer, len(units)) if stream else (0, int(fields["lost"]))
             epoch, place = int(reply.fields["epoch"]), 0
             frames: list[FleetFrame] = []
             for unit in units:
@@ -219,18 +219,18 @@ class FrameCaller:
         return {**answer, "skipped": skipped}, frames
 
     async def _made(
-        self, said: dict[str, Any], data: Data, lost: int, epoch: int, deadline: float
+        self, fields: dict[str, Any], data: Data, lost: int, epoch: int, deadline: float
     ) -> FleetFrame:
         """Return the frame for an agent's fields and bytes."""
-        earliest, latest = self._caller.here(float(said["captured"]))
+        earliest, latest = self._caller.here(float(fields["captured"]))
         return from_fields(
-            said,
+            fields,
             data,
             captured=(earliest + latest) / 2 - self._ahead,
             doubt=(latest - earliest) / 2,
             lost=lost,
             source=self.name,
-            camera_info=await self._lens(epoch, int(said["lens"]), deadline),
+            camera_info=await self._lens(epoch, int(fields["lens"]), deadline),
         )
 
     @property
@@ -247,9 +247,9 @@ class FrameCaller:
         key = epoch, number
         if key not in self._lenses:
             reply = await self._caller.call("lens", deadline, {"lens": number})
-            said = reply.fields["answer"]["lens"]
+            data = reply.fields["answer"]["lens"]
             try:
-                found = None if said is None else CameraModel.from_data(said)
+                found = None if data is None else CameraModel.from_data(data)
             except CalibrationError as exc:
                 raise RemoteProtocolError(f"{self.name}: invalid lens of the agent: {exc}") from exc
             self._lenses[key] = found
@@ -259,7 +259,7 @@ class FrameCaller:
 
     def leave(self, stream: int) -> None:
         """End a stream."""
-        self._caller.tell("leave_frames", {"stream": stream})
+        self._caller.notify("leave_frames", {"stream": stream})
 
     def next_stream(self) -> int:
         """Return the number of a new stream."""

@@ -65,13 +65,13 @@ class FramesOf(NamedTuple):
     Attributes:
         make: function that returns the source; None: there is none.
         url: address of the source, without a password; for people.
-        teller: observer of the camera's sessions that tells the others the picture of each result;
+        reporter: observer of the camera's sessions that reports the picture of each result;
             None: there is none.
     """
 
     make: Callable[[], FrameSource] | None
     url: str | None
-    teller: Observer | None = None
+    reporter: Observer | None = None
 
 
 NO_FRAMES = FramesOf(None, None)
@@ -94,7 +94,7 @@ class SharedFrames:
         sender: sender of the frames' bytes.
         encoder: encoder that makes frames small before they are sent.
         url: address of the source, without a password; for people.
-        told: whether the camera's observers are told the picture of each result.
+        reports_pictures: whether observers of the camera get the picture of each result.
     """
 
     name: str
@@ -102,7 +102,7 @@ class SharedFrames:
     sender: FrameSender
     encoder: FrameEncoder
     url: str | None = None
-    told: bool = False
+    reports_pictures: bool = False
     _source: FrameSource | None = None
     _opening: asyncio.Task[FrameSource] | None = None
     _viewers: dict[tuple[str, int], FrameStream] = field(
@@ -204,7 +204,7 @@ class SharedFrames:
         came = asyncio.get_running_loop().time()
         frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
         self._send([frame], order)
-        return {"came": came, "frame": self._said(frame, took)}
+        return {"came": came, "frame": self._frame_fields(frame, took)}
 
     async def get(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
@@ -234,7 +234,7 @@ class SharedFrames:
         came = asyncio.get_running_loop().time()
         frame, took = await self.triggered(order, wait=wait)
         self._send([frame], order)
-        return {"came": came, "frame": self._said(frame, took)}
+        return {"came": came, "frame": self._frame_fields(frame, took)}
 
     async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
         """Trigger the device; return its picture, and the seconds that it took to encode it."""
@@ -308,7 +308,7 @@ class SharedFrames:
                 if self._viewers.get(key) is viewer:
                     viewer.rest(lambda: self._leave(key, viewer))
         self._send([one.frame for one in taken], order)
-        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_said(taken)}
+        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_fields(taken)}
 
     async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
         """Begin a stream."""
@@ -397,15 +397,15 @@ class SharedFrames:
         data = frames[0].data if len(frames) == 1 else b"".join(one.data for one in frames)
         self.sender.send(order.program, order.call, data)
 
-    def _said(self, frame: Frame, took: float) -> dict[str, Any]:
+    def _frame_fields(self, frame: Frame, took: float) -> dict[str, Any]:
         """Return the fields that describe a frame."""
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
-    def _all_said(self, taken: list[TakenFrame]) -> dict[str, Any]:
+    def _all_fields(self, taken: list[TakenFrame]) -> dict[str, Any]:
         """Return the fields that describe all frames that go together."""
         if not taken[-1].number:
-            return {"frame": self._said(taken[-1].frame, taken[-1].took)}
-        units = [{**self._said(one.frame, one.took), "number": one.number} for one in taken]
+            return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
+        units = [{**self._frame_fields(one.frame, one.took), "number": one.number} for one in taken]
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._frames.caller import as_source_error
 from smartcam.fleet._frames.shared_driver import SharedFrameDriver
-from smartcam.fleet._frames.wish import StreamWish
+from smartcam.fleet._frames.stream_form import StreamForm
 from smartcam.fleet._opening import fleet_camera
 
 if TYPE_CHECKING:
@@ -28,15 +28,15 @@ class FleetFrameDriver(SharedFrameDriver):
     """
 
     def __init__(self, address: FrameAddress) -> None:
-        url, said = _split(address.url)
+        url, options = _split(address.url)
         numbers = {
-            name: address.number(name, said[name], least, most)
+            name: address.number(name, options[name], least, most)
             for name, (least, most) in _NUMBERS.items()
-            if name in said
+            if name in options
         }
         quality = numbers.get("quality")
-        wish = StreamWish.checked(
-            said.get("encoding", "raw"),
+        request = StreamForm.checked(
+            options.get("encoding", "raw"),
             None if quality is None else int(quality),
             numbers.get("bitrate"),
             numbers.get("latency"),
@@ -44,7 +44,7 @@ class FleetFrameDriver(SharedFrameDriver):
         )
         self._url = url
         self._camera = self._make()
-        super().__init__(address, self._camera.frame_caller, wish)
+        super().__init__(address, self._camera.frame_caller, request)
 
     def _make(self) -> FleetCamera[Any]:
         return fleet_camera(self._url, {}, ())
@@ -69,7 +69,7 @@ class FleetFrameDriver(SharedFrameDriver):
 def _split(url: str) -> tuple[str, dict[str, str]]:
     """Return a fleet URL, and the options for frames from its query."""
     parts = urlsplit(url)
-    said = parse_qsl(parts.query, keep_blank_values=True)
-    own = {key: value for key, value in said if key in {"encoding", *_NUMBERS}}
-    query = urlencode([(key, value) for key, value in said if key not in own])
+    pairs = parse_qsl(parts.query, keep_blank_values=True)
+    own = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
+    query = urlencode([(key, value) for key, value in pairs if key not in own])
     return urlunsplit(parts._replace(query=query)), own

@@ -30,14 +30,14 @@ def feature_fields(feature: Feature) -> dict[str, Any]:
     }
 
 
-def read_feature(said: object, who: str) -> Feature:
+def read_feature(data: object, who: str) -> Feature:
     """Return the feature in an agent's fields.
 
     Raises:
         RemoteProtocolError: the fields are not a valid feature.
     """
     try:
-        fields = cast("dict[str, Any]", said)
+        fields = cast("dict[str, Any]", data)
         kind, access, value = fields["kind"], fields["access"], fields["value"]
         if kind not in _KINDS or access not in _ACCESS:
             raise ValueError(f"kind {kind!r:.40}, access {access!r:.40}")
@@ -55,21 +55,21 @@ def read_feature(said: object, who: str) -> Feature:
         raise RemoteProtocolError(f"{who}: the agent's feature is not valid: {exc!r}") from exc
 
 
-def read_value(said: object, who: str) -> FeatureValue:
+def read_value(value: object, who: str) -> FeatureValue:
     """Return a value in an agent's reply.
 
     Raises:
         RemoteProtocolError: the value is not valid.
     """
-    if isinstance(said, (bool, int, float, str)):
-        return said
-    raise RemoteProtocolError(f"{who}: the agent's value of a feature is not valid: {said!r:.80}")
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    raise RemoteProtocolError(f"{who}: the agent's value of a feature is not valid: {value!r:.80}")
 
 
-def _number(said: object) -> float:
-    if isinstance(said, bool) or not isinstance(said, (int, float)):
-        raise TypeError(f"{said!r:.40} is no number")
-    return said
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{value!r:.40} is no number")
+    return value
 
 
 class FleetFeatures(DeviceFeatures):
@@ -90,8 +90,8 @@ class FleetFeatures(DeviceFeatures):
 
     async def names(self) -> list[str]:
         """Return the names of all features."""
-        said = await self._call("features", names_only=True)
-        return [str(one) for one in self._list(said, "names")]
+        answer = await self._call("features", names_only=True)
+        return [str(one) for one in self._list(answer, "names")]
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
@@ -105,29 +105,29 @@ class FleetFeatures(DeviceFeatures):
         return found[0]
 
     async def _described(self, **arguments: Any) -> list[Feature]:
-        said = await self._call("features", **arguments)
-        return [read_feature(one, self._name) for one in self._list(said, "features")]
+        answer = await self._call("features", **arguments)
+        return [read_feature(one, self._name) for one in self._list(answer, "features")]
 
-    def _list(self, said: dict[str, Any], name: str) -> list[Any]:
+    def _list(self, answer: dict[str, Any], name: str) -> list[Any]:
         """Return the items of an agent's list.
 
         Raises:
             RemoteProtocolError: the list is not valid, or has too many items.
         """
-        found = said.get(name)
+        found = answer.get(name)
         if not isinstance(found, list) or len(found) > MAX_FEATURES:
             raise RemoteProtocolError(f"{self._name}: the agent's list of {name} is not valid")
         return found
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""
-        said = await self._call("features", name=name, value_only=True)
-        return read_value(said.get("value"), self._name)
+        answer = await self._call("features", name=name, value_only=True)
+        return read_value(answer.get("value"), self._name)
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a feature; return the device's new value."""
-        said = await self._call("set_feature", name=name, value=value)
-        return read_value(said.get("value"), self._name)
+        answer = await self._call("set_feature", name=name, value=value)
+        return read_value(answer.get("value"), self._name)
 
     async def execute(self, name: str) -> None:
         """Execute a command, and wait until the device has done it."""

@@ -15,7 +15,7 @@ MAX_WAIT_SHARE = 0.04
 MIN_WAIT_SECONDS = 0.002
 """A frame may have waited this many seconds in any case."""
 
-PATIENCE = 1.25
+MAX_WAIT_PERIODS = 1.25
 """Number of periods to wait for the next frame; then the older one is sent after all."""
 
 
@@ -44,10 +44,10 @@ class FramePace:
         way = min(self._ways)
         since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
         if 0 < self._period <= way:  # otherwise the link is free before the next frame comes
-            until = came + PATIENCE * self._period
+            until = came + MAX_WAIT_PERIODS * self._period
         if rest and now < self._due:
             since = max(since, self._due - self._period / 2)
-            until = max(until, self._due + PATIENCE * self._period)
+            until = max(until, self._due + MAX_WAIT_PERIODS * self._period)
         return since, until
 
     def took(self, came: float, offered: int) -> None:

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from smartcam.fleet._frames.caller import FrameCaller
+    from smartcam.fleet._frames.stream_form import StreamForm
     from smartcam.fleet._frames.units import VideoUnits
     from smartcam.fleet._frames.wire import FleetFrame
-    from smartcam.fleet._frames.wish import StreamWish
     from smartcam.frames import (
         AwaitedTrigger,
         DeviceFeatures,
@@ -55,14 +55,14 @@ class SharedFrameDriver(FrameDriver):
     Args:
         address: address of the camera.
         frames: caller that asks the agent for frames.
-        wish: form and rate of the frames.
+        request: form and rate of the frames.
     """
 
     times_frames = True
 
-    def __init__(self, address: FrameAddress, frames: FrameCaller, wish: StreamWish) -> None:
+    def __init__(self, address: FrameAddress, frames: FrameCaller, request: StreamForm) -> None:
         super().__init__(address)
-        self._frames, self._wish = frames, wish
+        self._frames, self._request = frames, request
         self._task: asyncio.Task[None] | None = None
         self._video: VideoUnits | None = None
 
@@ -79,10 +79,10 @@ class SharedFrameDriver(FrameDriver):
             UnsupportedError: the camera has no frames.
             MissingExtraError: the package that decodes H.264 is not installed here.
         """
-        if self._wish.form.name == VIDEO and self._wish.decode:
+        if self._request.form.name == VIDEO and self._request.decode:
             load("av")
         try:
-            return await self._frames.about(self._wish)
+            return await self._frames.about(self._request)
         except (FrameSourceError, UnsupportedError, ConfigurationError):
             raise
         except SmartCamError as exc:
@@ -99,7 +99,7 @@ class SharedFrameDriver(FrameDriver):
         Raises:
             SmartCamError: the agent's error.
         """
-        form = self._wish.form
+        form = self._request.form
         picture = FrameForm("raw", None) if form.name == VIDEO else form
         return await self._frames.trigger(picture, timeout, wait=not refuse)
 
@@ -118,10 +118,10 @@ class SharedFrameDriver(FrameDriver):
 
     async def start(self, sink: FrameSink) -> None:
         """Start to request one frame after the other."""
-        if self._wish.form.name == VIDEO:
+        if self._request.form.name == VIDEO:
             from smartcam.fleet._frames.units import VideoUnits
 
-            self._video = VideoUnits(decode=self._wish.decode)
+            self._video = VideoUnits(decode=self._request.decode)
         stream = self._frames.next_stream()
         self._task = asyncio.get_running_loop().create_task(
             self._ask(sink, stream), name=f"frames of {self.name}"
@@ -189,8 +189,8 @@ class SharedFrameDriver(FrameDriver):
 
     def _arguments(self, stream: int) -> dict[str, Any]:
         """Return the arguments of the call for the next frame."""
-        arguments = {**self._wish.form.fields(), "stream": stream}
-        rate = self._wish.rate
+        arguments = {**self._request.form.fields(), "stream": stream}
+        rate = self._request.rate
         if rate is not None:
             arguments |= {"quality": rate.quality, "rest": rate.rest}
         if self._video is not None:
@@ -204,7 +204,7 @@ class SharedFrameDriver(FrameDriver):
         if self._video is not None:
             await self._video.give(sink, answer, frames)
             return
-        frame, rate = frames[-1], self._wish.rate
+        frame, rate = frames[-1], self._request.rate
         if rate is not None:
             here, age = frame.age, float(answer["frame"]["age"])
             rate.sent(len(frame.data), frame.captured + age, here - age, age=age)

@@ -32,6 +32,7 @@ VIDEO = "h264"
 """Further encoding, for streams only."""
 
 MIN_BITRATE, MAX_BITRATE = 10_000, 1_000_000_000
+"""Smallest and largest bit rate of H.264, bits per second."""
 
 
 class FrameForm(NamedTuple):
@@ -64,14 +65,14 @@ class FrameForm(NamedTuple):
             quality: quality of a JPEG; None: not given.
             who: name of the caller, for error texts.
             bitrate: bits per second; None: not given.
-            stream: whether the order is for a stream, which video can be.
+            stream: whether the request is for a stream; only streams may have :data:`VIDEO`.
 
         Raises:
             ConfigurationError: there is no such encoding, or it has no such quality or bit rate.
         """
         known = (*ENCODINGS, VIDEO) if stream else ENCODINGS
         if name not in known:
-            why = ": it is for streams, no frame of it is a picture by itself"
+            why = ": it is for streams only, since its frames depend on each other"
             raise ConfigurationError(
                 f"{who}: encoding: expected {', '.join(known)}, got {name!r:.40}"
                 f"{why if name == VIDEO else ''}"
@@ -92,8 +93,8 @@ class FrameForm(NamedTuple):
 
     def fields(self) -> dict[str, Any]:
         """Return the form as arguments of a call."""
-        said = {"encoding": self.name, "quality": self.quality}
-        return said if self.bitrate is None else {**said, "bitrate": self.bitrate}
+        fields = {"encoding": self.name, "quality": self.quality}
+        return fields if self.bitrate is None else {**fields, "bitrate": self.bitrate}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,14 +111,14 @@ class FleetFrame(Frame):
     rate: RateStatistics | None = None
 
 
-def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> dict[str, Any]:
+def to_fields(frame: Frame, ahead: float, encoding_time: float, lens_number: int) -> dict[str, Any]:
     """Return the fields that describe a frame, as JSON.
 
     Args:
         frame: the frame.
         ahead: seconds by which the agent's clock is ahead of ``time.monotonic()``.
         encoding_time: as in :class:`FleetFrame`.
-        lens: number of the frame's ``camera_info``; 0 for none.
+        lens_number: number of the frame's ``camera_info``; 0 for none.
     """
     return {
         "format": frame.format.name,
@@ -134,35 +135,39 @@ def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> di
         "age": frame.age,
         "size": len(frame.data),
         "encoding_time": encoding_time,
-        "lens": lens,
+        "lens": lens_number,
         **_more(frame, ahead),
     }
 
 
 def _more(frame: Frame, ahead: float) -> dict[str, Any]:
     """Return the fields that only some frames have."""
-    said: dict[str, Any] = {}
+    more: dict[str, Any] = {}
     chunks = {
         name: value
         for name, value in frame.chunks.items()
         if not isinstance(value, float) or math.isfinite(value)
     }
     if chunks:
-        said["chunks"] = chunks
+        more["chunks"] = chunks
     if frame.remark:
-        said["remark"] = frame.remark
+        more["remark"] = frame.remark
     if frame.trigger is not None:
-        said["trigger"] = {
+        more["trigger"] = {
             "number": frame.trigger.number,
             "fired": frame.trigger.fired + ahead,
             "evidence": [*frame.trigger.evidence],
         }
-    return said
+    return more
 
 
-def _read_more(said: dict[str, Any], captured: float, who: str) -> dict[str, Any]:
+def _read_more(fields: dict[str, Any], captured: float, who: str) -> dict[str, Any]:
     """Return the fields from :func:`_more`, by this side's clock."""
-    chunks, remark, trigger = said.get("chunks", {}), said.get("remark", ""), said.get("trigger")
+    chunks, remark, trigger = (
+        fields.get("chunks", {}),
+        fields.get("remark", ""),
+        fields.get("trigger"),
+    )
     if not isinstance(chunks, dict):
         raise TypeError("its chunks are not valid")
     read: dict[str, Any] = {
@@ -173,14 +178,14 @@ def _read_more(said: dict[str, Any], captured: float, who: str) -> dict[str, Any
         "remark": str(remark),
     }
     if trigger is not None:
-        fired = float(trigger["fired"]) - float(said["captured"]) + captured
+        fired = float(trigger["fired"]) - float(fields["captured"]) + captured
         evidence = tuple(map(str, trigger["evidence"]))
         read["trigger"] = FrameTrigger(int(trigger["number"]), fired, evidence)
     return read
 
 
 def from_fields(
-    said: dict[str, Any],
+    sent: dict[str, Any],
     data: Data,
     *,
     captured: float,
@@ -192,7 +197,7 @@ def from_fields(
     """Return the frame of an agent's fields and these arguments.
 
     Args:
-        said: fields from :func:`to_fields`.
+        sent: fields from :func:`to_fields`.
         data: bytes of the frame.
         captured: time of the capture by this side's ``time.monotonic()``.
         doubt: seconds by which ``captured`` may be wrong.
@@ -207,18 +212,18 @@ def from_fields(
     from smartcam.frames import find_format  # imports numpy, which not every program needs
 
     try:
-        width, height, stride = int(said["width"]), int(said["height"]), int(said["stride"])
-        duration, device = float(said["duration"]), said["device_time"]
-        pixels = str(said["format"])
+        width, height, stride = int(sent["width"]), int(sent["height"]), int(sent["stride"])
+        duration, device = float(sent["duration"]), sent["device_time"]
+        pixels = str(sent["format"])
         if width <= 0 or height <= 0 or stride < 0 or not 0 <= duration < math.inf:
             raise ValueError(f"{width}x{height}, rows of {stride} bytes")
         fields: dict[str, Any] = {
-            "moment": Moment[str(said["moment"])],
-            "utc": float(said["utc"]),
+            "moment": Moment[str(sent["moment"])],
+            "utc": float(sent["utc"]),
             "device_time": None if device is None else float(device),
-            "sequence": int(said["sequence"]),
-            "encoding_time": float(said["encoding_time"]),
-            **_read_more(said, captured, source),
+            "sequence": int(sent["sequence"]),
+            "encoding_time": float(sent["encoding_time"]),
+            **_read_more(sent, captured, source),
         }
     except (KeyError, TypeError, ValueError) as exc:
         raise RemoteProtocolError(f"{source}: the agent's frame is not valid: {exc!r}") from exc

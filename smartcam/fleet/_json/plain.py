@@ -261,7 +261,7 @@ class Plain:
                 f"{name}: expected camera_name, the name of a camera, got {camera!r:.80}"
             )
         if error is not None and (not isinstance(camera, str) or not camera):
-            _say(question, _Order("", name, service, fields, error).failed(error))
+            _reply(question, _Order("", name, service, fields, error).failed(error))
             return
         waited = self._pulse.waited()
         self._take(question, _Order(str(camera), name, service, fields, error, waited))
@@ -272,7 +272,7 @@ class Plain:
             f"{question.key!r:.200}: expected a key with exactly one camera and one service in it, "
             "without *; nothing was done"
         )
-        _say(question, failure(error))
+        _reply(question, failure(error))
 
     def _take(self, question: BusQuestion, order: _Order) -> None:
         if order.camera in self._agent.hosts:
@@ -281,7 +281,7 @@ class Plain:
         try:
             check_name(order.camera)
         except ConfigurationError as error:
-            _say(question, order.failed(error))  # every agent says the same
+            _reply(question, order.failed(error))  # every agent says the same
             return
         if self._is_full(question, order):
             return
@@ -294,7 +294,7 @@ class Plain:
             kind = "commands" if order.operates else "questions"
             full_of = f"{MAX_CONCURRENT_CALLS} {kind} are under way"
             text = f"{order.camera}: {full_of}; {order.name} was not done"
-            _say(question, order.failed(LocalProtocolError(text)))
+            _reply(question, order.failed(LocalProtocolError(text)))
         return full
 
     def _start(self, work: Any, order: _Order) -> None:
@@ -332,7 +332,7 @@ class Plain:
                 f"the fleet {self._keys.fleet} has no camera {order.camera!r}"
                 f"{did_you_mean(order.camera, self._agent.hosts)}; {order.name} was not done"
             )
-            _say(question, order.failed(error))
+            _reply(question, order.failed(error))
 
     async def _speaks_for_all(self, camera: str) -> bool:
         """Return True if no other agent has a camera and this agent is the first by its name."""
@@ -364,7 +364,7 @@ class Plain:
             ):
                 raise LocalProtocolError(f"{order.camera}: {order.name} is under way already")
         except SmartCamError as error:
-            _say(question, order.failed(error))
+            _reply(question, order.failed(error))
             return
         if call is None:
             if not self._is_full(question, order):
@@ -538,6 +538,6 @@ def _only_looks(key: str) -> bool:
     return service is not None and not service.command
 
 
-def _say(question: BusQuestion, answer: dict[str, Any]) -> None:
+def _reply(question: BusQuestion, answer: dict[str, Any]) -> None:
     question.reply(question.key, as_json(answer))
     question.close()

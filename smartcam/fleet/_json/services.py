@@ -287,8 +287,8 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
             f"{MAX_PICTURE_BYTES} at most",
             source=host.name,
         )
-    said = to_fields(frame, 0.0, took, 0)
-    own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
+    fields = to_fields(frame, 0.0, took, 0)
+    own = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
     if "trigger" in own:  # its time is by the agent's clock
         own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
     return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _TOPIC = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+){0,7}")
 
 
-def _said(value: object) -> object:
+def _none_if_empty(value: object) -> object:
     nothing = value == "" or (type(value) in {int, float} and value == 0)
     return None if nothing else value
 
@@ -40,9 +40,9 @@ class BusFields(PlainRequest):
     """The fields that a request on the bus may have besides those over ROS."""
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
-    id: Annotated[Id | None, BeforeValidator(_said)] = None
-    epoch: Annotated[Text | None, BeforeValidator(_said)] = None
-    deadline: Annotated[Deadline | None, BeforeValidator(_said)] = None
+    id: Annotated[Id | None, BeforeValidator(_none_if_empty)] = None
+    epoch: Annotated[Text | None, BeforeValidator(_none_if_empty)] = None
+    deadline: Annotated[Deadline | None, BeforeValidator(_none_if_empty)] = None
 
 
 def new_camera(request: SetupRequest) -> CameraSettings:

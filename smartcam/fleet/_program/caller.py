@@ -82,15 +82,15 @@ class Lease:
     Attributes:
         epoch: number of the start of the agent that made the reservation.
         lost: reason why the reservation is lost; empty while no loss is known.
-        told: whether an event has reported the loss.
+        reported: whether an event has reported the loss.
     """
 
-    __slots__ = ("epoch", "lost", "told")
+    __slots__ = ("epoch", "lost", "reported")
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
         self.lost: str = ""
-        self.told: bool = False
+        self.reported: bool = False
 
 
 class _HelloHeard(NamedTuple):
@@ -315,7 +315,7 @@ class Caller:
             epoch, clock = int(fields["epoch"]), float(fields["clock"])
             hello = dict(fields["answer"])
         except (KeyError, TypeError, ValueError) as exc:
-            raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
+            raise RemoteProtocolError(f"the agent {agent} sent an invalid hello: {exc}") from exc
         return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
 
     def _meet(self, heard: _HelloHeard) -> None:
@@ -351,11 +351,11 @@ class Caller:
         least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
 
-    def bound(self, clock: float, said: float) -> None:
+    def bound(self, clock: float, sent: float) -> None:
         """Bound the agent's clock, which showed ``clock`` after a message from this program."""
         now = asyncio.get_running_loop().time()
         most = self._most + MAX_DRIFT_RATIO * (now - self._bounded)
-        self._most, self._bounded = min(most, clock - said), now
+        self._most, self._bounded = min(most, clock - sent), now
 
     def here(self, clock: float) -> tuple[float, float]:
         """Return the loop's times between which the agent's clock showed ``clock``."""
@@ -398,14 +398,14 @@ class Caller:
     def lose_lease(self, number: int, why: str) -> None:
         """Note that a reservation is lost: no further command of its block is sent."""
         self.leases[number].lost = why
-        self.tell_leases_lost()
+        self.report_leases_lost()
 
-    def tell_leases_lost(self) -> None:
+    def report_leases_lost(self) -> None:
         """Report that this program's reservations are lost, unless that was reported before."""
-        untold = [one for one in self.leases.values() if not one.told]
-        for one in untold:
-            one.told = True
-        if untold:
+        unreported = [one for one in self.leases.values() if not one.reported]
+        for one in unreported:
+            one.reported = True
+        if unreported:
             self._on_lease_lost()
 
     def look_at_leases(self) -> None:
@@ -572,11 +572,11 @@ class Caller:
         if "error" in reply.fields:
             error = from_fields(reply.fields["error"])
             if isinstance(error, ReservationLostError) and self.leases:
-                self.lose_lease(next(iter(self.leases)), "its agent has said so")
+                self.lose_lease(next(iter(self.leases)), "its agent reported it")
             raise error
         return reply
 
-    def tell(self, do: str, arguments: dict[str, Any]) -> None:
+    def notify(self, do: str, arguments: dict[str, Any]) -> None:
         """Make a call without waiting for it, if there is an agent."""
         if self.met is not None and self._allowed(do):
             fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
@@ -598,7 +598,7 @@ class Caller:
         """
         program, met = self.program, self.met
 
-        def say() -> tuple[int, Outcome]:
+        def send() -> tuple[int, Outcome]:
             number = program.next_call()
             program.send(key, {"call": number, **fields})
             return number, program.expect(number, self)
@@ -617,10 +617,10 @@ class Caller:
                     return
                 finally:
                     program.forget(number)
-                number, answer = say()
+                number, answer = send()
 
         task = asyncio.get_running_loop().create_task(
-            repeat(*say()), name=f"smartcam.fleet.{self.camera}.insist"
+            repeat(*send()), name=f"smartcam.fleet.{self.camera}.insist"
         )
         self._insisting.add(task)
         task.add_done_callback(self._insisting.discard)
@@ -664,12 +664,12 @@ class Caller:
         agent = "the agent" if self.met is None else f"the agent {self.met.agent}"
         if do == "trigger":
             return TriggerTimeoutError(
-                f"{self.name}: {agent} said nothing within {waited:.3g} s; whether the camera "
+                f"{self.name}: {agent} did not answer within {waited:.3g} s; whether the camera "
                 f"was triggered is unknown{self._perhaps(do)}",
                 waited=waited,
             )
         return ResponseTimeoutError(
-            f"{self.name}: {agent} said nothing to {do} within {waited:.3g} s; whether it was "
+            f"{self.name}: {agent} did not answer {do} within {waited:.3g} s; whether it was "
             f"done is unknown{self._perhaps(do)}",
             waited=waited,
         )

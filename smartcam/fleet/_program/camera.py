@@ -177,9 +177,9 @@ class FleetCamera(Camera[ValueT]):
         settings = self.settings
         if spec is None and settings.calibration is not None:
             spec = "localizations"
-        said = "y_down" in settings.model_fields_set
+        is_given = "y_down" in settings.model_fields_set
         refused: ConfigurationError | None = None
-        for y_down in [settings.y_down] if said else [False, True]:
+        for y_down in [settings.y_down] if is_given else [False, True]:
             try:
                 return Interpretation(
                     spec,
@@ -306,7 +306,7 @@ class FleetCamera(Camera[ValueT]):
         loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
-        why: object = "there was none yet"
+        why: object = "none yet"
         try:
             async with asyncio.timeout_at(deadline + grace(timeout)):
                 while True:
@@ -329,7 +329,7 @@ class FleetCamera(Camera[ValueT]):
                         return
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"{self.name}: no session within {timeout:g} s; the last one: "
+                f"{self.name}: no session within {timeout:g} s; the last error: "
                 f"{self._trouble or why}",
                 waited=timeout,
             ) from exc
@@ -393,8 +393,8 @@ class FleetCamera(Camera[ValueT]):
         settings, layout = self.settings, hello.get("interpret_as")
         if isinstance(layout, dict):
             layout = {int(key): value for key, value in layout.items()}
-        said = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
-        changes = {key: on for key, on in said.items() if key not in settings.model_fields_set}
+        offered = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
+        changes = {key: on for key, on in offered.items() if key not in settings.model_fields_set}
         fields_set = settings.model_fields_set
         self.settings: CameraSettings = settings.model_copy(update=changes)
         self.settings.model_fields_set.intersection_update(fields_set)
@@ -452,37 +452,37 @@ class FleetCamera(Camera[ValueT]):
         for queue in self._watching:
             queue.put_nowait(what)
 
-    def _on_state(self, said: dict[str, Any]) -> None:
+    def _on_state(self, state: dict[str, Any]) -> None:
         """Process an event of the camera, with its present state."""
         if self._closed is not None:
             return
-        if said["kind"] == "Status" and self._changes_status_only(said):
-            self._take_status(_status(said["status"]), said)
+        if state["kind"] == "Status" and self._changes_status_only(state):
+            self._take_status(_status(state["status"]), state)
             return
-        at = _time(said)
-        linked = bool(said.get("connected"))
-        if said["kind"] == "Removed":
-            self._caller.removed(str(said.get("why")))
-        elif said["kind"] == "NoticeReceived":
-            self._take_notice(said.get("event", {}), at)
-        elif said["kind"] == "ReservationLost":
-            self._take_reservation_lost(str(said.get("by")), at)
-        if self._trying and not said.get("trying"):
+        at = _time(state)
+        linked = bool(state.get("connected"))
+        if state["kind"] == "Removed":
+            self._caller.removed(str(state.get("why")))
+        elif state["kind"] == "NoticeReceived":
+            self._take_notice(state.get("event", {}), at)
+        elif state["kind"] == "ReservationLost":
+            self._take_reservation_lost(str(state.get("by")), at)
+        if self._trying and not state.get("trying"):
             self._stir(self._status or Status(0))
-        self._trying = bool(said.get("trying"))
+        self._trying = bool(state.get("trying"))
         if not linked:
-            error, event = self._trouble_of(said), said.get("event", {})
+            error, event = self._trouble_of(state), state.get("event", {})
             self._lose(
                 error,
                 str(event.get("reason") or error),
                 expected=bool(event.get("expected")),
             )
-            if said.get("over") and self._closed is None:
+            if state.get("over") and self._closed is None:
                 self._counters.note_loss(error)
                 self._finish(error)
         elif not self._linked:
-            self._begin_session(said, at)
-        status, application = said.get("status"), said.get("application")
+            self._begin_session(state, at)
+        status, application = state.get("status"), state.get("application")
         if application is not None and application != self._active:
             previous, self._active = self._active, int(application)
             self._listeners.publish(
@@ -491,39 +491,43 @@ class FleetCamera(Camera[ValueT]):
                 )
             )
         if status is not None and linked:
-            self._take_status(_status(int(status)), said)
+            self._take_status(_status(int(status)), state)
 
-    def _changes_status_only(self, said: dict[str, Any]) -> bool:
+    def _changes_status_only(self, state: dict[str, Any]) -> bool:
         """Return True if an event leaves all but the camera's status as it is known."""
-        application = said.get("application")
+        application = state.get("application")
         return (
             self._linked
             and not self._trying
-            and "trying" not in said
-            and said.get("connected") is True
-            and said.get("status") is not None
+            and "trying" not in state
+            and state.get("connected") is True
+            and state.get("status") is not None
             and (application is None or application == self._active)
         )
 
-    def _take_notice(self, said: dict[str, Any], at: datetime) -> None:
+    def _take_notice(self, fields: dict[str, Any], at: datetime) -> None:
         """Publish a notice from the camera."""
         self._counters.note_notice()
-        kind, code, text = str(said.get("kind")), int(said.get("code", 0)), str(said.get("text"))
+        kind, code, text = (
+            str(fields.get("kind")),
+            int(fields.get("code", 0)),
+            str(fields.get("text")),
+        )
         event = NoticeReceived(camera=self.name, at=at, kind=kind, code=code, text=text)
         self._listeners.publish(event)
 
     def _take_reservation_lost(self, program: str, at: datetime) -> None:
         """Take the agent's report of a lost reservation; this program's may be known already."""
         if program == self._program.name and self._caller.leases:
-            self._caller.tell_leases_lost()
+            self._caller.report_leases_lost()
         else:
             self._publish_reservation_lost(program, at)
 
-    def _trouble_of(self, said: dict[str, Any]) -> LinkError:
+    def _trouble_of(self, state: dict[str, Any]) -> LinkError:
         """Return why the agent has no session with the camera."""
-        if "error" not in said:
+        if "error" not in state:
             return ConnectionLostError(f"{self.name}: the agent has no session with the camera yet")
-        error = from_fields(said["error"])
+        error = from_fields(state["error"])
         if isinstance(error, LinkError) and not isinstance(error, ConnectFailedError):
             return error
         lost = ConnectionLostError(
@@ -532,27 +536,27 @@ class FleetCamera(Camera[ValueT]):
         lost.__cause__ = error
         return lost
 
-    def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
+    def _begin_session(self, state: dict[str, Any], at: datetime) -> None:
         self._linked, self._trouble = True, None
         self._caller.linked = True
-        self._about |= said.get("about", {})
+        self._about |= state.get("about", {})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected
         self._listeners.publish(event(camera=self.name, at=at, url=self.url))
         self._stir(self._status or Status(0))
 
-    def _take_status(self, status: Status, said: dict[str, Any]) -> None:
+    def _take_status(self, status: Status, state: dict[str, Any]) -> None:
         listeners, previous = self._listeners, self._status
         self._status = status
-        if said["kind"] == "Status":
+        if state["kind"] == "Status":
             if listeners.hears_statuses:
                 listeners.offer_status(status, asyncio.get_running_loop().time())
         elif status == previous:
             return
         if status != previous and listeners.sees_events:
             listeners.publish(
-                StatusChanged(camera=self.name, at=_time(said), status=status, previous=previous)
+                StatusChanged(camera=self.name, at=_time(state), status=status, previous=previous)
             )
         if self._watching:
             self._stir(status)
@@ -565,8 +569,8 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def _place(self) -> Address:
-        told = self._about.get("url")
-        return self.settings.address if told is None else parse_address(told)
+        url = self._about.get("url")
+        return self.settings.address if url is None else parse_address(url)
 
     @property
     def ended(self) -> bool:
@@ -604,11 +608,11 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def capabilities(self) -> Capabilities:
-        said = self._about.get("capabilities")
-        if said is None:
+        flags = self._about.get("capabilities")
+        if flags is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         known = Capabilities.__dataclass_fields__
-        return Capabilities(**{key: value for key, value in said.items() if key in known})
+        return Capabilities(**{key: value for key, value in flags.items() if key in known})
 
     # ------------------------------------------------------------------ calls
 
@@ -660,7 +664,7 @@ class FleetCamera(Camera[ValueT]):
         own = receiver.own[number] = Own(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(request, application, expected, number, timeout)
-            receiver.take_told(reply)
+            receiver.take_states(reply)
             if not receiver.has(reply.states, reply.batch.following):
                 await self._reach(reply.states, reply.batch.following, deadline)
             return receiver.outcomes(own, reply.batch)
@@ -702,13 +706,13 @@ class FleetCamera(Camera[ValueT]):
             yield self
         except BaseException:
             self._expected = before
-            self._caller.tell("leave", {"entered": number, "wait": False})
+            self._caller.notify("leave", {"entered": number, "wait": False})
             raise
         self._expected = before
         if self.connected:
             await self._do("leave", limit, entered=number)
         else:  # the next session restores the application first
-            self._caller.tell("leave", {"entered": number, "wait": False})
+            self._caller.notify("leave", {"entered": number, "wait": False})
 
     @contextlib.asynccontextmanager
     async def _reserved(self, timeout: float) -> AsyncGenerator[Self]:
@@ -720,7 +724,7 @@ class FleetCamera(Camera[ValueT]):
             await self._check_kept(number)
         finally:
             leases.pop(number, None)
-            self._caller.tell("release", {"reservation": number})
+            self._caller.notify("release", {"reservation": number})
 
     async def _check_kept(self, reservation: int) -> None:
         """Check with the agent that a reservation has not ended; bounded.
@@ -744,7 +748,7 @@ class FleetCamera(Camera[ValueT]):
                 why = exc
             else:
                 if reply.fields["answer"].get("reserved") is not True:
-                    caller.lose_lease(reservation, "its agent has said so")
+                    caller.lose_lease(reservation, "its agent reported it")
                 caller.lease(reservation)
                 return
             raise ReservationLostError(
@@ -824,7 +828,7 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def has_frames(self) -> bool:
-        """True if the agent has said that the camera has frames."""
+        """True if the agent reported that the camera has frames."""
         return bool(self._about.get("frames"))
 
     def frame_source(
@@ -838,11 +842,11 @@ class FleetCamera(Camera[ValueT]):
 
     def _frame_source(self, wanted: StreamRequest) -> FrameSource:
         from smartcam.fleet._frames.shared_driver import SharedFrameDriver
-        from smartcam.fleet._frames.wish import StreamWish
+        from smartcam.fleet._frames.stream_form import StreamForm
         from smartcam.frames import FrameAddress, FrameSource
 
-        wish = StreamWish.checked(*wanted[:4], self.name, decode=wanted.decode)
-        driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wish)
+        request = StreamForm.checked(*wanted[:4], self.name, decode=wanted.decode)
+        driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, request)
         return FrameSource(driver, timeout=wanted.timeout, stall=None)
 
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
@@ -899,10 +903,10 @@ _status = functools.lru_cache(maxsize=256)(Status)
 """Return the status with given bits; a new object costs more than a look at the last ones."""
 
 
-def _time(said: dict[str, Any]) -> datetime:
-    if "event" not in said:
+def _time(state: dict[str, Any]) -> datetime:
+    if "event" not in state:
         return datetime.now(UTC)
     try:
-        return datetime.fromisoformat(said["event"]["at"])
+        return datetime.fromisoformat(state["event"]["at"])
     except (KeyError, TypeError, ValueError):
         return datetime.now(UTC)

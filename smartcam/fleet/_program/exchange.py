@@ -193,12 +193,12 @@ class Exchange(Bus):
         keys, bus = self._keys(), self._bus
         while agent in self._lacking:
             self._lacking.discard(agent)
-            told = await ask_cameras(bus, keys, agent, "**", ASK_AGAIN)
-            for one in told:
+            cameras = await ask_cameras(bus, keys, agent, "**", ASK_AGAIN)
+            for one in cameras:
                 places = self._places.get("results", {})
                 for place in tuple(places.get(keys.results(one.summary.camera), ())):
                     place.call(place.key, encode_runs(one.epoch, one.following, []))
-            if not told and await bus.present(keys.agent(agent), ASK_AGAIN):
+            if not cameras and await bus.present(keys.agent(agent), ASK_AGAIN):
                 self._lacking.add(agent)
                 await asyncio.sleep(ASK_AGAIN)
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Literal, Self
 
-    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
+    from smartcam.fleet._agent.outlet_service import ReportedOutlet, ReportedStore
     from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.bus import Bus, Handle
@@ -493,11 +493,11 @@ class Fleet:
         timeout = check_seconds(timeout, "timeout", "status")
         self._require_open()
         program = self._program
-        told = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
-        best = by_name(told, lambda one: (one.summary.connected, one.summary.agent))
+        summaries = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
+        best = by_name(summaries, lambda one: (one.summary.connected, one.summary.agent))
         return {name: best[name].summary for name in sorted(best)}
 
-    async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ToldOutlet]:
+    async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
         """Return the accounts of all agents' outlets, by agent and name.
 
         Args:
@@ -521,7 +521,7 @@ class Fleet:
         failed: bool = False,
         most: int = 100,
         timeout: float = STORE_TIMEOUT,
-    ) -> list[ToldStore]:
+    ) -> list[ReportedStore]:
         """Return the answers of agents' stores of results, by agent and outlet.
 
         Args:

@@ -158,8 +158,8 @@ class Program:
                 return found[0]
             if found:
                 raise ConfigurationError(
-                    f"{self._camera}: there are several fleets: {', '.join(found)}; say which one "
-                    f"is meant: ?fleet={found[0]}"
+                    f"{self._camera}: there are several fleets: {', '.join(found)}; choose one: "
+                    f"?fleet={found[0]}"
                 )
             await asyncio.sleep(min(LOOK_AGAIN, left))
         what, meant = "camera", ""
@@ -245,8 +245,8 @@ class Program:
                 message: Reply = outcome
                 number = outcome.call
             else:
-                message = said = decode(payload, "a reply")
-                number = said.fields["call"]
+                message = decoded = decode(payload, "a reply")
+                number = decoded.fields["call"]
             pending = self._pending.get(number)
         except (ProtocolError, KeyError, TypeError) as exc:
             logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)

@@ -44,8 +44,8 @@ def interpreted(
     """
     cells = fault = None
     if run.cells:
-        said: dict[str, Any] = json.loads(run.cells)
-        fault, given = said.get("fault"), said.get("cells")
+        content: dict[str, Any] = json.loads(run.cells)
+        fault, given = content.get("fault"), content.get("cells")
         cells = None if given is None else tuple(given)
     (data,) = run.payloads
     container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
@@ -80,25 +80,31 @@ def result_fields(
     The value is None with an error, and without an interpretation.
     """
     value = sequence = None
-    said: dict[str, Any] = {"error": ""}
+    outcome: dict[str, Any] = {"error": ""}
     if interpretation is not None:
         try:
             value, sequence, _ = interpreted(run, interpretation, camera)
             if localizations_of(value) is None:  # there is a faster way for localizations
                 value = plain(value)
         except InterpretationError as error:
-            value, said = None, failure(error)
+            value, outcome = None, failure(error)
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - a plug-in's value cannot become JSON
-            value, said = None, failure(InterpretationError(f"the value is no JSON: {exc!r:.200}"))
-    return {**as_result(run, camera, value, sequence)._asdict(), **said}
+            value, outcome = (
+                None,
+                failure(InterpretationError(f"the value is no JSON: {exc!r:.200}")),
+            )
+    return {**as_result(run, camera, value, sequence)._asdict(), **outcome}
 
 
 def failure(error: BaseException) -> dict[str, Any]:
     """Return an error for answers and results in JSON: ``error`` is never empty."""
-    said = to_fields(error, 0)
-    fields: dict[str, Any] = {"error": said["text"] or said["kind"], "kind": said["kind"]}
-    if "attributes" in said:
-        fields["attributes"] = said["attributes"]
+    described = to_fields(error, 0)
+    fields: dict[str, Any] = {
+        "error": described["text"] or described["kind"],
+        "kind": described["kind"],
+    }
+    if "attributes" in described:
+        fields["attributes"] = described["attributes"]
     return fields

@@ -35,38 +35,38 @@ FILL_TIMEOUT = 5.0
 """Seconds for the answer to a request for missing messages; then it is sent again."""
 
 
-class ToldState(NamedTuple):
+class StateMessage(NamedTuple):
     """An event of the camera, and its state after the event.
 
     Attributes:
         number: number of the event.
         next: number of the event after it.
-        said: fields of the event and of the camera's state.
+        fields: fields of the event and of the camera's state.
     """
 
     number: int
     next: int
-    said: dict[str, Any]
+    fields: dict[str, Any]
 
     @property
     def size(self) -> int:
         """Approximate number of bytes."""
         return 500
 
-    def since(self, number: int) -> ToldState:
+    def since(self, number: int) -> StateMessage:
         """Return this state, which has one number only."""
         return self
 
 
-def state(data: bytes) -> ToldState:
+def state(data: bytes) -> StateMessage:
     """Return the event from an agent's bytes.
 
     Raises:
         ValueError: the bytes are not an event.
     """
-    said = decode_state(data)
-    number: int = said["number"]
-    return ToldState(number, number + 1, said)
+    fields = decode_state(data)
+    number: int = fields["number"]
+    return StateMessage(number, number + 1, fields)
 
 
 class FleetListeners(Listeners):
@@ -149,7 +149,7 @@ class Receiver:
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
         self._program = 0  # the agent's number for this program
-        self._states: Feed[ToldState] = Feed(
+        self._states: Feed[StateMessage] = Feed(
             self._take_state, _ignore, lambda: self._lack("states")
         )
         self._results: Feed[ResultRun] = Feed(
@@ -315,7 +315,7 @@ class Receiver:
     # ------------------------------------------------------------------ messages
 
     def _hear_states(self, key: str, payload: bytes) -> None:
-        what = f"what the agent says of {self._camera}"
+        what = f"the agent's message about {self._camera}"
         try:
             message = decode(payload, what)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
@@ -331,14 +331,14 @@ class Receiver:
         self._states.receive(epoch, following, states)
         self._wake()
 
-    def take_told(self, reply: TriggerReply) -> None:
+    def take_states(self, reply: TriggerReply) -> None:
         """Take the states in a reply, which the agent has not published yet."""
-        if not reply.told:
+        if not reply.new_states:
             return
         try:
-            states = [state(one) for one in reply.told]
+            states = [state(one) for one in reply.new_states]
         except ValueError as exc:
-            logger.warning("%s ! what the agent says with a reply: %s", self._camera, exc)
+            logger.warning("%s ! the states in a reply are not valid: %s", self._camera, exc)
             return
         self._states.receive(reply.epoch, reply.states, states)
         self._wake()
@@ -369,8 +369,8 @@ class Receiver:
         counters.frames_received += 1
         counters.bytes_received += len(payload)
 
-    def _take_state(self, taken: ToldState) -> None:
-        self._on_state(taken.said)
+    def _take_state(self, taken: StateMessage) -> None:
+        self._on_state(taken.fields)
 
     # ------------------------------------------------------------------ results
 
@@ -498,5 +498,5 @@ def _things(kind: str, reply: BusMessage) -> list[Any]:
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 
-def _ignore(_count: int, _then: ToldState | None) -> None:
+def _ignore(_count: int, _then: StateMessage | None) -> None:
     """Ignore missed states: the next one has the camera's state."""

@@ -17,22 +17,22 @@ from smartcam.fleet._security.certificates import AGENT, OPERATOR, ROLES, ROUTER
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Does = Literal["say", "hear", "ask", "answer", "appear", "watch"]
+Does = Literal["put", "subscribe", "query", "answer", "present", "watch"]
 Flow = Literal["ingress", "egress"]
 
 MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
-    "say": (("put", "ingress"), ("declare_subscriber", "egress")),
-    "hear": (("declare_subscriber", "ingress"), ("put", "egress")),
-    "ask": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
+    "put": (("put", "ingress"), ("declare_subscriber", "egress")),
+    "subscribe": (("declare_subscriber", "ingress"), ("put", "egress")),
+    "query": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
     "answer": (("declare_queryable", "ingress"), ("query", "egress"), ("reply", "ingress")),
-    "appear": (("liveliness_token", "ingress"),),
+    "present": (("liveliness_token", "ingress"),),
     "watch": (
         ("liveliness_query", "ingress"),
         ("declare_liveliness_subscriber", "ingress"),
         ("liveliness_token", "egress"),
     ),
 }
-"""The engine's messages for each kind of use, and their direction as seen from the engine."""
+"""Zenoh's messages for each kind of use, and their direction as seen from Zenoh."""
 
 
 class Right(NamedTuple):
@@ -57,54 +57,54 @@ _LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 
 RIGHTS: tuple[Right, ...] = (
     Right(
-        "see which agents and cameras are there",
+        "see which agents and cameras are present",
         "watch",
         (_ANY.agent("*"), _ANY.camera("*", "**")),
         _LOOKS,
     ),
     *(
         Right(
-            "be there under a name of its role", "appear", (_ANY.program(names_of(role)),), (role,)
+            "be present under a name of its role",
+            "present",
+            (_ANY.program(names_of(role)),),
+            (role,),
         )
         for role in _LOOKS
     ),
-    Right("hear results and states", "hear", (_ANY.results("**"), _ANY.states("**")), _LOOKS),
+    Right("get results and states", "subscribe", (_ANY.results("**"), _ANY.states("**")), _LOOKS),
     *(
-        Right("ask what changes nothing, as its role", "say", (_ANY.ask(role, "*", "**"),), (role,))
+        Right("send queries as its role", "put", (_ANY.ask(role, "*", "**"),), (role,))
         for role in _LOOKS
     ),
-    Right("get answers and frames", "hear", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
-    Right("hear results in bundles", "hear", (_ANY.bundle("*"),), _LOOKS),
-    Right("ask what agents know of all cameras", "ask", (_ANY.summary("*"),), _LOOKS),
-    Right("JSON: list the cameras", "ask", (_ANY.listing("**"),), _LOOKS),
-    Right("JSON: ask what outlets did", "ask", (_ANY.outlets("*", "*"),), _LOOKS),
-    Right("JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS),
+    Right("get answers and frames", "subscribe", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
+    Right("get results in bundles", "subscribe", (_ANY.bundle("*"),), _LOOKS),
+    Right("request the state of all cameras", "query", (_ANY.summary("*"),), _LOOKS),
+    Right("JSON: list the cameras", "query", (_ANY.listing("**"),), _LOOKS),
+    Right("JSON: request the outlets' accounts", "query", (_ANY.outlets("*", "*"),), _LOOKS),
+    Right(
+        "JSON: get topics", "subscribe", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS
+    ),
     Right(
         "JSON: services that change nothing",
-        "ask",
+        "query",
         tuple(_ANY.service("**", name) for name in _LOOKING),
         _LOOKS,
     ),
-    Right("command", "say", (_ANY.command("*", "**"),), _ACTS),
-    Right("JSON: all services", "ask", (f"{_ANY.root}/service/**", _ANY.thesis("*")), _ACTS),
-    Right("have an agent read its file again", "ask", (_ANY.reload("*"),), _ACTS),
+    Right("command", "put", (_ANY.command("*", "**"),), _ACTS),
+    Right("JSON: all services", "query", (f"{_ANY.root}/service/**", _ANY.thesis("*")), _ACTS),
+    Right("make an agent read its file again", "query", (_ANY.reload("*"),), _ACTS),
     Right("read its file again", "answer", (_ANY.reload("*"),), _SHARES),
-    Right("share cameras", "appear", (_ANY.agent("*"), _ANY.camera("*", "**")), _SHARES),
-    Right("have a name of its own", "appear", (_ANY.start("*", "*"),), _SHARES),
-    Right("see who has its name", "watch", (_ANY.start("*", "*"),), _SHARES),
-    Right("see which programs are there", "watch", (_ANY.program("*"),), _SHARES),
-    Right(
-        "take calls",
-        "hear",
-        (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")),
-        _SHARES,
-    ),
-    Right("answer calls", "say", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
-    Right("tell results and states", "say", (_ANY.results("**"), _ANY.states("**")), _SHARES),
-    Right("tell results in bundles", "say", (_ANY.bundle("*"),), _SHARES),
-    Right("say what it knows of all cameras", "answer", (_ANY.summary("*"),), _SHARES),
-    Right("JSON: tell what its outlets did", "answer", (_ANY.outlets("*", "*"),), _SHARES),
-    Right("JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
+    Right("share cameras", "present", (_ANY.agent("*"), _ANY.camera("*", "**")), _SHARES),
+    Right("reserve its own name", "present", (_ANY.start("*", "*"),), _SHARES),
+    Right("see which agent has its name", "watch", (_ANY.start("*", "*"),), _SHARES),
+    Right("see which programs are present", "watch", (_ANY.program("*"),), _SHARES),
+    Right("get calls", "subscribe", (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")), _SHARES),
+    Right("answer calls", "put", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
+    Right("publish results and states", "put", (_ANY.results("**"), _ANY.states("**")), _SHARES),
+    Right("publish results in bundles", "put", (_ANY.bundle("*"),), _SHARES),
+    Right("report the state of all its cameras", "answer", (_ANY.summary("*"),), _SHARES),
+    Right("JSON: report its outlets' accounts", "answer", (_ANY.outlets("*", "*"),), _SHARES),
+    Right("JSON: publish topics", "put", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
     Right(
         "JSON: list, serve",
         "answer",

@@ -33,7 +33,7 @@ ROUTER_FILE = "router.json5"
 LIFETIME = timedelta(days=365)
 AUTHORITY_LIFETIME = timedelta(days=3650)
 
-SOON = timedelta(days=30)
+RENEWAL_TIME = timedelta(days=30)
 """Time before its end, or a third of its lifetime if less, at which a certificate is renewed."""
 
 BEFORE = timedelta(days=1)
@@ -97,8 +97,8 @@ def make_certificates(
         for name in several:
             if check_word(name, role) == AUTHORITY or names.setdefault(name, role) != role:
                 raise ConfigurationError(f"certificates: {name} is taken: expected another name")
-    said = [*dict.fromkeys(hosts)]
-    for host in said:
+    unique_hosts = [*dict.fromkeys(hosts)]
+    for host in unique_hosts:
         if not HOST.fullmatch(host):
             raise ConfigurationError(f"certificates: {host!r:.80} is no name or address of a host")
     authority = _Authority.of(folder)
@@ -113,7 +113,7 @@ def make_certificates(
                 f"for the {role}, or delete {folder / name}"
             )
     return [
-        authority.make(role, name, said if name in names else [], lifetime)
+        authority.make(role, name, unique_hosts if name in names else [], lifetime)
         for name, role in sorted(known.items())
     ]
 
@@ -321,7 +321,7 @@ def _hosts_of(certificate: Any) -> list[str]:
 def _ends_soon(certificate: Any) -> bool:
     ends, begins = certificate.not_valid_after_utc, certificate.not_valid_before_utc
     lifetime = ends - begins - BEFORE
-    return bool(ends - datetime.now(UTC) <= min(SOON, lifetime / 3))
+    return bool(ends - datetime.now(UTC) <= min(RENEWAL_TIME, lifetime / 3))
 
 
 def _pem(certificate: Any) -> bytes:

@@ -85,10 +85,12 @@ def decode_jpeg(
         if not remark.strip() or any(one in remark.lower() for one in DAMAGE):
             raise _wrong(what, data, exc) from exc
         _check_restarts(data, what, exc)
-        return DecodedJpeg(_read_past(decode, data, colours, what), remark)
+        return DecodedJpeg(_decode_tolerantly(decode, data, colours, what), remark)
 
 
-def _read_past(decode: Any, data: bytes | bytearray | memoryview, colours: str, what: str) -> Any:
+def _decode_tolerantly(
+    decode: Any, data: bytes | bytearray | memoryview, colours: str, what: str
+) -> Any:
     try:
         return decode(_joined_segments(bytes(data)), colours, strict=False)
     except ValueError as exc:

@@ -21,8 +21,8 @@ MAX_PLAIN_BYTES: Final = 16 << 20
 """Largest size of an unpacked description, bytes; those of large cameras have 2 MB."""
 
 MAX_PACKED_BYTES: Final = 4 << 20
-"""Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. Each 46 bytes can
-declare a file, which takes 8 us."""
+"""Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. An archive can
+declare a file in 46 bytes; listing one takes 8 us."""
 
 MAX_LEVELS: Final = 32
 """Largest depth of nested elements of a description."""
@@ -103,8 +103,8 @@ def unpack(data: bytes) -> bytes:
     """Return a description's text, from a ZIP archive the text of its first XML file.
 
     Raises:
-        MessageError: the archive cannot be unpacked, has more than :data:`MAX_PLAIN_BYTES`, or uses
-            another compression than DEFLATE, with which a few bytes could stand for gigabytes.
+        MessageError: the archive cannot be unpacked, has more than :data:`MAX_PLAIN_BYTES`, or is
+            not compressed by DEFLATE; with other methods a few bytes may unpack to gigabytes.
     """
     if not data.startswith(b"PK"):
         return data.rstrip(b"\0")

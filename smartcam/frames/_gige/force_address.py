@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 ANSWER_TIMEOUT: Final = 1.0
 """Seconds for the answer to one request."""
 
-TRIES: Final = 3
+MAX_ATTEMPTS: Final = 3
 
 APPEAR_TIMEOUT: Final = 5.0
 """Seconds until the camera answers a search by its new address."""
@@ -173,7 +173,7 @@ async def _sent(
                     allow_broadcast=True,
                 )
                 opened.append((transport, place))
-        for _ in range(TRIES):
+        for _ in range(MAX_ATTEMPTS):
             for transport, place in opened:
                 for target in place.targets:
                     transport.sendto(datagram, (target, port))
@@ -182,8 +182,9 @@ async def _sent(
                 break
         else:
             raise FrameTimeoutError(
-                f"{camera.info.label}: no answer to FORCEIP in {TRIES} x {ANSWER_TIMEOUT:g} s: a "
-                "camera controlled by another application does not answer"
+                f"{camera.info.label}: no answer to FORCEIP in "
+                f"{MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s: "
+                "a camera controlled by another application does not answer"
             )
     finally:
         for transport, _ in opened:

@@ -88,8 +88,8 @@ def planes_to_rgb(
         parts = [one[top : top + step] for one in chroma]
         if across * down > 1:
             size = (columns * across, len(parts[0]) * down)
-            woven = cv2.merge(parts)
-            parts = [cv2.resize(woven, size, interpolation=cv2.INTER_NEAREST)]
+            interleaved = cv2.merge(parts)
+            parts = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
         band = slice(top * down, (top + step) * down)
         merged = cv2.merge([y[band], *(one[: height - band.start, :width] for one in parts)])
         if spare:  # bits above the depth have no meaning

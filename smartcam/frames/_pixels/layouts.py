@@ -234,15 +234,15 @@ class Planes(PixelLayout):
     Attributes:
         across: pixels along a row that share a U and a V.
         down: rows that share a U and a V.
-        woven: whether U and V alternate in one plane with the stride of Y; else they have separate
-            planes.
+        interleaved: whether U and V alternate in one plane with the stride of Y; else they have
+            separate planes.
         matrix: name of the matrix in ``MATRICES``.
         depth: bits of a sample; more than 8 take two bytes, the low one first.
     """
 
     across: int
     down: int
-    woven: bool
+    interleaved: bool
     matrix: str
     depth: int = 8
 
@@ -253,7 +253,7 @@ class Planes(PixelLayout):
 
     def least_stride(self, width: int) -> int:
         """Return the number of bytes of a row of Y, or of U and V if that is larger."""
-        return self.size_of * (-(-width // self.across) * 2 if self.woven else width)
+        return self.size_of * (-(-width // self.across) * 2 if self.interleaved else width)
 
     def _chroma(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
         """Return the width, height and stride of U and V."""
@@ -262,12 +262,12 @@ class Planes(PixelLayout):
     def chroma_stride(self, stride: int) -> int:
         """Return the bytes from row to row of U and V."""
         samples = stride // self.size_of
-        return stride if self.woven else self.size_of * -(-samples // self.across)
+        return stride if self.interleaved else self.size_of * -(-samples // self.across)
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes of all planes."""
         _, rows, own = self._chroma(width, height, stride)
-        return stride * height + own * rows * (1 if self.woven else 2)
+        return stride * height + own * rows * (1 if self.interleaved else 2)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return the bytes, (N,)."""
@@ -282,8 +282,8 @@ class Planes(PixelLayout):
         across, down, own = self._chroma(width, height, stride)
         size, kind = self.size_of, f"<u{self.size_of}"
         y = _view(picture, kind, (height, width), (stride, size))
-        begin, step = stride * height, size * (2 if self.woven else 1)
-        apart = size if self.woven else own * down
+        begin, step = stride * height, size * (2 if self.interleaved else 1)
+        apart = size if self.interleaved else own * down
         u, v = (
             _view(picture, kind, (down, across), (own, step), begin + place) for place in (0, apart)
         )
@@ -301,7 +301,7 @@ class Planes(PixelLayout):
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         y, *chroma = self.planes(picture)
-        if self.woven:
+        if self.interleaved:
             shape, strides = (*chroma[0].shape, 2), (*chroma[0].strides, self.size_of)
             begin = picture.stride * picture.height
             chroma = [_view(picture, f"<u{self.size_of}", shape, strides, begin)]

@@ -171,7 +171,7 @@ def _repacked(video: Any) -> Any:
         return video.reformat(format=to[deep > 8])
     if len(parts) == 1:
         return video.reformat(format=_wider_grey(kind.name, deep))
-    return _with_known_sharing(video, deep, alpha=alpha)
+    return _with_supported_subsampling(video, deep, alpha=alpha)
 
 
 def _wider_grey(name: str, deep: int) -> str:
@@ -179,8 +179,8 @@ def _wider_grey(name: str, deep: int) -> str:
     return "gray" if deep <= 8 else little if little in _SAMPLES else "gray16le"
 
 
-def _with_known_sharing(video: Any, deep: int, *, alpha: bool) -> Any:
-    """Return Y, U and V in planes of a supported format."""
+def _with_supported_subsampling(video: Any, deep: int, *, alpha: bool) -> Any:
+    """Return the frame with a supported chroma subsampling."""
     kind, size = video.format, (video.width, video.height)
     across, down = (round(one / part) for one, part in zip(size, _chroma(video), strict=True))
     bits = next(one for one in (8, 10, 12, 16) if deep <= one)
@@ -245,7 +245,7 @@ def _rows(plane: Any) -> NDArray[np.uint8]:
 def _tight(plane: Any, found: PixelFormat) -> bytes:
     """Return the rows of a plane without padding."""
     layout: Any = found.layout
-    size = layout.size_of * (2 if layout.woven and plane.index else 1)
+    size = layout.size_of * (2 if layout.interleaved and plane.index else 1)
     rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return rows[:, : plane.width * size].tobytes()
 
@@ -361,7 +361,7 @@ def _encodable(found: PixelFormat) -> str | None:
     if isinstance(layout, YuvPairs):
         return "uyvy422" if layout.y else "yuyv422"
     if isinstance(layout, Planes) and layout.depth == 8:
-        return "nv12" if layout.woven else f"yuv{_SUBSAMPLING[layout.across, layout.down]}p"
+        return "nv12" if layout.interleaved else f"yuv{_SUBSAMPLING[layout.across, layout.down]}p"
     return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(found.name)
 
 
@@ -395,7 +395,7 @@ def _filled(frame: Frame, name: str) -> Any:
     layout = frame.format.layout
     if isinstance(layout, Planes):
         y, u, v = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
-        parts = [y, np.stack((u, v), axis=-1)] if layout.woven else [y, u, v]
+        parts = [y, np.stack((u, v), axis=-1)] if layout.interleaved else [y, u, v]
     else:
         parts = [frame.array()]
     for plane, part in zip(video.planes, parts, strict=True):

@@ -364,13 +364,13 @@ def _result(
             fit, _ = _steps(pixels, segments, shape, widened, None, ground, noise)
             again = _equations((fit, blurs), segments, shape.pose, use, MAX_STEPS)
             rows, weights, noise = again[0], np.where(seen, again[1], 0.0), again[2]
-            told = rows, fit.shifts, weights
-            solved = _solve(told, free, expected.off(shape), expected.sigmas)
+            weighted = rows, fit.shifts, weights
+            solved = _solve(weighted, free, expected.off(shape), expected.sigmas)
             if solved is None:
                 return None
             shape = shape.moved(solved[0])
-    told = rows, fit.shifts, np.where(seen, weights, 0.0)
-    settled = _settled(told, free, expected.off(shape), expected.sigmas)
+    weighted = rows, fit.shifts, np.where(seen, weights, 0.0)
+    settled = _settled(weighted, free, expected.off(shape), expected.sigmas)
     if settled is None:
         return None
     move, covariance, kept, chi_square = settled
@@ -416,8 +416,8 @@ def _settled(
         chi_square = float((away[kept] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
     misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part is not quite the taught one
-    told = rows[kept], shifts[kept], weights[kept]
-    solved = _changed(told, free, off, sigmas, max(chi_square, 1.0))
+    weighted = rows[kept], shifts[kept], weights[kept]
+    solved = _changed(weighted, free, off, sigmas, max(chi_square, 1.0))
     if solved is None:
         return None
     move, covariance = solved

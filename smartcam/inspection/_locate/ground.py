@@ -1,6 +1,6 @@
 """Fit steps whose sides are not of one level, such as edges of a part on a textured ground.
 
-What the light beside an edge does *along* the edge moves no step, so it can be told without one.
+What the light beside an edge does *along* the edge moves no step, so it can be measured alone.
 A texture does the same across the edge, where it does move the step: each side then has a slope
 that is unknown, but no larger than those along the edges around it.
 """
@@ -71,18 +71,18 @@ def ground_beside(
     along, ones = places[1] / BAND_PX, np.ones_like(rise)
     columns = np.stack([ones, rise, slope, (1 - rise) * along, rise * along])
     values, inverse, variances, _ = _solved(columns, pixels, np.zeros((len(used), 5)))
-    told = used & (variances > 0)
-    if np.count_nonzero(told) < MIN_BANDS:
+    measured = used & (variances > 0)
+    if np.count_nonzero(measured) < MIN_BANDS:
         return None
-    by_noise = float(np.median(variances[told])) * np.diagonal(inverse, axis1=1, axis2=2)
+    by_noise = float(np.median(variances[measured])) * np.diagonal(inverse, axis1=1, axis2=2)
     found = []
     for side, way in ((3, -0.5), (4, 0.5)):
-        squares, noise = values[told, side] ** 2, by_noise[told, side]
+        squares, noise = values[measured, side] ** 2, by_noise[measured, side]
         if float(np.percentile(squares / noise, 75)) < GROUND_SQUARE:
             found.append(np.zeros(len(used)))
             continue
         at = segments.middles + way * BAND_PX * segments.normals
-        far = np.linalg.norm(at[:, None] - at[told], axis=2)
+        far = np.linalg.norm(at[:, None] - at[measured], axis=2)
         near = np.exp(-0.5 * (far / NEAR_PX) ** 2) / noise
         beyond = (near @ (squares - noise)) / np.maximum(near.sum(axis=1), 1e-9)
         found.append(np.sqrt(np.maximum(beyond, 0.0)))

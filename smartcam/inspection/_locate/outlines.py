@@ -1,4 +1,4 @@
-"""Outlines of parts in files of DXF and SVG, and draw a picture of such a part.
+"""Read outlines of parts from files of DXF and SVG, and draw a picture of such a part.
 
 The libraries ezdxf and fontTools read the curves; here lines whose ends meet are joined to loops. A
 loop inside a loop is a hole.
@@ -156,14 +156,13 @@ def _dxf_lines(
         raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: expected DXF")
     try:
         drawing = ezdxf.readfile(path)
-        said = unit or DXF_UNITS.get(int(drawing.header.get("$INSUNITS", 0)))
-        if said is None:
+        unit_name = unit or DXF_UNITS.get(int(drawing.header.get("$INSUNITS", 0)))
+        if unit_name is None:
             raise TeachingError(
                 TeachingTrouble.UNIT,
-                f"{path}: its header says no unit that is known here: say unit, one of "
-                f"{', '.join(MM)}",
+                f"{path}: its header names no known unit: set unit to one of {', '.join(MM)}",
             )
-        scale = MM[said] * pixels_per_mm
+        scale = MM[unit_name] * pixels_per_mm
         for entity in disassemble.recursive_decompose(drawing.modelspace()):
             if layers and entity.dxf.layer not in layers:
                 continue
@@ -225,7 +224,7 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
     if None in sizes:
         raise TeachingError(
             TeachingTrouble.UNIT,
-            f'{path}: its width and height say no unit, such as width="50mm": say unit, one of '
+            f'{path}: its width and height have no unit, such as width="50mm": set unit to one of '
             f"{', '.join(MM)}",
         )
     millimetres = [(one[0] * MM[one[1]], one[1]) for one in sizes if one is not None]
@@ -347,7 +346,7 @@ def _loop(corners: Array) -> Array:
 
 
 def _steps(radius: float, flat: float) -> int:
-    """Return the number of corners of a polygon within the flatness of a circle."""
+    """Return how many corners a polygon needs to be within ``flat`` of a circle."""
     return max(16, math.ceil(math.pi / math.sqrt(2 * min(flat / max(radius, 1e-9), 0.5))))
 
 
@@ -423,7 +422,7 @@ def _one_matrix(name: str, values: list[float]) -> Array:
 def drawn_outline(
     outline: Outline, *, bright: bool
 ) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Return the picture (H, W) of a part, and the place of its first pixel from the origin."""
+    """Return the picture (H, W) of a part, and its first pixel's place in the drawing, pixels."""
     points = np.concatenate(outline.loops)
     low = np.floor(points.min(axis=0)).astype(int) - MARGIN_PX
     width, height = (np.ceil(points.max(axis=0)).astype(int) + MARGIN_PX + 1 - low).tolist()
@@ -457,7 +456,7 @@ def _areas(loops: list[Array], shape: tuple[int, int]) -> Array:
     row, across = np.concatenate(rows), np.concatenate(crossings)
     order = np.lexsort((across, row))
     row, across = row[order], across[order]
-    # the crossings of a row enter and leave the part in turn; from each one to the right
+    # crossings of a row enter and leave the part in turn; each changes all pixels to its right
     signs = np.where(np.arange(len(row)) % 2, -1.0, 1.0) / SUBROWS
     first = np.floor(across).astype(int)
     canvas = np.zeros((shape[0], shape[1] + 2))

@@ -1,4 +1,4 @@
-"""Find out at which turns a part looks like itself."""
+"""Find the turns by which a part looks like itself."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.inspection._locate.segments import Segments
 
-SAME: Final = 0.97
-"""Part of the outline that a turn brings onto itself, from which on it is the same part."""
+MIN_SAME_SHARE: Final = 0.97
+"""Least share of the outline that a symmetry's turn brings onto the outline."""
 
-ALIKE: Final = 0.75
-"""Part of the outline from which on a turned part may be taken for one that is not turned."""
+MIN_ALIKE_SHARE: Final = 0.75
+"""Least share of the outline for a turn by which a part may be mistaken for the unturned part."""
 
 MAX_FOLD: Final = 24
-"""Turns of the full circle up to which a part is told from a round one."""
+"""Largest fold of a symmetry that is distinguished from a round part."""
 
 NEAR_PX: Final = 1.5
-"""Pixels beside the outline that a turned point may be."""
+"""Largest distance of a turned point from the outline, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
 """Largest angle between the direction of a turned edge and that of the edge that it lies on."""
 
 CENTRE_STEPS: Final = 6
-"""Steps in which the place is found that a part turns about."""
+"""Number of iterations that find the centre of a part's turns."""
 
 CENTRE_PX: Final = 8.0
-"""Largest distance, pixels, of a turned segment from the one that it lies on, at the first step."""
+"""Largest distance, pixels, between a turned segment and its partner, in the first iteration."""
 
-MIN_MET: Final = 8
-"""Least number of segments that lie on another one when they are turned."""
+MIN_PAIRED_SEGMENTS: Final = 8
+"""Least number of turned segments with a partner."""
 
 COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
-"""Folds of which the middle is always looked for: a notch may move the reference off it."""
+"""Folds whose centre is always searched for: a notch may move the reference away from it."""
 
 MAX_POINTS: Final = 1000
-"""Edge pixels that are turned, about."""
+"""Approximate number of edge pixels that are turned."""
 
-TURNS: Final = 720
+ANGLE_COUNT: Final = 720
 """Turns of the full circle that are tried."""
 
 
@@ -66,42 +66,42 @@ class Symmetry:
 
     @property
     def period(self) -> float:
-        """Angle after which the part is the same, radians; an angle is told modulo this."""
+        """Angle after which the part is the same, radians; an angle is known modulo this."""
         return 2 * math.pi / max(self.fold, 1)
 
     def text(self) -> str:
-        """Return the sentence that people are told."""
+        """Return a sentence about the symmetry, for people."""
         if self.fold == 0:
             return "round: it has no angle"
-        said = "has one angle"
+        sentence = "has one angle"
         if self.fold > 1:
-            said = f"the same every {360 / self.fold:g} degrees: its angle is told modulo that"
+            sentence = f"the same every {360 / self.fold:g} degrees: its angle is known modulo that"
         if self.alike:
             angle, share = self.alike[0]
-            said += (
+            sentence += (
                 f"; turned by {math.degrees(angle):.0f} degrees, {100 * share:.0f} % of it are "
-                "the same: what differs must be in sight"
+                "the same: the rest must be visible"
             )
-        return said
+        return sentence
 
 
 def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Symmetry, Array]:
     """Return the turns at which a part's edges lie on themselves, and the place they turn about.
 
     ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
-    is told to a fraction of a pixel.
+    is measured to a fraction of a pixel.
 
     The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
     """
     shares = _shares(points, normals)
-    best, most = Symmetry(1, _alike(shares, 1)), ALIKE
+    best, most = Symmetry(1, _alike(shares, 1)), MIN_ALIKE_SHARE
     for count in (0, *range(MAX_FOLD, 1, -1)):
-        if count not in COMMON_FOLDS and _least(shares, count) < ALIKE:
+        if count not in COMMON_FOLDS and _least(shares, count) < MIN_ALIKE_SHARE:
             continue
         centre = _centre(segments, count or MAX_FOLD)
         again = _shares(points - centre, normals)
         least = _least(again, count)
-        if least >= SAME:
+        if least >= MIN_SAME_SHARE:
             return Symmetry(count, _alike(again, count) if count else ()), centre
         if least > most and count:
             x, y = centre.tolist()
@@ -113,8 +113,8 @@ def _least(shares: Array, count: int) -> float:
     """Return the part of the outline that each turn of a fold brings onto itself at least."""
     if count == 0:
         return float(shares.min())
-    turns = np.rint(TURNS * np.arange(1, count) / count).astype(np.intp)
-    around = np.mod(turns[:, None] + np.arange(-1, 2, dtype=np.intp), TURNS)
+    turns = np.rint(ANGLE_COUNT * np.arange(1, count) / count).astype(np.intp)
+    around = np.mod(turns[:, None] + np.arange(-1, 2, dtype=np.intp), ANGLE_COUNT)
     return float(shares[around].max(axis=1).min())
 
 
@@ -137,14 +137,14 @@ def _centre(segments: Segments, count: int) -> Array:
             used &= np.abs(along) <= segments.halves[met] + 1
             rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
             values.append(-off[used])
-        if sum(map(len, values)) < MIN_MET:
+        if sum(map(len, values)) < MIN_PAIRED_SEGMENTS:
             return np.zeros(2)
         centre = centre + np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
     return centre
 
 
 def _shares(points: Array, normals: Array) -> Array:
-    """Return the part of the edges that each turn brings onto others, (TURNS,)."""
+    """Return the part of the edges that each turn brings onto others, (ANGLE_COUNT,)."""
     cv2 = load("cv2", "inspection needs")
     radius = math.ceil(float(np.linalg.norm(points, axis=1).max())) + 3
     image = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
@@ -156,9 +156,9 @@ def _shares(points: Array, normals: Array) -> Array:
     point_of = np.zeros(int(nearest.max()) + 1, int)
     point_of[nearest[at[:, 1], at[:, 0]]] = np.arange(len(at))
     step = max(1, len(points) // MAX_POINTS)
-    shares = np.empty(TURNS)
-    for number in range(TURNS):
-        angle = 2 * math.pi * number / TURNS
+    shares = np.empty(ANGLE_COUNT)
+    for number in range(ANGLE_COUNT):
+        angle = 2 * math.pi * number / ANGLE_COUNT
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
         met = point_of[nearest[rows, columns]]
@@ -169,10 +169,10 @@ def _shares(points: Array, normals: Array) -> Array:
 
 def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
     """Return the turns within the period at which the part may be taken for itself."""
-    period = TURNS // fold
+    period = ANGLE_COUNT // fold
     inside = shares[:period]
     before, after = np.roll(inside, 1), np.roll(inside, -1)
-    peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= ALIKE))
-    far = peaks[(peaks > TURNS // 36) & (peaks < period - TURNS // 36)]
+    peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= MIN_ALIKE_SHARE))
+    far = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
     order = far[np.argsort(-inside[far], kind="stable")][:8]
-    return tuple((2 * math.pi * one / TURNS, float(shares[one])) for one in order.tolist())
+    return tuple((2 * math.pi * one / ANGLE_COUNT, float(shares[one])) for one in order.tolist())

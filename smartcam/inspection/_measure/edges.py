@@ -251,13 +251,13 @@ def _of_strip(
 ) -> StripEdges:
     """Return the edges of a strip; ``count``: possible edges, of which not all may be fitted."""
     if crowded:
-        text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be told apart"
+        text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be separated"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
     there = [one for one in steps if wanted(one.edge, settings) or not one.settled]
     too_many = None
     # if a fitted edge has too little contrast, the weaker edges have, too
     if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
-        text = f"{count} edges in one strip, {MAX_EDGES} at most are told apart"
+        text = f"{count} edges in one strip, {MAX_EDGES} at most can be separated"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
     if not there and too_many is not None:
         return StripEdges((), too_many)

@@ -109,11 +109,11 @@ class Events:
         return known
 
 
-def _type_of(field: str, said: Any) -> ua.VariantType:
+def _type_of(field: str, data_type: Any) -> ua.VariantType:
     if field in _NODE_IDS:
         return ua.VariantType.NodeId
     if field in _TYPES:
         return _TYPES[field]
-    if isinstance(said, ua.NodeId):  # of a time
+    if isinstance(data_type, ua.NodeId):  # of a time
         return ua.VariantType.DateTime
-    return ua.VariantType(said)
+    return ua.VariantType(data_type)

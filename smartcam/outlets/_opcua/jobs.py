@@ -101,7 +101,7 @@ class VisionResult:
         application: application that made it; None if that is not known.
         job: job that the result belongs to; None for a result without a job.
         created: time at which it came, UTC.
-        said: fields of its JSON object.
+        fields: fields of its JSON object.
         error: text that says why there are no values; "" if there are.
         picture: file of its picture; None without one.
         simulated: True for an emulated camera, False for a real one, None if that is not known.
@@ -113,7 +113,7 @@ class VisionResult:
     application: int | None
     job: VisionJob | None
     created: datetime
-    said: Mapping[str, Any]
+    fields: Mapping[str, Any]
     error: str = ""
     picture: Path | None = None
     simulated: bool | None = None

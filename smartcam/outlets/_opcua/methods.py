@@ -201,12 +201,12 @@ class Methods:
 
     def _given(self, kind: str, value: Any) -> Any:
         """Return the client's id, which the result will carry; None without one."""
-        text, told = _text(value), getattr(value, "Description", None)
-        if not text and told is None:
+        text, description = _text(value), getattr(value, "Description", None)
+        if not text and description is None:
             return None
         found = self._values.identity(kind, text)
-        if told is not None and len(told.Text or "") <= MAX_TEXT_CHARACTERS:
-            found.Description = told
+        if description is not None and len(description.Text or "") <= MAX_TEXT_CHARACTERS:
+            found.Description = description
         return found
 
     async def _start_plain(self, meas: str, part: str, recipe: str) -> list[ua.Variant]:

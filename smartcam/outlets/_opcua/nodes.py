@@ -179,8 +179,8 @@ class CameraNodes:
                 kinds.append("ErrorEventType")  # according to the text of OPC 40100-1
             for kind in kinds:
                 changes = kind in _CHANGES
-                told = fields if changes else self._job_fields(kind, job, prepared)
-                await self._emit(kind, message, told)
+                event_fields = fields if changes else self._job_fields(kind, job, prepared)
+                await self._emit(kind, message, event_fields)
 
         self._outbox.put(publish)
 
@@ -209,8 +209,8 @@ class CameraNodes:
         async def publish() -> None:
             content = await self._values.content(result, columns)
             value = self._values.result(result, recipe, content)
-            said = result.said.get("value")
-            text = "" if said is None else json.dumps(said, separators=(",", ":"))
+            plain = result.fields.get("value")
+            text = "" if plain is None else json.dumps(plain, separators=(",", ":"))
             keep(KeptResult(result, value, recipe, text))
             await self._show_plain(result, recipe, columns, text)
             names = value.__dataclass_fields__
@@ -259,11 +259,11 @@ class CameraNodes:
         await self._events.emit(kind, self.root, self.name, message, fields)
 
     async def _write(self, path: str, value: ua.Variant, status: int = 0) -> None:
-        told = ua.DataValue(value, StatusCode=ua.StatusCode(status), SourceTimestamp=_now())
+        data_value = ua.DataValue(value, StatusCode=ua.StatusCode(status), SourceTimestamp=_now())
         node = self.id(path)
         (
             await self._server.iserver.aspace.write_attribute_value(
-                node, ua.AttributeIds.Value, told
+                node, ua.AttributeIds.Value, data_value
             )
         ).check()
 
@@ -312,9 +312,9 @@ class CameraNodes:
     ) -> None:
         """Write the plain variables, the counter last."""
         self._count = (self._count + 1) % (1 << 32)
-        records = records_of(result.said.get("value")) or []
+        records = records_of(result.fields.get("value")) or []
         job = result.job
-        told = {
+        shown = {
             "Error": result.error,
             "ResultId": result.id,
             "JobId": result.job_id,
@@ -327,7 +327,7 @@ class CameraNodes:
             "Records": len(records),
             "Value": text,
         }
-        for name, one in told.items():
+        for name, one in shown.items():
             await self._write(f"Plain.{name}", ua.Variant(one, _PLAIN[name][0]))
         if columns and result.application is not None:
             first = records[0] if records and not result.error else {}

@@ -237,9 +237,9 @@ class CameraFace:
             raise ConfigurationError("commands are not allowed here")
         return await self._server.desk.command(name, verb, given)
 
-    def _picture(self, said: Mapping[str, Any]) -> Path | None:
+    def _picture(self, fields: Mapping[str, Any]) -> Path | None:
         pattern = self._settings.pictures
-        return None if pattern is None else picture_of(pattern, self._server.folder, said)
+        return None if pattern is None else picture_of(pattern, self._server.folder, fields)
 
     # ------------------------------------------------------------------ what clients see
 

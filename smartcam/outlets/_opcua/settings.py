@@ -64,7 +64,9 @@ class OpcUaSettings(OutletSettings):
         None, min_length=1, description="file of the certificate's private key, in PEM"
     )
     clients: str | None = Field(
-        None, min_length=1, description="folder of the certificates of all clients with encryption"
+        None,
+        min_length=1,
+        description="folder with a certificate of each client that uses encryption",
     )
     recipes: dict[str, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(
         {}, max_length=MAX_RECIPES, description="names for applications: {housing: 7}"

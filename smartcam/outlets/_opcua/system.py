@@ -256,16 +256,16 @@ class VisionSystem:
         if self.states.automatic not in ("Initialized", "Ready"):
             raise WrongStateError(f"PrepareRecipe is not allowed in {self.states.both}")
         self._by_client, self._wanted, self._preparing = True, None, True
-        told: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._spawn(lambda: self._prepare(application, told))
+        prepared: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._spawn(lambda: self._prepare(application, prepared))
         try:
             async with asyncio.timeout(PREPARE_WAIT):
-                await asyncio.shield(told)
+                await asyncio.shield(prepared)
         except TimeoutError:
-            if not told.done():
-                told.add_done_callback(lambda done: self._prepared_later(application, done))
+            if not prepared.done():
+                prepared.add_done_callback(lambda done: self._prepared_later(application, done))
                 return False
-            told.result()
+            prepared.result()
         return True
 
     def _prepared_later(self, application: int, done: asyncio.Future[None]) -> None:
@@ -275,7 +275,7 @@ class VisionSystem:
             text = f"recipe {application} is not prepared: {str(error) or type(error).__name__}"
             self.face.message(text, type(error).__name__, None)
 
-    async def _prepare(self, application: int, told: asyncio.Future[None]) -> None:
+    async def _prepare(self, application: int, prepared: asyncio.Future[None]) -> None:
         """Prepare an application, and set the outcome."""
         try:
             if self.states.automatic == "Ready":
@@ -290,14 +290,14 @@ class VisionSystem:
             self._wanted = application
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
-            told.set_exception(exc)
-            told.exception()  # the caller may no longer wait
+            prepared.set_exception(exc)
+            prepared.exception()  # the caller may no longer wait
         else:
-            told.set_result(None)
+            prepared.set_result(None)
         finally:
             self._preparing = False
-            if not told.done():
-                told.cancel()
+            if not prepared.done():
+                prepared.cancel()
 
     def unprepare(self) -> None:
         """Remove the prepared recipe.
@@ -440,10 +440,10 @@ class VisionSystem:
         if not job.seen.is_set() and (job.single or state == FAILED):
             job.seen.set()
             at = datetime.now(UTC)
-            said = {"error": why, "kind": kind}
+            fields = {"error": why, "kind": kind}
             made = f"{self.name}/job/{job.id}"
             ended = VisionResult(
-                *(made, self.name, state, job.application, job, at, said, why, None),
+                *(made, self.name, state, job.application, job, at, fields, why, None),
                 self._simulated,
             )
             self.face.result(ended)
@@ -462,8 +462,8 @@ class VisionSystem:
         """Publish an entry, or keep it until it is known whether the job under way made it."""
         job = self.job
         if self._pending or (job is not None and job.single and job.trigger is None):
-            said = json.loads(entry.body) if entry.body else {}
-            maybe = self._pending or said.get("triggered_at") is not None
+            fields = json.loads(entry.body) if entry.body else {}
+            maybe = self._pending or fields.get("triggered_at") is not None
             if maybe and len(self._pending) < MAX_PENDING:
                 self._pending.append(entry)
                 return
@@ -474,35 +474,35 @@ class VisionSystem:
             self._publish(self._pending.popleft())
 
     def _publish(self, entry: OutletEntry) -> None:
-        said: dict[str, Any] = json.loads(entry.body) if entry.body else {}
+        fields: dict[str, Any] = json.loads(entry.body) if entry.body else {}
         if entry.kind == "gap":
-            lost = said.get("lost", "some")
-            self.face.message(f"{lost} results are lost: {said.get('error', '')}", "Gap", None)
+            lost = fields.get("lost", "some")
+            self.face.message(f"{lost} results are lost: {fields.get('error', '')}", "Gap", None)
             return
-        error = str(said.get("error") or "")
-        if said.get("application") is None:
-            self.face.message(error, str(said.get("kind") or "Error"), None)
+        error = str(fields.get("error") or "")
+        if fields.get("application") is None:
+            self.face.message(error, str(fields.get("kind") or "Error"), None)
             return
-        at = _time(said.get("received_at")) or datetime.fromtimestamp(entry.at, UTC)
-        job = self._job_of(said, at)
-        application = said["application"]
+        at = _time(fields.get("received_at")) or datetime.fromtimestamp(entry.at, UTC)
+        job = self._job_of(fields, at)
+        application = fields["application"]
         if job is not None and application != job.application:
             error = error or f"it is of application {application}, not {job.application}"
         if job is not None and not job.single:
             self.face.acquired(job)
         state = FAILED if error else COMPLETED
-        picture = self._picture({**said, "camera": entry.camera})
+        picture = self._picture({**fields, "camera": entry.camera})
         made = VisionResult(
-            *(entry.id, self.name, state, application, job, at, said, error, picture),
+            *(entry.id, self.name, state, application, job, at, fields, error, picture),
             self._simulated,
         )
         self.face.result(made)
         if job is not None:
             job.seen.set()
 
-    def _job_of(self, said: Mapping[str, Any], at: datetime) -> VisionJob | None:
+    def _job_of(self, fields: Mapping[str, Any], at: datetime) -> VisionJob | None:
         """Return the job of a result; None if it is uncertain."""
-        trigger = _time(said.get("triggered_at"))
+        trigger = _time(fields.get("triggered_at"))
         if trigger is not None:
             found = self._by_trigger.pop(trigger, None)
             if found is not None:

@@ -169,7 +169,7 @@ class VisionValues:
         )
 
     def _times(self, result: VisionResult) -> Any:
-        text = result.said.get("triggered_at")
+        text = result.fields.get("triggered_at")
         if not isinstance(text, str):
             return None
         start = datetime.fromisoformat(text).astimezone(UTC)
@@ -180,7 +180,7 @@ class VisionValues:
         self, result: VisionResult, columns: Sequence[Column]
     ) -> list[ua.Variant] | None:
         """Return a result's values: a structure for each record; JSON without a layout."""
-        value = result.said.get("value")
+        value = result.fields.get("value")
         if value is None:
             return None
         records = records_of(value)

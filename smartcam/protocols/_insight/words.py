@@ -100,7 +100,7 @@ class AnswerForm(enum.Enum):
     INFO = "info"
     """The code, then five lines of the form ``name: value``."""
     SIZED = "sized"
-    """The code, a line with a number of characters, then as many, then a line end."""
+    """The code, a line with a number, that number of characters, then a line end."""
     HEX = "hex"
     """The code, a line with a size, lines of hexadecimal digits, a line with their checksum."""
 

@@ -106,8 +106,8 @@ class BagConversion:
         self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
         self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
         for one in chosen:
-            said = {"interpret_as": self._spec(one)} if again else one.facts
-            self._items.describe({**said, "camera": one.name})
+            facts = {"interpret_as": self._spec(one)} if again else one.facts
+            self._items.describe({**facts, "camera": one.name})
 
     @property
     def counts(self) -> BagCounts:

@@ -1,4 +1,4 @@
-"""Make a bag's messages from the items that a client received, or of a recording."""
+"""Make a bag's messages from a client's or a recording's items."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
-_CONTAINERS = 64
+_MAX_CONTAINERS = 64
 """Largest number of containers that are kept until their results come: many come in one burst."""
 
 UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
@@ -217,8 +217,8 @@ class _BagCamera:
         self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
         self._status = Topic(f"/{self.title}/status", STATUS_TYPE, LATCHED)
-        self._told: object = None  # contents of the last diagnostics
-        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
+        self._last_health: object = None  # contents of the last diagnostics
+        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_MAX_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
         """Keep the state that an event reports."""
@@ -241,22 +241,22 @@ class _BagCamera:
         how = health(known, heard=bool(known.why))
         fields = {"header": header_fields(at, self.name), **status_fields(known)}
         yield BagMessage(self._status, nanoseconds(at), fields)
-        told = (how.level, "" if how.level == OK else how.text, known.application)
-        if told != self._told:
-            self._told = told
+        health_now = (how.level, "" if how.level == OK else how.text, known.application)
+        if health_now != self._last_health:
+            self._last_health = health_now
             application = [] if known.application is None else [("application", known.application)]
             yield self._diagnostics(at, how.level, how.text, application)
 
     def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
         """Return a message of the diagnostics about a single error."""
-        said = [(key, value) for key, value in values.items() if value is not None]
-        return self._diagnostics(at, WARN, text, said)
+        pairs = [(key, value) for key, value in values.items() if value is not None]
+        return self._diagnostics(at, WARN, text, pairs)
 
     def _diagnostics(
         self, at: datetime, level: int, text: str, values: list[tuple[str, Any]]
     ) -> BagMessage:
-        said = diagnostic_fields(self.title, _hardware(self.url), level, text, values)
-        fields = {"header": header_fields(at, self.name), "status": [said]}
+        status = diagnostic_fields(self.title, _hardware(self.url), level, text, values)
+        fields = {"header": header_fields(at, self.name), "status": [status]}
         return BagMessage(_DIAGNOSTICS, nanoseconds(at), fields)
 
     # ------------------------------------------------------------------ containers
@@ -304,18 +304,18 @@ def parts_from_json(value: object) -> list[Localization] | None:
     """Return the localizations of recorded JSON; None if it has other values."""
     if not isinstance(value, list):
         return None
-    said: list[Any] = value
+    items: list[Any] = value
     try:
-        return [_part(one) for one in said]
+        return [_part(one) for one in items]
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 
-def _part(said: Mapping[str, Any]) -> Localization:
+def _part(fields: Mapping[str, Any]) -> Localization:
     """Return a localization from JSON; raise if it is not valid."""
-    if set(said) != set(Localization._fields):
+    if set(fields) != set(Localization._fields):
         raise ValueError("these are not its fields")
-    pose, feature, photo = said["pose"], said["feature_id"], said["photo_index"]
+    pose, feature, photo = fields["pose"], fields["feature_id"], fields["photo_index"]
     header = pose["header"]
     if not (isinstance(feature, str) and isinstance(header["frame_id"], str)):
         raise TypeError("no text")
@@ -327,15 +327,15 @@ def _part(said: Mapping[str, Any]) -> Localization:
         Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
     )
     if "sigma" in pose:
-        told = {name: pose["sigma"][name] for name in PoseSigma._fields}
+        sigma = {name: pose["sigma"][name] for name in PoseSigma._fields}
         errors: dict[str, Any] = {
-            name: None if one is None else _number(one) for name, one in told.items()
+            name: None if one is None else _number(one) for name, one in sigma.items()
         }
         place = place.with_sigma(PoseSigma(**errors))
-    return Localization(feature, _number(said["quality"]), photo, place)
+    return Localization(feature, _number(fields["quality"]), photo, place)
 
 
-def _number(said: object) -> float:
-    if isinstance(said, bool) or not isinstance(said, (int, float)):
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError("no number")
-    return float(said)
+    return float(value)

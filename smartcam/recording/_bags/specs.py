@@ -18,17 +18,17 @@ class Specs:
     """The interpreters that ``interpret_as`` names, for all applications or for each.
 
     Args:
-        said: value of ``interpret_as``, or its text; "" if it is not known.
-        pixels: whether positions are in pixels, whatever ``said`` is.
+        spec: value of ``interpret_as``, or its text; "" if it is not known.
+        pixels: whether positions are in pixels, whatever ``spec`` is.
     """
 
-    def __init__(self, said: Any = "", *, pixels: bool = False) -> None:
-        if isinstance(said, str) and said.startswith("{"):
+    def __init__(self, spec: Any = "", *, pixels: bool = False) -> None:
+        if isinstance(spec, str) and spec.startswith("{"):
             try:
-                said = ast.literal_eval(said)
+                spec = ast.literal_eval(spec)
             except (ValueError, SyntaxError, MemoryError, RecursionError):
-                said = ""
-        specs: Any = said if hasattr(said, "items") else {None: said}
+                spec = ""
+        specs: Any = spec if hasattr(spec, "items") else {None: spec}
         self._known = {key: _resolved(one) for key, one in specs.items()}
         self._pixels = pixels
         self._with_parts: set[int] = set()  # applications that had localizations

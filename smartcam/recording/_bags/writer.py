@@ -233,14 +233,14 @@ class BagWriter:
             self._schemas[kind.name],
             {"offered_qos_profiles": qos, "topic_type_hash": kind.hash},
         )
-        told = {
+        metadata = {
             "name": topic.name,
             "type": kind.name,
             "serialization_format": "cdr",
             "offered_qos_profiles": qos,
             "type_description_hash": kind.hash,
         }
-        return _BagChannel(number, told)
+        return _BagChannel(number, metadata)
 
     def _write_metadata_record(self) -> None:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})

@@ -101,9 +101,9 @@ class FolderFiles:
         file = track.file
         if file is None:  # cannot happen: the file was begun
             return 0
-        if track.gap is not None and not track.gap_told:
+        if track.gap is not None and not track.gap_written:
             self._add_gap(track, file, track.gap)
-            track.gap_told = True
+            track.gap_written = True
         if isinstance(one, Gap):
             track.follow_all(one)
             self._add_gap(track, file, one)
@@ -176,14 +176,14 @@ class FolderFiles:
         file.check()
         track.good = file.size
         track.written += written
-        if track.gap_told:
-            track.gap, track.gap_told = None, False
+        if track.gap_written:
+            track.gap, track.gap_written = None, False
         self._folder.grown(file.path, file.size)
 
     def _cut(self, track: CameraTrack) -> None:
         """Close a file, cut to the last whole chunk."""
         file, track.file = track.file, None
-        track.gap_told = False
+        track.gap_written = False
         if file is not None:
             file.cut(track.good)
             self._folder.grown(file.path, track.good)

@@ -68,7 +68,7 @@ class FleetPictures:
             matcher.results.append(result)
             self._settle(track, matcher)
 
-    def told(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
+    def add_reported(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
         """Record the picture of a result, as the camera names it."""
         made = 0, result.number, result.received_at
         self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *made))
@@ -87,22 +87,27 @@ class FleetPictures:
 
     async def _record(self, track: CameraTrack) -> None:
         """Record while the agent has the camera and pictures of it."""
-        delays, told = RETRY.delays(), ""
+        delays, logged = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
-            if host is None or host.frames.closed or host.frames.make is None or host.frames.told:
+            if (
+                host is None
+                or host.frames.closed
+                or host.frames.make is None
+                or host.frames.reports_pictures
+            ):
                 return
             why = "they ended"
             try:
                 if await self._take_all(track, await host.frames.source()):
-                    delays, told = RETRY.delays(), ""
+                    delays, logged = RETRY.delays(), ""
             except (SmartCamError, OSError) as exc:
                 why = str(exc)
             except Exception as exc:  # a driver may be a plug-in's
                 logger.exception("%s ! its pictures are not recorded", track.camera)
                 why = repr(exc)
-            if why != told and not host.frames.closed:
-                told = why
+            if why != logged and not host.frames.closed:
+                logged = why
                 self._tell(track, why)
             await asyncio.sleep(next(delays))
 

@@ -224,7 +224,7 @@ class _Hooks(Observer):
         """Keep the picture of a software camera's result."""
         track = self._track(result.camera)
         if track is not None and self._pictures is not None:
-            self._pictures.told(track, result, frame)
+            self._pictures.add_reported(track, result, frame)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep an error."""
@@ -250,7 +250,7 @@ class _Hooks(Observer):
         settings = self._server.hosts[camera].settings
         spec, y_down, lenient = settings.interpret_as, settings.y_down, settings.lenient
         track = self._writer.track(camera, _SeenReading(camera, spec, y_down, lenient).items)
-        said = {
+        facts_given = {
             "fleet": self._server.file.fleet,
             "interpret_as": spec,
             "application": settings.application,
@@ -258,7 +258,7 @@ class _Hooks(Observer):
             "lenient": lenient or None,
             "frames": None if self._section.frames else "no",
         }
-        facts = {name: str(fact) for name, fact in said.items() if fact is not None}
+        facts = {name: str(fact) for name, fact in facts_given.items() if fact is not None}
         self._writer.describe(track, facts)
         return track
 
@@ -309,8 +309,8 @@ class _SeenReading:
     def _read(self, given: _SeenResult, endian: int, interpret: Interpretation) -> Result[Any]:
         result, cells, fault = given.result, None, None
         if result.value.cells:
-            said: dict[str, Any] = json.loads(result.value.cells)
-            fault, texts = said.get("fault"), said.get("cells")
+            content: dict[str, Any] = json.loads(result.value.cells)
+            fault, texts = content.get("fault"), content.get("cells")
             cells = None if texts is None else tuple(texts)
         container = ResultContainer(
             application=result.application, data=result.raw, cells=cells, fault=fault

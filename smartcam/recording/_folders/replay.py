@@ -127,16 +127,16 @@ class FleetReplay(Server):
                 await stack.enter_async_context(camera)
                 known = self._recording.camera(name)
                 fleet = fleet or known.facts.get("fleet")
-                entries[name] = {"url": camera.url, **_said(known)}
+                entries[name] = {"url": camera.url, **_camera_options(known)}
                 if isinstance(camera, ReplayedCamera):
                     pictures = camera._show_pictures(self._recording, name)  # noqa: SLF001
                     if pictures is not None:
                         frames[name] = pictures.source
-            told: dict[str, Any] = {"listen": self._listen, "cameras": entries}
+            content: dict[str, Any] = {"listen": self._listen, "cameras": entries}
             if fleet is not None:
-                told["fleet"] = fleet
+                content["fleet"] = fleet
             try:
-                file = FleetFile.model_validate(told)
+                file = FleetFile.model_validate(content)
             except ValueError as exc:
                 raise ConfigurationError(f"recording {self._recording.path}: {exc}") from exc
             server = await stack.enter_async_context(FleetServer(file, _frames=frames))
@@ -148,7 +148,7 @@ class FleetReplay(Server):
         await self._stack.aclose()
 
 
-def _said(camera: RecordedCamera) -> dict[str, Any]:
+def _camera_options(camera: RecordedCamera) -> dict[str, Any]:
     """Return a camera's settings for the agent, without the address."""
     found: dict[str, Any] = {}
     spec = camera.interpret_as

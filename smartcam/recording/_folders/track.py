@@ -85,7 +85,7 @@ class CameraTrack:
         self.endian = 0
         self.facts: dict[str, str] = {"camera": camera}
         self.gap: Gap | None = None  # gap that is not on the disk yet
-        self.gap_told = False  # whether the gap is in the file's next chunk
+        self.gap_written = False  # whether the gap is in the file's next chunk
         self.file: RecordingFile | None = None
         self.begun = 0.0  # time of the file's beginning, on the monotonic clock
         self.good = 0  # bytes of the file that are on the disk

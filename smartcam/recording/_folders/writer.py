@@ -280,14 +280,14 @@ class FolderWriter:
         tries = 0 if before is None else before.tries + 1
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         prefix = f"recordings {self._folder.path}: "
-        told = RecordingError(prefix + reason.removeprefix(prefix))
-        told.__cause__ = error
+        failure = RecordingError(prefix + reason.removeprefix(prefix))
+        failure.__cause__ = error
         full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
         again = self._clock() + RETRY_DELAYS[min(tries, len(RETRY_DELAYS) - 1)]
-        self._trouble = _Trouble(told, reason, full, again, tries)
+        self._trouble = _Trouble(failure, reason, full, again, tries)
         if before is None:
-            logger.warning("%s; nothing is recorded until it is better", told)
-            self._tell(told)
+            logger.warning("%s; nothing is recorded until it is better", failure)
+            self._tell(failure)
 
     def _heal(self) -> None:
         """Note that the disk works again."""

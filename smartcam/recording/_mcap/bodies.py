@@ -1,4 +1,4 @@
-"""The data of the last frames, one of which has a result's bytes, which are so written once."""
+"""Remember the last frames' data, so that a result can refer to its bytes instead of a copy."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections import deque
 from typing import Generic, TypeVar
 
 MAX_FRAMES = 4096
-"""Largest number of kept frames: all frames of a delivery come before its first
-result."""
+"""Largest number of kept frames: a delivery may have many frames before its first result."""
 
 MAX_CHARACTERS = 1 << 23
 """Largest number of hex characters of the kept frames together; the last one is kept
@@ -30,7 +29,10 @@ class LastBodies(Generic[Key, Value]):
         self._characters = 0
 
     def add(self, key: Key, value: Value, characters: int) -> None:
-        """Keep the value of a frame whose data has so many characters; drop the oldest beyond."""
+        """Keep a frame's value, and drop the oldest ones beyond the bounds.
+
+        ``characters``: number of hex characters of the frame's data.
+        """
         self._order.append((key, value, characters))
         self._known[key] = value
         self._characters += characters

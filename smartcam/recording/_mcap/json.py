@@ -38,11 +38,11 @@ def frame_text(entry: TraceEntry) -> str:
             fields = {name: value for name, value in fields.items() if name != "data"}
     number = "" if message_id is None else f'"message_id":{text_of(message_id)},'
     body = "" if fields is None else f'"fields":{text_of(fields)},'
-    said = hex_text(data) if type(data) is str else text_of(data)
+    data_text = hex_text(data) if type(data) is str else text_of(data)
     begins = "" if data_from is None else f',"data_from":{data_from}'
     return (
         f'{{"at":{text_of(at)},"camera":{text_of(camera)},"direction":{text_of(direction)},'
-        f'{number}"message":{text_of(message)},{body}"hex":{said}{begins}}}'
+        f'{number}"message":{text_of(message)},{body}"hex":{data_text}{begins}}}'
     )
 
 
@@ -116,17 +116,17 @@ def result_text(result: Result[Any], raw_from: int | None = None) -> str:
     if triggered_at is not None:
         text += f',"triggered_at":{text_of(triggered_at)}'
     text += f',"received_at":{text_of(received_at)}'
-    if latency is not None and (said := text_of(latency)) != NULL:
-        text += f',"latency":{said}'
+    if latency is not None and (field_text := text_of(latency)) != NULL:
+        text += f',"latency":{field_text}'
     if raw_from is None:
         text += f',"raw":{text_of(raw)}'
     if value is raw:
         end = f',"value_from":{VALUE_IS_RAW}}}'
     else:
         end = "}"
-        said = text_of(value)
-        if said != NULL:
-            text += f',"value":{said}'
+        field_text = text_of(value)
+        if field_text != NULL:
+            text += f',"value":{field_text}'
     if raw_from is not None:
         text += f',"raw_from":{raw_from}'
     return text + end

@@ -127,13 +127,13 @@ class RecordReader:
                 self._check_magic()
                 return
             elif opcode == _DATA_END:
-                said = _Body(memoryview(self._read(_small(length)))).number(4)
-                if said not in {0, crc}:
-                    raise ValueError(f"the data's checksum is {crc:08x}, expected {said:08x}")
+                expected = _Body(memoryview(self._read(_small(length)))).number(4)
+                if expected not in {0, crc}:
+                    raise ValueError(f"the data's checksum is {crc:08x}, expected {expected:08x}")
             elif opcode == _STATISTICS:
-                said = _Body(memoryview(self._read(_small(length)))).number(8)
-                if said != self._messages:
-                    raise ValueError(f"of {said} messages {self._messages} are there")
+                expected = _Body(memoryview(self._read(_small(length)))).number(8)
+                if expected != self._messages:
+                    raise ValueError(f"of {expected} messages {self._messages} are there")
             elif opcode == _NONE:
                 raise ValueError("a record of the kind 0, which there is not")
             elif opcode == _METADATA:
@@ -178,7 +178,7 @@ class RecordReader:
     def _inflated(self, body: memoryview) -> memoryview:
         """Unpack a chunk."""
         fields = _Body(body)
-        _, _, said, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
+        _, _, plain_bytes, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
         how = fields.text()
         packed = fields.take(fields.number(8))
         if how in {"zstd", "lz4"}:
@@ -187,8 +187,8 @@ class RecordReader:
             raise ValueError(f"a chunk is packed as {how!r:.40}, expected zstd, lz4 or nothing")
         else:
             data = packed
-        if len(data) != said:
-            raise ValueError(f"a chunk unpacks to {len(data)} bytes, expected {said}")
+        if len(data) != plain_bytes:
+            raise ValueError(f"a chunk unpacks to {len(data)} bytes, expected {plain_bytes}")
         if crc not in {0, zlib.crc32(data)}:
             raise ValueError(f"a chunk's checksum is not {crc:08x}")
         return data

@@ -202,13 +202,13 @@ class McapWriter:
 
     def _statistics(self) -> bytes:
         counts = self._counts
-        told = (
+        totals = (
             *(sum(counts.values()), len(self._schema_records), len(self._channel_records)),
             *(0, len(self._metadata_indexes), self._chunks),  # no attachments
         )
         return _record(
             _STATISTICS,
-            struct.pack("<QHIIII", *told),
+            struct.pack("<QHIIII", *totals),
             struct.pack("<QQI", self._began, self._ended, _COUNT.size * len(counts)),
             *(_COUNT.pack(channel, count) for channel, count in counts.items()),
         )

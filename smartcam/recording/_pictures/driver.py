@@ -70,20 +70,22 @@ class RecordedDriver(TaskDriver):
         if found is not None and "://" not in address.url:
             path, fragment = found[1], found[2]
         self._path = Path(path)
-        said = address.parameters(_KNOWN, fragment)
-        self._camera = said.get("camera")
-        self._said_name = said.get("name")
-        pace = said.get("pace", "real")
+        parameters = address.parameters(_KNOWN, fragment)
+        self._camera = parameters.get("camera")
+        self._given_name = parameters.get("name")
+        pace = parameters.get("pace", "real")
         if pace not in ("real", "none"):
             raise address.wrong("pace", "real or none", pace)
         self._paced = pace == "real"
-        self._speed = address.number("speed", said.get("speed", "1"), 1 / MAX_SPEED, MAX_SPEED)
+        self._speed = address.number(
+            "speed", parameters.get("speed", "1"), 1 / MAX_SPEED, MAX_SPEED
+        )
         self._reading: asyncio.Future[RecordedPicture | None] | None = None
 
     @property
     def name(self) -> str:
         """The name in the URL, or of the camera; the path before the driver is opened."""
-        return self._said_name or self._camera or str(self._path)
+        return self._given_name or self._camera or str(self._path)
 
     async def open(self) -> StreamFormat:
         """Find the first picture.
@@ -124,7 +126,7 @@ class RecordedDriver(TaskDriver):
 
     def _several(self, cameras: dict[str, None]) -> FrameFormatError:
         return FrameFormatError(
-            f"{self._path}: there are pictures of {', '.join(cameras)}: say which, such as "
+            f"{self._path}: there are pictures of {', '.join(cameras)}: choose one, such as "
             f"{self._path}#camera={next(iter(cameras))}",
             source=self.name,
             available=tuple(cameras),

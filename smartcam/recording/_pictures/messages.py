@@ -134,22 +134,24 @@ def check_readable(frame: Frame) -> None:
         FrameFormatError: the message could not be read, and neither could the rest of the
             recording.
     """
-    said, form = "", find_format(frame.format.name)
+    problem, form = "", find_format(frame.format.name)
     if not (1 <= frame.width <= MAX_SIDE_PX and 1 <= frame.height <= MAX_SIDE_PX):
-        said = f"{frame.width}x{frame.height}, expected 1 to {MAX_SIDE_PX} pixels along each side"
+        problem = (
+            f"{frame.width}x{frame.height}, expected 1 to {MAX_SIDE_PX} pixels along each side"
+        )
     elif not (math.isfinite(frame.captured) and math.isfinite(frame.device_time or 0.0)):
-        said = f"captured {frame.captured}, {frame.device_time} of the device, expected seconds"
+        problem = f"captured {frame.captured}, {frame.device_time} of the device, expected seconds"
     elif not 0 <= frame.utc <= MAX_CAPTURE_TIME:
-        said = f"captured {frame.utc} s after 1970, expected 0 to {MAX_CAPTURE_TIME:.0f}"
+        problem = f"captured {frame.utc} s after 1970, expected 0 to {MAX_CAPTURE_TIME:.0f}"
     elif not frame.duration >= 0:
-        said = f"duration {frame.duration}, expected 0 or more seconds"
+        problem = f"duration {frame.duration}, expected 0 or more seconds"
     elif not 0 <= frame.stride < 1 << 32:
-        said = f"stride {frame.stride}, expected bytes in 32 bits"
+        problem = f"stride {frame.stride}, expected bytes in 32 bits"
     elif not (frame.sequence < 1 << 64 and 0 <= frame.lost < 1 << 64):
-        said = f"number {frame.sequence}, {frame.lost} lost, expected numbers of 64 bits"
-    if said:
+        problem = f"number {frame.sequence}, {frame.lost} lost, expected numbers of 64 bits"
+    if problem:
         raise FrameFormatError(
-            f"{frame.source}: a picture cannot be recorded: {said}", source=frame.source
+            f"{frame.source}: a picture cannot be recorded: {problem}", source=frame.source
         )
     form.check(frame.data, frame.width, frame.height, frame.stride)
 
@@ -233,44 +235,44 @@ def picture_of(
         ValueError: the message is not valid, or lacks a field of its format.
     """
     values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
-    said = _Values(values)
+    fields = _Values(values)
     try:
-        found = find_format(said.text("pixel_format", 100))
-        marks = drawings if number and said.whole("annotations_from") == number else ()
-        frame = _frame(said, found, marks)
+        found = find_format(fields.text("pixel_format", 100))
+        marks = drawings if number and fields.whole("annotations_from") == number else ()
+        frame = _frame(fields, found, marks)
         found.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
-        received = said.result_received_at()
+        received = fields.result_received_at()
     except (FrameFormatError, OverflowError, OSError) as exc:
         raise ValueError(f"a picture: {exc!s:.300}") from exc
-    camera = said.text("frame_id", MAX_NAME_CHARACTERS)
-    made = said.number_of_result(), received
-    return RecordedPicture(camera, at, frame, said.whole("left_out"), *made)
+    camera = fields.text("frame_id", MAX_NAME_CHARACTERS)
+    made = fields.number_of_result(), received
+    return RecordedPicture(camera, at, frame, fields.whole("left_out"), *made)
 
 
-def _frame(said: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
-    moment = said.text("moment", 100)
+def _frame(fields: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
+    moment = fields.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")
-    duration = said.real("duration", endless=True)
+    duration = fields.real("duration", endless=True)
     if duration < 0:
         raise ValueError(f"duration: {duration} came, expected 0 or more seconds")
-    width, height = said.side("picture_width"), said.side("picture_height")
+    width, height = fields.side("picture_width"), fields.side("picture_height")
     return Frame(
-        data=said.data(),
+        data=fields.data(),
         format=found,
         width=width,
         height=height,
-        stride=said.whole("stride"),
-        captured=said.real("captured"),
-        utc=said.real("utc"),
+        stride=fields.whole("stride"),
+        captured=fields.real("captured"),
+        utc=fields.real("utc"),
         moment=Moment[moment],
         duration=duration,
-        device_time=said.real("device_time") if said.has("device_time") else None,
-        sequence=said.whole("sequence"),
-        lost=said.whole("lost"),
-        source=said.text("source", MAX_NAME_CHARACTERS),
-        remark=said.text("remark", MAX_NAME_CHARACTERS),
+        device_time=fields.real("device_time") if fields.has("device_time") else None,
+        sequence=fields.whole("sequence"),
+        lost=fields.whole("lost"),
+        source=fields.text("source", MAX_NAME_CHARACTERS),
+        remark=fields.text("remark", MAX_NAME_CHARACTERS),
         drawings=drawings,
     )
 

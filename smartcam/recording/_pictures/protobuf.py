@@ -202,8 +202,10 @@ def file_set(
     for called, fields in messages.items():
         body = sized(1, called.encode())
         for field, one in fields.items():
-            told = _descriptor(field, one.number, TYPES[one.type], one.of, repeated=one.repeated)
-            body += sized(2, told)
+            descriptor = _descriptor(
+                field, one.number, TYPES[one.type], one.of, repeated=one.repeated
+            )
+            body += sized(2, descriptor)
         for enum, names in enums.get(called, {}).items():
             members = (
                 sized(2, sized(1, member.encode()) + tag(2, VARINT) + varint(number))
@@ -219,9 +221,9 @@ def _descriptor(
     name: str, number: int, kind: int, of: str = "", *, repeated: bool = False
 ) -> bytes:
     """Return a FieldDescriptorProto."""
-    told = sized(1, name.encode()) + tag(3, VARINT) + varint(number)
-    told += tag(4, VARINT) + varint(3 if repeated else 1) + tag(5, VARINT) + varint(kind)
-    return told + (sized(6, of.encode()) if of else b"")
+    encoded = sized(1, name.encode()) + tag(3, VARINT) + varint(number)
+    encoded += tag(4, VARINT) + varint(3 if repeated else 1) + tag(5, VARINT) + varint(kind)
+    return encoded + (sized(6, of.encode()) if of else b"")
 
 
 def _file(path: str, package: str, messages: list[bytes], needs: str = "") -> bytes:

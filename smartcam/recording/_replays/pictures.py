@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame, FrameSink
     from smartcam.recording._reader import Recording
-    from smartcam.recording._replays.schedule import TakeList
+    from smartcam.recording._replays.schedule import ApplicationRuns
 
 _log = logging.getLogger(__name__)
 
@@ -51,14 +51,18 @@ class ReplayedPictures:
     """
 
     def __init__(
-        self, recording: Recording, camera: str, applications: Mapping[int, TakeList], speed: float
+        self,
+        recording: Recording,
+        camera: str,
+        applications: Mapping[int, ApplicationRuns],
+        speed: float,
     ) -> None:
         self.name = camera
         self.shown: Frame | None = None
         self.sinks: set[FrameSink] = set()
         self._speed, self._began = speed, 0.0
         self._given: collections.Counter[tuple[int, bytes]] = collections.Counter()
-        self._pictures = _told_apart(recording, camera, applications)
+        self._pictures = _by_application(recording, camera, applications)
         self.first: Frame | None = next(
             (one.frame for some in self._pictures.values() for one in some if one is not None), None
         )
@@ -91,8 +95,8 @@ class ReplayedPictures:
             sink.frame(self.shown)
 
 
-def _told_apart(
-    recording: Recording, camera: str, applications: Mapping[int, TakeList]
+def _by_application(
+    recording: Recording, camera: str, applications: Mapping[int, ApplicationRuns]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
     """Return the pictures of results with the same bytes, if their order is certain."""
     found: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
@@ -112,18 +116,20 @@ def _told_apart(
     return {key: some for key, some in found.items() if counts.get(key) == len(some)}
 
 
-def _in_one_order(applications: Mapping[int, TakeList]) -> dict[tuple[int, bytes], int]:
+def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int, bytes], int]:
     """Return the numbers of containers with the same bytes, for those with a certain order.
 
     Containers of triggers and those without a trigger are replayed in two separate orders.
     """
     triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
-    unasked: collections.Counter[tuple[int, bytes]] = collections.Counter()
+    untriggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     for number, takes in applications.items():
-        for count, some in ((triggered, takes.triggered), (unasked, takes.unasked)):
+        for count, some in ((triggered, takes.triggered), (untriggered, takes.untriggered)):
             count.update((number, data) for take in some for data in take.containers)
-    both = triggered.keys() & unasked.keys()
-    return {key: n for count in (triggered, unasked) for key, n in count.items() if key not in both}
+    both = triggered.keys() & untriggered.keys()
+    return {
+        key: n for count in (triggered, untriggered) for key, n in count.items() if key not in both
+    }
 
 
 class _ResultPictures(FrameDriver):

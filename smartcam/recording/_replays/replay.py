@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
     from smartcam.recording._replays.pictures import ReplayedPictures
-from smartcam.recording._replays.schedule import ReplayPlan, Take, TakeList
+from smartcam.recording._replays.schedule import ApplicationRuns, RecordedRun, ReplayPlan
 
 MAX_SPEED = 1000.0
 """Largest factor of the speed; beyond it the timers' millisecond is too coarse."""
@@ -60,28 +60,28 @@ MAX_LOAD_TIME = 3600.0
 
 
 @dataclass(slots=True, eq=False)
-class _Takes:
-    """A list of takes that is played once, or over and over."""
+class _Runs:
+    """A list of runs that is played once, or over and over."""
 
-    _takes: list[Take]
+    _runs: list[RecordedRun]
     _loop: bool
     _next: int = 0
 
     @property
-    def head(self) -> Take | None:
+    def head(self) -> RecordedRun | None:
         """The next take; None if none is left."""
-        return self._takes[self._next] if self._next < len(self._takes) else None
+        return self._runs[self._next] if self._next < len(self._runs) else None
 
     @property
     def left(self) -> int:
-        """Number of takes that are left, in this round."""
-        return len(self._takes) - self._next
+        """Number of runs that are left, in this round."""
+        return len(self._runs) - self._next
 
-    def pop(self) -> Take | None:
+    def pop(self) -> RecordedRun | None:
         """Remove and return the next take."""
         head = self.head
         self._next += head is not None
-        if self._loop and self._next >= len(self._takes):
+        if self._loop and self._next >= len(self._runs):
             self._next = 0
         return head
 
@@ -109,15 +109,15 @@ class _Track:
     """The parts of a replay that belong to one application."""
 
     waits: bool  # whether the camera waits for triggers
-    triggered: _Takes  # takes for triggers
-    unasked: _Takes  # takes without a trigger
-    current: Take | None = None  # the take of the inspection under way
+    triggered: _Runs  # takes for triggers
+    untriggered: _Runs  # runs without a trigger
+    current: RecordedRun | None = None  # the take of the inspection under way
     # further containers to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
     # place of the client's numbers in containers; None: containers keep their own numbers
     numbers: _Numbers | None = None
     # function that is called with each recorded container when it is sent
-    told: Callable[[bytes], None] = lambda _: None
+    on_picture: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
         """End the inspection: return its container; None if it sends nothing."""
@@ -126,7 +126,7 @@ class _Track:
             return None
         containers = take.containers
         for data in containers:
-            self.told(data)
+            self.on_picture(data)
         if self.numbers is not None:
             containers = [self.numbers.put(data, number, byte_order) for data in containers]
         first, *self.rest = containers
@@ -214,8 +214,8 @@ class ReplayedCamera(EmulatedCamera):
         self._tracks = {
             number: _Track(
                 found.waits,
-                _Takes(found.triggered, loop),
-                _Takes(found.unasked, loop),
+                _Runs(found.triggered, loop),
+                _Runs(found.untriggered, loop),
             )
             for number, found in self.plan.applications.items()
         }
@@ -246,7 +246,7 @@ class ReplayedCamera(EmulatedCamera):
         self._numbers = _numbers(recording.camera(camera).interpret_as)
         self.device.set_endian(self.plan.endian)
         self._set_conditions(self.plan.conditions)
-        self._armed: Take | None = None  # the take before which triggers are to be dropped
+        self._armed: RecordedRun | None = None  # the take before which triggers are to be dropped
         self._ready: int | None = None  # the application that may send without a trigger now
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._alarm: TimerHandle | None = None
@@ -270,14 +270,14 @@ class ReplayedCamera(EmulatedCamera):
 
         shown = ReplayedPictures(recording, camera, self.plan.applications, self.speed)
         for number, track in self._tracks.items():
-            track.told = partial(shown.given, number)
+            track.on_picture = partial(shown.given, number)
         self._pictures = None if shown.first is None else shown
         return self._pictures
 
     @property
     def remaining(self) -> int:
         """Number of inspections that are left, in this round."""
-        return sum(track.triggered.left + track.unasked.left for track in self._tracks.values())
+        return sum(track.triggered.left + track.untriggered.left for track in self._tracks.values())
 
     async def stop(self) -> None:
         """Close the port and every connection; the replay pauses. Does nothing if stopped.
@@ -322,7 +322,7 @@ class ReplayedCamera(EmulatedCamera):
             tell, self._on_over = self._on_over, None
             tell()
 
-    def _begin(self, track: _Track, take: Take | None) -> None:
+    def _begin(self, track: _Track, take: RecordedRun | None) -> None:
         """Begin an inspection with the recorded duration."""
         track.current, self._armed = take, None
         if self._pictures is not None:
@@ -355,20 +355,20 @@ class ReplayedCamera(EmulatedCamera):
         if ready != self._ready:
             self._pause()
             self._ready, self._reference = ready, self.clock.now
-        head = track.unasked.head
+        head = track.untriggered.head
         if ready is None or head is None:
             return
         if self._due and not (track.waits and self.device.processing):
-            self._begin_unasked(track, head)
-            head = track.unasked.head
+            self._begin_untriggered(track, head)
+            head = track.untriggered.head
         if head is not None and self._alarm is None and not self._due:
             when = self._reference + head.gap / self.speed
             self._alarm = self.clock.call_at(max(when, self.clock.now), self._wake_unasked)
 
-    def _begin_unasked(self, track: _Track, take: Take) -> None:
+    def _begin_untriggered(self, track: _Track, take: RecordedRun) -> None:
         if not track.waits:
             for data in take.containers:
-                track.told(data)
+                track.on_picture(data)
             self._send(take.containers)
         elif self.device.trigger():
             self._begin(track, take)
@@ -376,7 +376,7 @@ class ReplayedCamera(EmulatedCamera):
             return  # the device accepts no trigger now; try later
         self._due = False
         self._reference += (take.gap + take.seconds) / self.speed
-        track.unasked.pop()
+        track.untriggered.pop()
 
     def _wake_unasked(self) -> None:
         self._alarm, self._due = None, True
@@ -384,7 +384,7 @@ class ReplayedCamera(EmulatedCamera):
             pass
 
     def _pause(self) -> None:
-        """Hold back takes without a trigger."""
+        """Hold back runs without a trigger."""
         self._ready, self._due = None, False
         if self._alarm is not None:
             self._alarm.cancel()
@@ -433,7 +433,7 @@ def _numbers(interpret_as: str | None) -> _Numbers | None:
     return None
 
 
-def _application(found: TakeList, speed: float) -> _PlayedApplication:
+def _application(found: ApplicationRuns, speed: float) -> _PlayedApplication:
     fields: dict[str, Any] = {"id": found.application, "name": "recorded"}
     if found.load_time is not None:
         fields["load_time"] = min(found.load_time / speed, MAX_LOAD_TIME)

@@ -41,8 +41,8 @@ CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
 """Bits that an operator of the emulated camera can set; the others follow from its operation."""
 
 MAX_TIME_BEHIND_FIRST = 0.1
-"""Seconds after an inspection's first container in which its others come, if the camera always
-reports that it waits for a trigger."""
+"""Seconds within which an inspection's further containers follow its first one, if the camera
+always reports that it waits for a trigger."""
 
 MAX_REPLAY_BYTES = 1 << 30
 """Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
@@ -50,8 +50,8 @@ per second."""
 
 
 @dataclass(slots=True)
-class Take:
-    """One inspection."""
+class RecordedRun:
+    """One recorded inspection."""
 
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
@@ -63,12 +63,14 @@ class Take:
 
 
 @dataclass(slots=True)
-class TakeList:
-    """The results of an application, in order."""
+class ApplicationRuns:
+    """The recorded inspections of an application, in order."""
 
     application: int
-    triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
-    unasked: list[Take] = field(default_factory=list[Take])  # the others
+    triggered: list[RecordedRun] = field(
+        default_factory=list[RecordedRun]
+    )  # runs that a client triggered
+    untriggered: list[RecordedRun] = field(default_factory=list[RecordedRun])  # the others
     waits: bool = True  # whether the application waits for triggers; otherwise it runs free
     load_time: float | None = None  # seconds of a switch to it; None if none was recorded
 
@@ -89,7 +91,7 @@ class ReplayPlan:
     dialect: str
     quirks: tuple[str, ...]  # deviations from the dialect
     transport: Literal["tcp", "udp"]
-    applications: Mapping[int, TakeList]  # takes of each application, by id; never empty
+    applications: Mapping[int, ApplicationRuns]  # runs of each application, by id; never empty
     active: int  # id of the application of the first container
     running: bool  # whether the camera ran
     endian: int  # the status message's endian field
@@ -106,7 +108,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
         RecordingError: its containers are more than :data:`MAX_REPLAY_BYTES`.
     """
     known = recording.camera(camera)
-    dialect, transport = _spoken(recording, known)
+    dialect, transport = _dialect_of(recording, known)
     items = recording.all_items(known.name)
     if is_fleet(known.url) or known.facts.get("frames") == "no":
         steps = _steps_without_frames(items, known.facts.get("endian", "0"))
@@ -141,22 +143,22 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
 
 
 def _fitting(
-    recording: Recording, lists: Mapping[int, TakeList], dialect: FramedDialect
-) -> dict[int, TakeList]:
+    recording: Recording, lists: Mapping[int, ApplicationRuns], dialect: FramedDialect
+) -> dict[int, ApplicationRuns]:
     """Return the applications that can be emulated; others must have no containers."""
-    fitting: dict[int, TakeList] = {}
+    fitting: dict[int, ApplicationRuns] = {}
     for number, found in lists.items():
         if number in dialect.application_ids and number >= 1:
             fitting[number] = found
-        elif found.triggered or found.unasked:
+        elif found.triggered or found.untriggered:
             raise ConfigurationError(
                 f"recording {recording.path}: application id {number} cannot be emulated in "
                 f"dialect {dialect.name}"
             )
-    return fitting or {1: TakeList(1)}
+    return fitting or {1: ApplicationRuns(1)}
 
 
-def _spoken(
+def _dialect_of(
     recording: Recording, camera: RecordedCamera
 ) -> tuple[FramedDialect, Literal["tcp", "udp"]]:
     """Return the dialect and the transport of the camera."""
@@ -185,8 +187,8 @@ def _spoken(
     return dialect.with_quirks(address.quirks), "udp" if transport is Transport.UDP else "tcp"
 
 
-class _What(enum.Enum):
-    """Steps of a recording."""
+class _StepKind(enum.Enum):
+    """Kinds of steps of a recording."""
 
     CONNECTED = enum.auto()
     LOST = enum.auto()
@@ -203,37 +205,38 @@ class _ReplayStep(NamedTuple):
     """The meaning of a frame, or of the end of a link, for a replay."""
 
     at: float  # time, seconds since 1970
-    what: _What
+    kind: _StepKind
     number: int = 0  # an application's id, or the endian field
     bits: Status = Status(0)  # bits of a status
     data: bytes = b""  # bytes of a container
     # time in the record, seconds since 1970; ``at`` may be later, since times never go back
-    told_at: float | None = None
+    recorded_at: float | None = None
 
 
 _PLAIN = {
-    (">", "Trigger"): _What.TRIGGER,
-    (">", "Stop"): _What.ABORT,
-    (">", "Reboot"): _What.ABORT,
-    ("<", "ConnectAnswer"): _What.CONNECTED,
+    (">", "Trigger"): _StepKind.TRIGGER,
+    (">", "Stop"): _StepKind.ABORT,
+    (">", "Reboot"): _StepKind.ABORT,
+    ("<", "ConnectAnswer"): _StepKind.CONNECTED,
 }
-_ANSWERS = {("<", "SwitchAnswer"): _What.SWITCHED, ("<", "QueryAnswer"): _What.NAMED}
+_ANSWERS = {("<", "SwitchAnswer"): _StepKind.SWITCHED, ("<", "QueryAnswer"): _StepKind.NAMED}
 
 
 def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
     """Return steps, where those before a time are replaced by the camera's state at that time."""
-    single = {_What.TRIGGER, _What.CONTAINER, _What.SWITCH}
+    single = {_StepKind.TRIGGER, _StepKind.CONTAINER, _StepKind.SWITCH}
     return [
         step._replace(at=max(step.at, at))
         for step in steps
-        if (step.at if step.told_at is None else step.told_at) >= at or step.what not in single
+        if (step.at if step.recorded_at is None else step.recorded_at) >= at
+        or step.kind not in single
     ]
 
 
-class _Seams:
-    """Makes steps of a recording's beginnings and gaps.
+class _GapSteps:
+    """Makes the steps at a recording's beginnings and gaps.
 
-    So results around a gap are not matched with wrong triggers.
+    Without these steps results around a gap would be matched with wrong triggers.
     """
 
     def __init__(self) -> None:
@@ -243,21 +246,21 @@ class _Seams:
         """Return the steps of an item, at a time that does not decrease."""
         if isinstance(item, RecordedError) and item.error == GAP:
             self._whole = False
-            return [_ReplayStep(at, _What.LOST)]
+            return [_ReplayStep(at, _StepKind.LOST)]
         if not isinstance(item, RecordedState):
             self._whole = True
             return []
         if not item.connected:
             self._whole = False
-            return [_ReplayStep(at, _What.LOST)]
+            return [_ReplayStep(at, _StepKind.LOST)]
         if self._whole:
             return []
         self._whole = True
-        found = [_ReplayStep(at, _What.CONNECTED)]
+        found = [_ReplayStep(at, _StepKind.CONNECTED)]
         if item.application is not None:
-            found.append(_ReplayStep(at, _What.NAMED, item.application))
+            found.append(_ReplayStep(at, _StepKind.NAMED, item.application))
         if item.status is not None:
-            found.append(_ReplayStep(at, _What.STATUS, item.endian, item.status))
+            found.append(_ReplayStep(at, _StepKind.STATUS, item.endian, item.status))
         return found
 
 
@@ -269,15 +272,15 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
         RecordingError: the containers are too large together.
     """
     at, active, size = 0.0, m.UNNAMED_APPLICATION, 0
-    seams = _Seams()
+    gap_steps = _GapSteps()
     for item in items:
         if isinstance(item, RecordedState) and item.at is not None:
             at = max(at, item.at.timestamp())
-        for seam in seams.steps(item, at):
-            active = seam.number if seam.what is _What.NAMED else active
-            yield seam
+        for gap_step in gap_steps.steps(item, at):
+            active = gap_step.number if gap_step.kind is _StepKind.NAMED else active
+            yield gap_step
         if isinstance(item, Disconnected):
-            yield _ReplayStep(at, _What.LOST)
+            yield _ReplayStep(at, _StepKind.LOST)
         if not isinstance(item, TraceEntry) or item.fields is None:
             continue
         at = max(at, item.at.timestamp())
@@ -285,20 +288,20 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
             step = _step(at, item, dialect)
         except (KeyError, TypeError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
-                f"recording: a {item.message} has not the fields of one: {item.fields!r:.80}"
+                f"recording: wrong fields of a {item.message}: {item.fields!r:.80}"
             ) from exc
         if step is None:
             continue
-        step = step._replace(told_at=item.at.timestamp())
+        step = step._replace(recorded_at=item.at.timestamp())
         size += len(step.data)
         if size > MAX_REPLAY_BYTES:
             raise RecordingError(
                 f"recording: {size} bytes of containers until {item.at}, expected "
                 f"{MAX_REPLAY_BYTES} at most for a replay"
             )
-        if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
+        if step.kind is _StepKind.CONTAINER and step.number == m.UNNAMED_APPLICATION:
             step = step._replace(number=active)  # a quirk: the container has no application id
-        elif step.what in {_What.SWITCHED, _What.NAMED}:
+        elif step.kind in {_StepKind.SWITCHED, _StepKind.NAMED}:
             active = step.number
         yield step
 
@@ -310,34 +313,34 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
 
     Raises:
         ConfigurationError: ``endian`` is no number.
-        RecordingError: there is too much of them.
+        RecordingError: the containers are too large together.
     """
     if endian not in {"0", "1"}:
         raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
     steps: list[_ReplayStep] = []
     triggered_at, size = None, 0
-    seams = _Seams()
+    gap_steps = _GapSteps()
     for item in items:
         when = item.received_at if isinstance(item, Result) else item.at
         at = 0.0 if when is None else when.timestamp()
-        steps += seams.steps(item, at)
+        steps += gap_steps.steps(item, at)
         match item:
             case Connected() | Reconnected():
-                steps.append(_ReplayStep(at, _What.CONNECTED))
+                steps.append(_ReplayStep(at, _StepKind.CONNECTED))
             case Disconnected():
-                steps.append(_ReplayStep(at, _What.LOST))
+                steps.append(_ReplayStep(at, _StepKind.LOST))
             case StatusChanged(status=status):
-                steps.append(_ReplayStep(at, _What.STATUS, int(endian), status))
+                steps.append(_ReplayStep(at, _StepKind.STATUS, int(endian), status))
             case ApplicationChanged(application=application):
-                steps.append(_ReplayStep(at, _What.SWITCHED, application))
+                steps.append(_ReplayStep(at, _StepKind.SWITCHED, application))
             case Result():
                 size += len(item.raw)
                 if item.triggered_at is None:
-                    steps.append(_ReplayStep(at, _What.ABORT))  # the earlier inspection is over
+                    steps.append(_ReplayStep(at, _StepKind.ABORT))  # the earlier inspection is over
                 elif item.triggered_at != triggered_at:
-                    steps.append(_ReplayStep(at - (item.latency or 0.0), _What.TRIGGER))
+                    steps.append(_ReplayStep(at - (item.latency or 0.0), _StepKind.TRIGGER))
                 triggered_at = item.triggered_at
-                steps.append(_ReplayStep(at, _What.CONTAINER, item.application, data=item.raw))
+                steps.append(_ReplayStep(at, _StepKind.CONTAINER, item.application, data=item.raw))
             case _:
                 pass
         if size > MAX_REPLAY_BYTES:
@@ -348,7 +351,7 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
     return _on_one_clock(steps)
 
 
-_BY_AGENT = {_What.TRIGGER, _What.ABORT, _What.CONTAINER}
+_BY_AGENT = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
 
 
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
@@ -359,21 +362,21 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
     least, most = -math.inf, math.inf  # bounds of the difference between the clocks
     by_program, by_agent = -math.inf, -math.inf  # the last times
     for step in steps:
-        if step.what is _What.CONTAINER:
+        if step.kind is _StepKind.CONTAINER:
             by_agent = step.at
             least = max(least, by_program - by_agent)
-        elif step.what not in _BY_AGENT:
+        elif step.kind not in _BY_AGENT:
             by_program = step.at
             most = min(most, by_program - by_agent)
     # a status follows most results at once
-    lacks = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
+    offset = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
     found: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
-        at = step.at + lacks if step.what in _BY_AGENT else step.at
-        if step.what is not _What.TRIGGER:
+        at = step.at + offset if step.kind in _BY_AGENT else step.at
+        if step.kind is not _StepKind.TRIGGER:
             at = last = max(at, last)
-        found.append(step._replace(at=at, told_at=step.at))
+        found.append(step._replace(at=at, recorded_at=step.at))
     return found
 
 
@@ -382,9 +385,9 @@ def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
     settled: list[_ReplayStep] = []
     active: int | None = None
     for step in steps:
-        if step.what in {_What.SWITCHED, _What.NAMED, _What.CONTAINER}:
+        if step.kind in {_StepKind.SWITCHED, _StepKind.NAMED, _StepKind.CONTAINER}:
             active = step.number
-        if step.what is _What.STATUS:
+        if step.kind is _StepKind.STATUS:
             bits = step.bits & ~(Status.OVERTRIGGERED | Status.WAITING_FOR_TRIGGER)
             if Status.RUNNING in bits and active not in free:
                 bits |= Status.WAITING_FOR_TRIGGER
@@ -404,13 +407,13 @@ def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep |
         return _ReplayStep(at, _ANSWERS[key], int(fields["application"])) if done else None
     match key:
         case (">", "SwitchApplication"):
-            return _ReplayStep(at, _What.SWITCH, int(fields["application"]))
+            return _ReplayStep(at, _StepKind.SWITCH, int(fields["application"]))
         case ("<", "StatusReport"):
             bits = status_of(fields["status"])
-            return _ReplayStep(at, _What.STATUS, int(fields.get("endian", 0)), bits)
+            return _ReplayStep(at, _StepKind.STATUS, int(fields.get("endian", 0)), bits)
         case ("<", "ResultContainer"):
             number = int(fields.get("application", m.UNNAMED_APPLICATION))
-            return _ReplayStep(at, _What.CONTAINER, number, data=bytes.fromhex(fields["data"]))
+            return _ReplayStep(at, _StepKind.CONTAINER, number, data=bytes.fromhex(fields["data"]))
         case _:
             return None
 
@@ -421,14 +424,14 @@ def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
     active: int | None = None
     early = Status(0)  # bits of statuses before the application is known
     for step in steps:
-        if step.what is _What.STATUS:
+        if step.kind is _StepKind.STATUS:
             if step.bits.loading:
                 active = None
             elif active is None:
                 early |= step.bits
             else:
                 seen[active] = seen.get(active, Status(0)) | step.bits
-        elif step.what in {_What.SWITCHED, _What.NAMED, _What.CONTAINER}:
+        elif step.kind in {_StepKind.SWITCHED, _StepKind.NAMED, _StepKind.CONTAINER}:
             active = step.number
             seen[active] = seen.get(active, Status(0)) | early
             early = Status(0)
@@ -443,7 +446,7 @@ class _ScheduleMaker:
     """Makes a plan from the steps of a recording."""
 
     def __init__(self, free: set[int]) -> None:
-        self.lists: dict[int, TakeList] = {}  # takes so far, by application
+        self.lists: dict[int, ApplicationRuns] = {}  # runs so far, by application
         # time at which the first session began, seconds; None before
         self.began: float | None = None
         self.now: float = 0.0  # time of the last step, seconds
@@ -459,27 +462,27 @@ class _ScheduleMaker:
         self._triggers: list[float] = []  # times of triggers without a container so far
         self._drops = 0  # number of triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # times at which Waiting for Trigger rose, fell
-        self._open: Take | None = None  # take whose inspection may send more containers
+        self._open: RecordedRun | None = None  # take whose inspection may send more containers
         self._opened = 0.0  # time of its first container
-        self._began_unasked: float | None = None  # start of an inspection without a trigger
+        self._began_untriggered: float | None = None  # start of an inspection without a trigger
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._switching: tuple[float, int] | None = None
-        self._takers: Mapping[_What, Callable[[_ReplayStep], None]] = {
-            _What.CONNECTED: self._on_connected,
-            _What.LOST: self._on_lost,
-            _What.STATUS: self._on_status,
-            _What.TRIGGER: self._on_trigger,
-            _What.ABORT: lambda _: self._give_up(),
-            _What.SWITCH: self._on_switch,
-            _What.SWITCHED: self._on_switched,
-            _What.NAMED: lambda step: self._name(step.number),
-            _What.CONTAINER: self._on_container,
+        self._takers: Mapping[_StepKind, Callable[[_ReplayStep], None]] = {
+            _StepKind.CONNECTED: self._on_connected,
+            _StepKind.LOST: self._on_lost,
+            _StepKind.STATUS: self._on_status,
+            _StepKind.TRIGGER: self._on_trigger,
+            _StepKind.ABORT: lambda _: self._give_up(),
+            _StepKind.SWITCH: self._on_switch,
+            _StepKind.SWITCHED: self._on_switched,
+            _StepKind.NAMED: lambda step: self._name(step.number),
+            _StepKind.CONTAINER: self._on_container,
         }
 
     def take(self, step: _ReplayStep) -> None:
         """Add the next step."""
         self.now = step.at
-        self._takers[step.what](step)
+        self._takers[step.kind](step)
 
     def finish(self) -> None:
         """End the plan, without the result of a trigger under way, which is unknown."""
@@ -494,7 +497,7 @@ class _ScheduleMaker:
 
     def _on_lost(self, _: _ReplayStep) -> None:
         self._triggers.clear()  # their results were lost with the link
-        self._open = self._began_unasked = self._switching = None
+        self._open = self._began_untriggered = self._switching = None
 
     def _on_status(self, step: _ReplayStep) -> None:
         was, self._status = self._status, step.bits
@@ -512,7 +515,7 @@ class _ScheduleMaker:
         if Status.SYSTEM_ERROR in risen or Status.RUNNING in fallen:
             self._give_up()
         if Status.WAITING_FOR_TRIGGER in fallen and not self._triggers:
-            self._began_unasked = self.now
+            self._began_untriggered = self.now
         if Status.WAITING_FOR_TRIGGER in risen:
             self._waits_from = self.now
             self._open = None
@@ -535,8 +538,8 @@ class _ScheduleMaker:
             return  # a triggered inspection is under way: the emulated camera drops it by itself
         if Status.WAITING_FOR_TRIGGER in bits:
             self._drops += 1
-        elif self._began_unasked is None:  # an untriggered inspection, which shows late
-            self._began_unasked = self._waited_until
+        elif self._began_untriggered is None:  # an untriggered inspection, which shows late
+            self._began_untriggered = self._waited_until
 
     def _on_trigger(self, _: _ReplayStep) -> None:
         self._open = None
@@ -561,23 +564,23 @@ class _ScheduleMaker:
         found = self._list(step.number)
         if not found.waits:
             self._triggers.clear()  # a free-running application ignores them
-            found.unasked.append(Take([step.data], 0.0, gap=self._gap(self.now)))
+            found.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
         elif self._triggers:
             began = self._triggers.pop(0)
-            self._open = Take([step.data], self.now - began, drops=self._drops)
+            self._open = RecordedRun([step.data], self.now - began, drops=self._drops)
             self._drops = 0
             found.triggered.append(self._open)
         elif self._open is not None and not self._is_over():
             self._open.containers.append(step.data)
         else:
-            seen = self._began_unasked is not None or not self._waits
-            began = self.now if self._began_unasked is None else self._began_unasked
-            take = Take([step.data], self.now - began, gap=self._gap(began))
-            found.unasked.append(take)
+            seen = self._began_untriggered is not None or not self._waits
+            began = self.now if self._began_untriggered is None else self._began_untriggered
+            take = RecordedRun([step.data], self.now - began, gap=self._gap(began))
+            found.untriggered.append(take)
             self._open = take if seen else None
         if self._open is not None and len(self._open.containers) == 1:
             self._opened = self.now
-        self._began_unasked = None
+        self._began_untriggered = None
 
     @property
     def _waits(self) -> bool:
@@ -600,16 +603,18 @@ class _ScheduleMaker:
         if self._active is not None and self._list(self._active).waits:
             for began in self._triggers:
                 ended = self._waits_from if self._waits_from > began else self.now
-                take = Take([], ended - began, drops=self._drops)
+                take = RecordedRun([], ended - began, drops=self._drops)
                 self._list(self._active).triggered.append(take)
                 self._drops = 0
         self._triggers.clear()
-        self._open = self._began_unasked = None
+        self._open = self._began_untriggered = None
 
     def _name(self, number: int) -> None:
         if number != self._active:
             self._active = number
             self._list(number)
 
-    def _list(self, number: int) -> TakeList:
-        return self.lists.setdefault(number, TakeList(number, waits=number not in self._free))
+    def _list(self, number: int) -> ApplicationRuns:
+        return self.lists.setdefault(
+            number, ApplicationRuns(number, waits=number not in self._free)
+        )

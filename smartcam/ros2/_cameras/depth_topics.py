@@ -20,7 +20,7 @@ from smartcam.ros2._cameras.cloud_messages import (
 )
 from smartcam.ros2._cameras.image_messages import array_fields, header_fields
 from smartcam.ros2._cameras.lens_messages import lens_fields
-from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
+from smartcam.ros2._cameras.picture_stream import SubscribedPictures, publish_newest
 from smartcam.ros2._cameras.transforms import StaticTransforms
 from smartcam.ros2._node.qos import DRIVER
 
@@ -95,7 +95,7 @@ class DepthTopics:
         self._transforms = StaticTransforms(node)
         self._nearest = 0.0
         self._publishers: dict[str, Any] = {}
-        self._stream: HeardPictures[DepthFrame] | None = None
+        self._stream: SubscribedPictures[DepthFrame] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
@@ -106,7 +106,9 @@ class DepthTopics:
             self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
         self._thread = ThreadPoolExecutor(1, "smartcam-ros2-depth")
         publishers = list(self._publishers.values())
-        self._stream = HeardPictures(self._node.full_name, publishers, self._read, self._publish)
+        self._stream = SubscribedPictures(
+            self._node.full_name, publishers, self._read, self._publish
+        )
         self._stream.start()
 
     async def close(self) -> None:

@@ -281,7 +281,7 @@ def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
     if name is None:
         raise FrameFormatError(
             f"ROS image: expected one of the encodings {', '.join(_FORMATS)}, got "
-            f"{encoding!r:.40}; pixels_from() has the numbers of 32FC1 and the like"
+            f"{encoding!r:.40}; pixels_from() reads encodings of numbers such as 32FC1"
         )
     form = find_format(name)
     if message.is_bigendian and form.depth > 8:

@@ -61,7 +61,7 @@ class CameraLens:
         self._path = as_path(url)
         self._info: CameraInfo | None = None
         self._read = self._path is None
-        self._told: tuple[int, int] | None = None
+        self._warned_size: tuple[int, int] | None = None
         self._writing = asyncio.Lock()
 
     async def load(self) -> None:
@@ -85,8 +85,8 @@ class CameraLens:
         info = self._info
         lens = frame.camera_info if info is None else info.camera
         if lens is not None and tuple(lens.size) != size:
-            if self._told != size:
-                self._told = size
+            if self._warned_size != size:
+                self._warned_size = size
                 logger.warning(
                     "%s ! the lens is that of pictures of %dx%d, these have %dx%d: camera_info is "
                     "that of a camera that is not calibrated",
@@ -138,20 +138,20 @@ class CameraLens:
                 rectification=info.rectification,
                 projection=info.projection,
             )
-            self._info, self._read, self._told = info, True, None
+            self._info, self._read, self._warned_size = info, True, None
         logger.info("%s: set_camera_info: written to %s", self._name, self._path)
         return self._path
 
 
 def _read(path: Path) -> CameraInfo:
     with path.open("rb") as file:
-        said = file.read(MAX_FILE_BYTES + 1)
-    if len(said) > MAX_FILE_BYTES:
+        data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
         raise ConfigurationError(
             f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most"
         )
     try:
-        return parse_camera_info(said.decode())
+        return parse_camera_info(data.decode())
     except UnicodeDecodeError as exc:
         raise ConfigurationError(f"{path}: expected text: {exc}") from exc
     except SmartCamError as exc:

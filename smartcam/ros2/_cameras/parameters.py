@@ -26,37 +26,37 @@ MAX_APPLICATION_ID = 0xFFFFFFFF
 PERIODS = (0.1, 3600.0)
 """Range of the seconds between two diagnostics."""
 
-SAID: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
-    "url": ("where the camera is, without a password", lambda one: masked(one.address.url)),
+SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
+    "url": ("URL of the camera, without a password", lambda one: masked(one.address.url)),
     "interpret_as": (
-        "what result containers hold; empty where that is not said",
+        "interpretation of result containers; empty: none",
         lambda one: as_text(one.interpret_as),
     ),
     "y_down": ("the camera's y axis points down", lambda one: one.y_down),
     "lenient": ("any non-zero byte is a true bool", lambda one: one.lenient),
     "restore": (
-        "after a reconnect the application and the run state are had back",
+        "application and run state are restored after a reconnect",
         lambda one: one.restore,
     ),
-    "reconnect": ("a camera that is lost is tried again", lambda one: one.reconnect is not None),
-    "connect_timeout": ("seconds for a session", lambda one: one.connect_timeout),
+    "reconnect": ("the client reconnects after a loss", lambda one: one.reconnect is not None),
+    "connect_timeout": ("seconds to establish a session", lambda one: one.connect_timeout),
     "switch_timeout": (
         "seconds for a switch until the camera is ready",
         lambda one: one.switch_timeout,
     ),
     "request_timeout": ("seconds for the answer to a request", lambda one: one.request_timeout),
     "liveness_timeout": (
-        "seconds for a sign of life of a camera that is asked for one; 0: no end",
+        "seconds until a camera that does not answer counts as lost; 0: never",
         lambda one: one.liveness_timeout or 0.0,
     ),
 }
 """Read-only parameters: the description, and a function that returns the value."""
 
 FRAMES = {
-    "video_device": "where frames come from",
+    "video_device": "source of the frames",
     "pixel_format": "format of frames, as four characters",
     "image_size": "width and height of frames in pixels",
-    "camera_info_url": "where the lens is said",
+    "camera_info_url": "file of the lens calibration",
 }
 """Descriptions by v4l2_camera's names."""
 
@@ -106,7 +106,7 @@ class CameraParameters:
         """Declare the parameters."""
         options, camera = self._options, self._camera
         settings = options.settings or camera.settings
-        for name, (description, value) in SAID.items():
+        for name, (description, value) in SETTINGS.items():
             self._declare(name, value(settings), description, read_only=True)
         self._declare(
             "application",

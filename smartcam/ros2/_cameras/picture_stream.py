@@ -21,14 +21,14 @@ Item = TypeVar("Item")
 LOOK_INTERVAL: Final = 0.1
 """Seconds between two checks for a subscriber."""
 
-SELDOM_INTERVAL: Final = 1.0
+IDLE_CHECK_INTERVAL: Final = 1.0
 """Seconds between two checks if the graph reports new subscribers."""
 
-AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
+REOPEN_BACKOFF: Final = Backoff(initial=0.5, maximum=10.0)
 """Delays after which a source that ended is opened again, while there is a subscriber."""
 
 
-class HeardPictures(Generic[Item]):
+class SubscribedPictures(Generic[Item]):
     """Reads a source while one of its topics has a subscriber, and publishes each frame.
 
     Args:
@@ -51,7 +51,7 @@ class HeardPictures(Generic[Item]):
         self.frames: int = 0
         self._name, self._publishers = name, publishers
         self._read, self._publish = read, publish
-        self._told = ""
+        self._last_warning = ""
         self._woken = asyncio.Event()
         self._watches: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
@@ -85,31 +85,35 @@ class HeardPictures(Generic[Item]):
             self._task = None
 
     @property
-    def heard(self) -> bool:
+    def has_subscriber(self) -> bool:
         """True if one of the topics has a subscriber, as far as is known."""
         return any(getattr(one, "heard", True) for one in self._publishers)
 
     async def _run(self) -> None:
         while True:
-            await self._until_heard()
+            await self._wait_for_subscriber()
             before = self.frames
-            delays = AGAIN.delays()
-            while self.heard:
+            delays = REOPEN_BACKOFF.delays()
+            while self.has_subscriber:
                 await self._stream()
                 if self.frames > before:
-                    before, delays = self.frames, AGAIN.delays()
+                    before, delays = self.frames, REOPEN_BACKOFF.delays()
                 await self._pause(next(delays))
 
-    async def _until_heard(self) -> None:
+    async def _wait_for_subscriber(self) -> None:
         """Wait for a subscriber; check seldom if the graph reports subscribers."""
         loop = asyncio.get_running_loop()
-        often = 0.0
-        while not self.heard:
-            pause = LOOK_INTERVAL if not self._watches or loop.time() < often else SELDOM_INTERVAL
+        check_often_until = 0.0
+        while not self.has_subscriber:
+            pause = (
+                LOOK_INTERVAL
+                if not self._watches or loop.time() < check_often_until
+                else IDLE_CHECK_INTERVAL
+            )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._woken.wait()
-                often = loop.time() + SELDOM_INTERVAL
+                check_often_until = loop.time() + IDLE_CHECK_INTERVAL
                 self._woken.clear()
                 await asyncio.sleep(0)
 
@@ -117,38 +121,38 @@ class HeardPictures(Generic[Item]):
         """Wait before the source is opened again, while there is a subscriber."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
-        while self.heard and loop.time() < end:  # noqa: ASYNC110 - there is no event for it
+        while self.has_subscriber and loop.time() < end:  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(LOOK_INTERVAL)
 
     async def _stream(self) -> None:
         """Publish until there is no subscriber, or the source ends."""
         try:
             async with self._read(LOOK_INTERVAL) as reader:
-                while self.heard:
+                while self.has_subscriber:
                     with contextlib.suppress(FrameTimeoutError):
-                        await self._one(await anext(reader))
+                        await self._publish_one(await anext(reader))
         except StopAsyncIteration:
-            self._tell(
+            self._warn_once(
                 "the source of pictures ended; it is opened again while there is a subscriber"
             )
         except SmartCamError as exc:
-            self._tell(str(exc))
+            self._warn_once(str(exc))
         except Exception:
             logger.exception("%s ! its pictures failed", self._name)
 
-    async def _one(self, frame: Item) -> None:
+    async def _publish_one(self, frame: Item) -> None:
         try:
             await self._publish(frame)
         except FrameFormatError as exc:  # the next frame may be complete
-            self._tell(str(exc))
+            self._warn_once(str(exc))
             return
         self.frames += 1
-        self._told = ""
+        self._last_warning = ""
 
-    def _tell(self, text: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Log an error, once until pictures come again."""
-        if text != self._told:
-            self._told = text
+        if text != self._last_warning:
+            self._last_warning = text
             logger.warning("%s ! %s", self._name, text)
 
 

@@ -19,7 +19,7 @@ from smartcam.ros2._cameras.image_messages import (
 )
 from smartcam.ros2._cameras.lens import CameraLens
 from smartcam.ros2._cameras.picture_requests import PictureRequests, one_frame
-from smartcam.ros2._cameras.picture_stream import HeardPictures, publish_newest
+from smartcam.ros2._cameras.picture_stream import SubscribedPictures, publish_newest
 from smartcam.ros2._node.qos import DRIVER
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class CameraPictures:
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
         self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
         self._ends: list[Any] = []
-        self._streams: list[HeardPictures[Frame]] = []
+        self._streams: list[SubscribedPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
         self._size: tuple[int, int] | None = None
         self._codecs = Codecs(threads=1)
@@ -117,8 +117,8 @@ class CameraPictures:
             self._image, self._info, self._small = image, info, small
             name = node.full_name
             self._streams = [
-                HeardPictures(name, (image, info), self._read, self._publish_raw),
-                HeardPictures(
+                SubscribedPictures(name, (image, info), self._read, self._publish_raw),
+                SubscribedPictures(
                     name, (small,), partial(self._read, encoding="jpeg"), self._publish_small
                 ),
             ]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._client._inside import in_pixels
 from smartcam._json import object_text
-from smartcam._thesis import MAX_TIMEOUT, THESIS, said_spec
+from smartcam._thesis import MAX_TIMEOUT, THESIS, spec_of_text
 from smartcam._thesis_calibration import CALIBRATION
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, SmartCamError
@@ -137,7 +137,7 @@ class CameraServices:
             try:
                 return {"error": "", **await do(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
-                return {"error": self._told(exc)}
+                return {"error": self._error_text(exc)}
 
         return handler
 
@@ -150,11 +150,11 @@ class CameraServices:
             try:
                 return {"success": True, "message": await do(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
-                return {"success": False, "message": self._told(exc)}
+                return {"success": False, "message": self._error_text(exc)}
 
         return handler
 
-    def _told(self, error: Exception) -> str:
+    def _error_text(self, error: Exception) -> str:
         if not isinstance(error, SmartCamError):
             logger.error("%s ! a service failed", self._node.full_name, exc_info=error)
             return error_text(RuntimeError(f"{type(error).__name__}: {error}"))
@@ -187,7 +187,7 @@ class CameraServices:
 
     async def _trigger_results(self, request: Any) -> dict[str, Any]:
         camera = self._camera
-        wanted, spec = request.results_per_trigger or 1, said_spec(request.interpret_as)
+        wanted, spec = request.results_per_trigger or 1, spec_of_text(request.interpret_as)
         self._check(request, wanted, spec)
         results = await camera.trigger(
             request.application_id or None,

@@ -74,7 +74,7 @@ class CameraStatus:
         self.period: float = options.diagnostics_period
         self._frame_id = options.frame_id or camera.name
         self._least = 1.0 / options.status_rate
-        self._said: dict[str, Any] | None = None
+        self._published: dict[str, Any] | None = None
         self._due = -math.inf  # loop time of the next status
         self._since: datetime | None = None
         self._before: dict[str, int] = {}  # counters at the last diagnostics
@@ -120,10 +120,10 @@ class CameraStatus:
         self.period = seconds
         self._woken.set()
 
-    def _guarded(self, say: Callable[[], None]) -> None:
+    def _guarded(self, publish: Callable[[], None]) -> None:
         """Call a function that publishes; log its errors."""
         try:
-            say()
+            publish()
         except SmartCamError as exc:
             logger.warning("%s ! its status was not published: %s", self._node.full_name, exc)
         except ENDS_PROGRAM:
@@ -155,11 +155,11 @@ class CameraStatus:
 
     def _publish_if_new(self) -> None:
         fields = status_fields(KnownState.of(self._camera))
-        if fields == self._said:
+        if fields == self._published:
             return
         self._due = asyncio.get_running_loop().time() + self._least
         self._status.publish({"header": self._header(), **fields})
-        self._said = fields
+        self._published = fields
         for heard in tuple(self._heard):
             self._guarded(heard)
 

@@ -86,19 +86,19 @@ class CameraStatusTopic:
             await asyncio.wait(tuple(self._ending))
 
     async def _follow(self, publisher: Any) -> None:
-        said: dict[str, Any] | None = None
+        published: dict[str, Any] | None = None
         async with self._camera.events(max_queue=MAX_WAITING_EVENTS) as events:
             while True:
                 fields = status_fields(KnownState.of(self._camera))
-                if fields != said:
-                    said = fields
+                if fields != published:
+                    published = fields
                     self._publish(publisher, fields)
                     await asyncio.sleep(MIN_INTERVAL)
                 try:
                     await anext(events)
                 except (SmartCamError, StopAsyncIteration):
                     break  # nothing more will come, and the status says why
-        if status_fields(KnownState.of(self._camera)) != said:
+        if status_fields(KnownState.of(self._camera)) != published:
             self._publish(publisher, status_fields(KnownState.of(self._camera)))
 
     def _publish(self, publisher: Any, fields: dict[str, Any]) -> None:

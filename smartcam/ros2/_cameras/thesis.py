@@ -187,14 +187,14 @@ class ThesisServices:
         request = self._request(name, service, message)
         call = ThesisCall(self._face, request, request.timeout or service.timeout)
         async with self._settling if service.settles else contextlib.nullcontext():
-            return self._said(await service.answer(call))
+            return self._encodable(await service.answer(call))
 
     def _request(self, name: str, service: ThesisService, message: Any) -> Any:
         known = [one for one in service.request.model_fields if hasattr(message, one)]
         fields = {one: getattr(message, one) for one in known}
         return validated(service.request, fields, f"{self._face.name}: {name}")
 
-    def _said(self, found: dict[str, Any]) -> dict[str, Any]:
+    def _encodable(self, found: dict[str, Any]) -> dict[str, Any]:
         if "strings" in found:
             found["strings"] = [utf8(one) for one in found["strings"]]
         if "localizations" in found:

@@ -43,7 +43,7 @@ MAX_AGE: Final = 2.0
 MAX_GAP: Final = 1.0
 """Largest number of seconds between two transforms between which poses are interpolated."""
 
-FIRST_TRANSFORM_MARGIN: Final = 0.25
+MAX_EXTRAPOLATION_SECONDS: Final = 0.25
 """Seconds by which a pose may be older than the first received transform, which is then used."""
 
 MAX_STAMP_STEP_BACK: Final = 10.0
@@ -120,7 +120,7 @@ class _FrameLink:
         place = bisect.bisect_left(self.times, utc)
         if place < len(self.times) and self.times[place] == utc:
             return _transform(self, self.moments[place], utc)
-        if place == 0 and self.times[0] - utc <= FIRST_TRANSFORM_MARGIN:
+        if place == 0 and self.times[0] - utc <= MAX_EXTRAPOLATION_SECONDS:
             return _transform(self, self.moments[0], utc)
         if place in {0, len(self.times)} or self.times[place] - self.times[place - 1] > MAX_GAP:
             raise Code.BAD_TIME.refusal(

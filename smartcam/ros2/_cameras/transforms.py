@@ -91,8 +91,8 @@ class CameraFrames:
 
     def _of_pictures(self, place: Any) -> Transform:
         pose: Transform = place.camera_pose
-        said = self._flange if place.setup == "eye-in-hand" else self._parent
-        return _named(pose, said or pose.target, self.optical)
+        frame = self._flange if place.setup == "eye-in-hand" else self._parent
+        return _named(pose, frame or pose.target, self.optical)
 
     def _of_plane(self, calibration: Any, end: str) -> list[Transform]:
         """Return the frame of a plane; none if a calibration has no plane."""

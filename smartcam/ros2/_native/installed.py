@@ -37,8 +37,8 @@ def rclpy(name: str = "") -> Any:
 
 def distribution() -> str:
     """Return the distribution of the installed ROS, as far as it is known."""
-    said = os.environ.get("ROS_DISTRO", "")
-    return said if said in DISTRIBUTIONS else "jazzy"
+    name = os.environ.get("ROS_DISTRO", "")
+    return name if name in DISTRIBUTIONS else "jazzy"
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from smartcam.ros2._native.topics import profile_of
 from smartcam.ros2._node.qos import QoS
 from smartcam.ros2._node.refusals import refusal
 from smartcam.ros2._node.services import LOOK_AGAIN, MAX_CONCURRENT_CALLS
-from smartcam.ros2._node.topics import said
+from smartcam.ros2._node.topics import message_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -107,7 +107,7 @@ class ServiceCalls:
         try:
             async with asyncio.timeout(self._timeout):
                 reply = await self._handler(self._kind.request.decode(data, whole=False))
-            found: bytes | None = self._kind.response.encode(said(reply, {}))
+            found: bytes | None = self._kind.response.encode(message_of(reply, {}))
         except asyncio.CancelledError:
             self._answer(answered, self._refused("the call was cancelled"))
             raise
@@ -261,7 +261,7 @@ class NativeClient:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        message = to_ros(self.type.request, said(request, fields), self._cls.Request)
+        message = to_ros(self.type.request, message_of(request, fields), self._cls.Request)
         self._check_open()
         await self.wait_served(timeout)
         reply: asyncio.Future[Any] = loop.create_future()

@@ -33,7 +33,7 @@ AFTER_ERROR = 0.05
 EXIT_TIMEOUT = 2.0
 """Seconds for which the end of the program waits for a node that was not closed."""
 
-MAX_TOLD = 100
+MAX_LOGGED_TEXTS = 100
 """Largest number of remembered errors of a spinning thread, each of which is logged once."""
 
 
@@ -140,7 +140,7 @@ class SpunNode:
         self._context, self._name, self._namespace = context, name, namespace
         self._loop, self._on_end, self._managed = loop, on_end, managed
         self._stopping = threading.Event()
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._made: asyncio.Future[None] = loop.create_future()
         self._thread = threading.Thread(
             target=self._run, name=f"smartcam-rclpy {namespace}/{name}", daemon=True
@@ -254,8 +254,8 @@ class SpunNode:
     def _tell_error(self, error: Exception) -> None:
         text = f"{type(error).__name__}: {error!s:.300}"
         closed = type(error).__name__ == "InvalidHandle"
-        if text not in self._told and len(self._told) < MAX_TOLD:
-            self._told.add(text)
+        if text not in self._logged and len(self._logged) < MAX_LOGGED_TEXTS:
+            self._logged.add(text)
             level = logging.DEBUG if closed else logging.WARNING
             logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)
         time.sleep(AFTER_ERROR)

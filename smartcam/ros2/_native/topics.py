@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.exceptions import RosError
 from smartcam.ros2._native.installed import rclpy
 from smartcam.ros2._node.topic_reader import TopicReader
-from smartcam.ros2._node.topics import MAX_WAITING_BYTES, said
+from smartcam.ros2._node.topics import MAX_WAITING_BYTES, message_of
 
 if TYPE_CHECKING:
     from smartcam.ros2._native.node import NativeNode
@@ -82,7 +82,7 @@ class NativePublisher:
             RosMessageError: the message is not of the type.
             RosError: the publisher is closed, or rclpy has ended.
         """
-        self.publish_encoded(self.type.encode(said(message, fields)))
+        self.publish_encoded(self.type.encode(message_of(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
         """Publish an encoded message of the type; never waits.
@@ -106,7 +106,7 @@ class NativePublisher:
         self._check_open()
         if self._raw is None:
             return
-        what = said(message, fields)
+        what = message_of(message, fields)
         done = asyncio.Event()
         failed: list[Exception] = []
 

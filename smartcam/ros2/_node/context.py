@@ -112,7 +112,7 @@ class RosContext:
         self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
         self._in_lane: collections.Counter[str] = collections.Counter()
-        self._calm_since, self._said_directly, self._crowded = 0.0, 0, 0.0
+        self._calm_since, self._direct_messages, self._crowded = 0.0, 0, 0.0
         self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
@@ -232,11 +232,11 @@ class RosContext:
             # just been full
             return False
         if now - self._calm_since > CALM:
-            self._calm_since, self._said_directly = now, 0
-        self._said_directly += 1
-        return self._said_directly <= MAX_DIRECT
+            self._calm_since, self._direct_messages = now, 0
+        self._direct_messages += 1
+        return self._direct_messages <= MAX_DIRECT
 
-    def send_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+    def send_later(self, owner: object, send: Callable[[], None], lane: str) -> None:
         """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:
@@ -244,9 +244,9 @@ class RosContext:
         with self._lock:
             self._long[owner] += 1
             self._in_lane[lane] += 1
-        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner, lane))
+        thread.submit(quietly, send).add_done_callback(lambda _: self._sent(owner, lane))
 
-    def _said(self, owner: object, lane: str) -> None:
+    def _sent(self, owner: object, lane: str) -> None:
         with self._lock:
             self._in_lane[lane] -= 1
             if lane == "short":

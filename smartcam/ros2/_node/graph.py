@@ -44,7 +44,7 @@ class RosGraph:
         self._by_name: dict[tuple[str, str], dict[str, Entity]] = {}
         self._listeners: list[Callable[[Entity, bool], None]] = []
         self._declared: ZenohDeclared | None = None
-        self._told = False
+        self._warned = False
 
     def open(self, session: ZenohSession) -> None:
         """Subscribe to the tokens."""
@@ -96,8 +96,8 @@ class RosGraph:
             logger.debug("the graph: %s", exc)
             return
         if len(self._entities) >= MAX_ENTITIES:
-            if not self._told:
-                self._told = True
+            if not self._warned:
+                self._warned = True
                 logger.warning("the graph has more than %d entities", MAX_ENTITIES)
             return
         self._entities[token] = entity

@@ -87,14 +87,14 @@ class ParameterServices:
         self._events.publish(
             stamp={"sec": seconds, "nanosec": rest},
             node=self._node.full_name,
-            new_parameters=self._said(new),
-            changed_parameters=self._said(changed),
+            new_parameters=self._messages(new),
+            changed_parameters=self._messages(changed),
             deleted_parameters=[
                 {"name": name, "value": encode_value(was)} for name, was in (deleted or {}).items()
             ],
         )
 
-    def _said(self, names: Iterable[str]) -> list[dict[str, Any]]:
+    def _messages(self, names: Iterable[str]) -> list[dict[str, Any]]:
         found = ((name, self._parameters.find(name)) for name in names)
         return [{"name": name, "value": encode_value(one)} for name, one in found if one]
 

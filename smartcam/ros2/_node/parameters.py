@@ -172,8 +172,8 @@ class RosParameters:
         if type and first.type != type:
             raise ConfigurationError(f"parameter {name!r}: expected {type}, got {first}")
         bounds = range_of(name, first.number, minimum, maximum, step)
-        said = ParameterDescription(name, first.type, description, read_only, *bounds)
-        made = _Declared(said, first, on_set)
+        described = ParameterDescription(name, first.type, description, read_only, *bounds)
+        made = _Declared(described, first, on_set)
         made.fitting(first, by_node=True)
         self._declared[name] = made
         self._tell(new=[name])

@@ -1,11 +1,13 @@
 """Answer a refused call, so that its caller does not wait forever.
 
-rmw_zenoh drops an error reply, so its clients would wait forever. They receive ordinary answers
-only. Many types have fields for that: ``success`` and a text, or an ``error``. Services of ROS that
-return lists return an empty one, as those of rclcpp do if a parameter is not declared. Any answer
-of another type, such as a sum, or of one without fields, would be a lie: such a call waits for its
-turn, and if it cannot be read it gets the error reply, so that rmw_zenoh's callers wait as they do
-for a node of ROS that cannot read a request.
+rmw_zenoh drops error replies, so its clients would wait forever. A refusal is therefore an ordinary
+response, if the type can express it. Many types have fields for a refusal: ``success`` and a text,
+or an ``error``. Services of ROS that return lists return an empty list, as rclcpp does if a
+parameter is not declared.
+
+A response of any other type, such as a sum, would be a lie. A call of such a type waits until it
+can be carried out. If its request is not valid, it gets an error reply, and rmw_zenoh's client
+waits forever, as for any node of ROS.
 """
 
 from __future__ import annotations
@@ -19,12 +21,12 @@ MAX_REASON_CHARACTERS: Final = 1000
 """Largest number of characters of the reason in an answer; a longer one is cut."""
 
 FLAGS: Final = ("success", "successful")
-"""Names of fields that say whether a call was carried out."""
+"""Names of fields that are true if the call was carried out."""
 
 TEXTS: Final = (
     *("error", "error_message", "failure_reason", "message", "reason", "status_message"),
 )
-"""Names of fields that say why not."""
+"""Names of fields for the reason of a refusal."""
 
 LISTING: Final = ("composition_interfaces", "lifecycle_msgs", "rcl_interfaces")
 """Packages in whose answers an empty list means that nothing is known."""

@@ -104,16 +104,16 @@ class RosOut:
 
     def _take(self, record: logging.LogRecord) -> None:
         """Queue a record; called in the thread that logs."""
-        said = self._said(record)
+        fields = self._fields(record)
         with self._lock:  # held only for a moment
             self.dropped += len(self._waiting) == MAX_WAITING_RECORDS
-            self._waiting.append(said)
+            self._waiting.append(fields)
         if not self._woken and self._loop is not None:
             self._woken = True
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._publish)
 
-    def _said(self, record: logging.LogRecord) -> dict[str, Any]:
+    def _fields(self, record: logging.LogRecord) -> dict[str, Any]:
         seconds, rest = divmod(round(record.created * 1e9), 1_000_000_000)
         below = record.name.removeprefix(self._logger.name)
         return {

@@ -24,7 +24,7 @@ from smartcam.exceptions import (
 from smartcam.ros2._node.attachment import Attachment
 from smartcam.ros2._node.refusals import refusal
 from smartcam.ros2._node.tokens import CLIENT, SERVICE
-from smartcam.ros2._node.topics import RosEnd, said
+from smartcam.ros2._node.topics import RosEnd, message_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -141,7 +141,7 @@ class RosService(RosEnd):
         try:
             async with asyncio.timeout(self._timeout):
                 reply = await self._handler(request)
-            data = self.type.response.encode(said(reply, {}))
+            data = self.type.response.encode(message_of(reply, {}))
         except asyncio.CancelledError:
             self._refuse(call, RosError("the call was cancelled"))
             raise
@@ -287,7 +287,7 @@ class RosClient(RosEnd):
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        data = self.type.request.encode(said(request, fields))
+        data = self.type.request.encode(message_of(request, fields))
         await self.wait_served(timeout)
         self._number += 1
         attachment = Attachment(self._number, time.time_ns(), self.entity.gid)

@@ -37,7 +37,7 @@ MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of a topic's messages that wait to be sent, or to be read."""
 
 
-def said(message: object, fields: dict[str, Any]) -> object:
+def message_of(message: object, fields: dict[str, Any]) -> object:
     """Return the message to send, or its fields if no message is given."""
     if message is not None and fields:
         raise RosMessageError("expected a message or its fields, got both")
@@ -188,7 +188,7 @@ class RosPublisher(RosEnd):
             RosMessageError: the value is not a message of the type.
             RosError: the publisher is closed.
         """
-        self.publish_encoded(self.type.encode(said(message, fields)))
+        self.publish_encoded(self.type.encode(message_of(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
         """Publish an encoded message of the type; never waits.
@@ -229,7 +229,7 @@ class RosPublisher(RosEnd):
         Cancellation: the message is published or not.
         """
         self._check_open()
-        what = said(message, fields)
+        what = message_of(message, fields)
         if self._slot is None:
             self._slot = self._context.slot()
             self._lane = self._slot.lane

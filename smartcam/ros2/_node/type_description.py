@@ -34,7 +34,7 @@ class TypeDescriptions:
 
     def __init__(self, node: NodeOfRos, entities: Callable[[], Iterable[Entity]]) -> None:
         self._node, self._entities = node, entities
-        self._said: dict[str, Any] = {}
+        self._descriptions: dict[str, Any] = {}
         if served(node.types):
             node.parameters.declare(
                 PARAMETER,
@@ -57,9 +57,9 @@ class TypeDescriptions:
                 break
         else:
             return _failed(f"{self._node.full_name} uses no type with the hash {asked}")
-        made = self._said.get(asked)
+        made = self._descriptions.get(asked)
         if made is None:
-            made = self._said[asked] = describe(self._node.types, entity.ros_type)
+            made = self._descriptions[asked] = describe(self._node.types, entity.ros_type)
         sources = self._sources(made) if request.include_type_sources else []
         return {"successful": True, "type_description": made, "type_sources": sources}
 

@@ -143,11 +143,11 @@ def parse_message(name: str, text: str) -> Definition:
     constants: dict[str, Any] = {}
     kinds: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        said = line.strip()
-        if not said or said.startswith("#"):
+        text_line = line.strip()
+        if not text_line or text_line.startswith("#"):
             continue
         try:
-            field, constant = _parse_line(package, said)
+            field, constant = _parse_line(package, text_line)
             if field.name in fields or field.name in constants:
                 raise ValueError(f"there are two {field.name}")
             if constant:
@@ -155,7 +155,7 @@ def parse_message(name: str, text: str) -> Definition:
             else:
                 fields[field.name] = field
         except (ValueError, SyntaxError, MemoryError, RecursionError) as exc:
-            raise ConfigurationError(f"{name}, line {number}: {said!r:.80}: {exc}") from exc
+            raise ConfigurationError(f"{name}, line {number}: {text_line!r:.80}: {exc}") from exc
     return Definition(name, tuple(fields.values()), constants, kinds)
 
 
@@ -171,11 +171,11 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
 
 
-def bare(said: Any) -> Any:
+def bare(definition: Any) -> Any:
     """Return the fields of a message, or of a service's two, without defaults."""
-    if isinstance(said, tuple):
-        return [bare(one) for one in said]
-    return [one._replace(default=None) for one in said.fields]
+    if isinstance(definition, tuple):
+        return [bare(one) for one in definition]
+    return [one._replace(default=None) for one in definition.fields]
 
 
 def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
@@ -200,19 +200,19 @@ def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     return field._replace(default=_value(field, value, whole=constant)), constant
 
 
-def _full_name(package: str, said: str) -> str:
-    said = OTHER_NAMES.get(said, said)
-    if said in ("wstring", "float128"):
-        raise ValueError(f"{said} is not supported")
-    if said in BASES:
-        return said
-    if "/" not in said:
-        said = _OLD_NAMES.get(said, f"{package}/msg/{said}")
-    elif "/msg/" not in said:
-        said = said.replace("/", "/msg/", 1)
-    if NAME.fullmatch(said) is None:
-        raise ValueError(f"{said} is no type")
-    return said
+def _full_name(package: str, name: str) -> str:
+    name = OTHER_NAMES.get(name, name)
+    if name in ("wstring", "float128"):
+        raise ValueError(f"{name} is not supported")
+    if name in BASES:
+        return name
+    if "/" not in name:
+        name = _OLD_NAMES.get(name, f"{package}/msg/{name}")
+    elif "/msg/" not in name:
+        name = name.replace("/", "/msg/", 1)
+    if NAME.fullmatch(name) is None:
+        raise ValueError(f"{name} is no type")
+    return name
 
 
 def _value(field: MessageField, text: str | None, *, whole: bool) -> Any:

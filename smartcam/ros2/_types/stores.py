@@ -61,27 +61,27 @@ def stored(distribution: str) -> Mapping[str, Any]:
     return found
 
 
-def read_stored(name: str, said: Any) -> Definition:
+def read_stored(name: str, stored: Any) -> Definition:
     """Return the definition of a message that a store holds."""
-    constants = {one: value for one, _, value in said[0]}
+    constants = {one: value for one, _, value in stored[0]}
     fields = []
-    for one, kind in said[1]:
+    for one, kind in stored[1]:
         if one != EMPTY.name:
             default = _DEFAULTS.get((name, one))
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(one, kind)._replace(default=default))
-    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in said[0]}
+    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in stored[0]}
     return Definition(name, tuple(fields), constants, kinds)
 
 
-def _field(name: str, said: Any) -> MessageField:
+def _field(name: str, stored: Any) -> MessageField:
     shape, size = "", 0
-    if said[0] in (_ARRAY, _SEQUENCE):
-        shape = "array" if said[0] == _ARRAY else "sequence"
-        said, size = said[1]
-    if said[0] == _NAME:
-        return MessageField(name, said[1], shape, size)
+    if stored[0] in (_ARRAY, _SEQUENCE):
+        shape = "array" if stored[0] == _ARRAY else "sequence"
+        stored, size = stored[1]
+    if stored[0] == _NAME:
+        return MessageField(name, stored[1], shape, size)
     kind: str
-    kind, limit = said[1]
+    kind, limit = stored[1]
     return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

@@ -324,14 +324,14 @@ class RosTypes:
         """
         _, kind, _ = split_name(name)
         parse = parse_service if kind == "srv" else parse_message
-        said = parse(name, text)
+        parsed = parse(name, text)
         with self._lock:
             if name in self.names():
                 if kind == "srv":
                     there: Any = parse(name, self._service_text(name) or "")
                 else:
                     there = self.definition(name)
-                if bare(there) != bare(said):
+                if bare(there) != bare(parsed):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )

@@ -124,8 +124,10 @@ async def test_folder_with_other_new_files_names_them(tmp_path: Path) -> None:
 
 def test_folder_describes_the_awaited_file(tmp_path: Path) -> None:
     told = PictureFolder(tmp_path, deadline=5.0).awaited
-    assert f"the next file that comes into {tmp_path} counts, one that ends in .bmp" in told
-    assert told.endswith("It is waited for 5 s")
+    assert (
+        f"the first file written to {tmp_path} from now on counts, if its name ends in .bmp" in told
+    )
+    assert told.endswith("The step waits 5 s for it")
 
 
 async def test_folder_with_an_invalid_picture_names_the_file(tmp_path: Path) -> None:

@@ -382,4 +382,4 @@ class Client:
         memory = (last, evidence, at.doubted, at.satisfied, at._last_number, at._turn, at._given)
         given_up = tuple(at._given_up.items())
         numbered = self.results._numbering is not None
-        return self.state._told, numbered, call, waiting, owed, memory, given_up
+        return self.state._last_status, numbered, call, waiting, owed, memory, given_up

@@ -382,7 +382,7 @@ class World:
                 self.ask("refreshed", ("get status",))
             case "refreshed" | "prepare":
                 if self.variant.family == "answer":
-                    at.heard()
+                    at.note_query_answered()
                 if at.doubted:
                     self.ask("heard")
                 elif at.owed and self.variant.number != "own":
@@ -390,7 +390,7 @@ class World:
                 else:
                     self.phase = "ready"
             case "heard":
-                at.heard()
+                at.note_query_answered()
                 self.phase = "prepare"
             case "settling" if WAITING in status:
                 self.ask("settled")

@@ -151,7 +151,7 @@ class Client:
 
     def trigger(self, wanted: int, application: int | None, *, has_input: bool) -> None:
         """Send a trigger, where one may be sent."""
-        if self.results._pending is not None or self.waits.owes(m.QueryAnswer):
+        if self.results._pending is not None or self.waits.is_pending(m.QueryAnswer):
             return
         if self.machine.state is not State.CONNECTED:
             return
@@ -188,7 +188,7 @@ class Client:
     def ask(self, request: m.Request = _QUERY) -> None:
         """Send a request of a caller, where none of its kind is open."""
         answer = request.answer
-        if self.machine.state is State.CONNECTED and answer and not self.waits.owes(answer):
+        if self.machine.state is State.CONNECTED and answer and not self.waits.is_pending(answer):
             self.machine.send(request)
             owed = self.waits.next_answer(answer, LOOP, LOOP.time(), behind=self.deliveries)
             self.awaited.append(owed)

@@ -24,10 +24,10 @@ class ForgetsStatuses(ShortDispatch):
     """Does not count the statuses around a result."""
 
     def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        heard = self._state.statuses_heard
+        heard = self._state.statuses_received
         taken = super()._take_round(events, now, at)
         if taken:
-            self._state.statuses_heard = heard
+            self._state.statuses_received = heard
         return taken
 
 

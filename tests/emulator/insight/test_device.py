@@ -103,8 +103,8 @@ def test_control_admits_what_lies_in_its_bounds() -> None:
 @pytest.mark.parametrize(
     ("image", "error"),
     [
-        (np.zeros((2, 2)), "an image is a table of uint8, got 2 axes of float64"),
-        (np.zeros(4, np.uint8), "an image is a table of uint8, got 1 axes of uint8"),
+        (np.zeros((2, 2)), "an image is a 2-D array of uint8, got 2 axes of float64"),
+        (np.zeros(4, np.uint8), "an image is a 2-D array of uint8, got 1 axes of uint8"),
         (np.zeros((0, 4), np.uint8), "an image has 1 to 8388608 pixels, got 0"),
         (np.zeros((4000, 4000), np.uint8), "an image has 1 to 8388608 pixels, got 16000000"),
     ],

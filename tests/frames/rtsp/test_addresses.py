@@ -13,12 +13,12 @@ from tests.frames.inside import (
     MAX_WRONG_ANSWERS,
     Authentication,
     PasswordGate,
+    RequestedTransport,
     RtspError,
     RtspRequest,
     RtspTarget,
-    TransportWish,
+    requested_transport,
     target_of,
-    wish_of,
 )
 from tests.frames.rtsp.client import Reply, digest
 
@@ -51,18 +51,21 @@ def test_text_that_is_no_url_is_refused(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("transport", "wish"),
+    ("transport", "requested"),
     [
-        ("RTP/AVP;unicast;client_port=5000-5001", TransportWish(False, 5000, 5001)),
-        ("RTP/AVP/UDP;unicast;client_port=5000;mode=play", TransportWish(False, 5000, 5001)),
-        (f"RTP/AVP;unicast;destination={US};client_port=9-8", TransportWish(False, 9, 8)),
-        ("rtp/avp/tcp;interleaved=2-3", TransportWish(True, 2, 3)),
-        ("RTP/AVP/TCP;unicast", TransportWish(True, None, None)),
-        ('RTP/SAVP;x, RTP/AVP;multicast,RTP/AVP/TCP;mode="PLAY"', TransportWish(True, None, None)),
+        ("RTP/AVP;unicast;client_port=5000-5001", RequestedTransport(False, 5000, 5001)),
+        ("RTP/AVP/UDP;unicast;client_port=5000;mode=play", RequestedTransport(False, 5000, 5001)),
+        (f"RTP/AVP;unicast;destination={US};client_port=9-8", RequestedTransport(False, 9, 8)),
+        ("rtp/avp/tcp;interleaved=2-3", RequestedTransport(True, 2, 3)),
+        ("RTP/AVP/TCP;unicast", RequestedTransport(True, None, None)),
+        (
+            'RTP/SAVP;x, RTP/AVP;multicast,RTP/AVP/TCP;mode="PLAY"',
+            RequestedTransport(True, None, None),
+        ),
     ],
 )
-def test_transports(transport: str, wish: TransportWish) -> None:
-    assert wish_of(transport, US) == wish
+def test_transports(transport: str, requested: RequestedTransport) -> None:
+    assert requested_transport(transport, US) == requested
 
 
 @pytest.mark.parametrize(
@@ -83,7 +86,7 @@ def test_transports(transport: str, wish: TransportWish) -> None:
 )
 def test_other_transports_are_refused(transport: str) -> None:
     with pytest.raises(RtspError) as caught:
-        wish_of(transport, US)
+        requested_transport(transport, US)
     assert caught.value.status == 461
 
 

@@ -43,7 +43,7 @@ class Coding(NamedTuple):
     Attributes:
         name: name of the codec.
         format: name of the encoded frames' format.
-        kind: function that returns the kind of the payloads.
+        kind: function that returns an object that assembles the payloads.
         size_in: function that returns the size of the pictures from an encoded frame; None if it
             lacks parameters.
         decoder: function that returns a decoder for a stream.

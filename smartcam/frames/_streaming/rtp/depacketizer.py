@@ -65,10 +65,10 @@ class Depacketizer:
         self._next: int | None = None  # next expected sequence number with wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
         self._open: OpenUnit | None = None
-        self._sure = False  # whether the next packet is the first of a frame
+        self._unbroken = False  # whether no packet is missing before the next one
         self._closed: int | None = None  # timestamp of the last ended frame
         self._begins = True  # whether the stream has had no complete frame yet
-        self._odd: int | None = None  # number after a sequence number that was far off
+        self._after_jump: int | None = None  # sequence number that would confirm a restarted stream
         # time of the open frame's untrusted marker
         self._marked_at: float | None = None
         self._marked = False  # whether the last ended frame had a marker
@@ -129,7 +129,7 @@ class Depacketizer:
         return min((now for _, now in self._held.values()), default=None)
 
     def give_up(self, before: float) -> list[AccessUnit]:
-        """Drop packets overdue since a moment, and return the frames that are complete then."""
+        """Stop waiting for packets missing since before a moment; return the complete frames."""
         made: list[AccessUnit] = []
         while (since := self.waits_since()) is not None and since < before:
             made += self._ready(True)
@@ -141,14 +141,14 @@ class Depacketizer:
             self._next = sequence
         off = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
         if not -MAX_PACKETS_LATE <= off <= MAX_PACKETS_AHEAD:
-            if sequence != self._odd:
-                self._odd = sequence + 1 & 0xFFFF
+            if sequence != self._after_jump:
+                self._after_jump = sequence + 1 & 0xFFFF
                 return None
             self._damage_open()
             self._begin()
             self.streams += 1
             self._next, off = sequence, 0
-        self._odd = None
+        self._after_jump = None
         place = self._next + off
         return None if off < 0 or place in self._held else place
 
@@ -171,7 +171,7 @@ class Depacketizer:
     def _gap(self) -> None:
         if self._open is not None:
             self._open.whole = False
-        self._sure, self._parameters = False, None
+        self._unbroken, self._parameters = False, None
 
     def _follow(self, packet: RtpPacket, now: float) -> Iterator[AccessUnit]:
         if self._open is not None and self._open.timestamp != packet.timestamp:
@@ -181,7 +181,7 @@ class Depacketizer:
         if self._open is None:
             self._open = self._opened(packet, now)
         self._open.add(packet.payload)
-        self._sure = True
+        self._unbroken = True
         over = self._open.has_picture or not self._open.parts
         if packet.marker and over and not self._marks_lie:
             self._marked_at = now
@@ -190,13 +190,13 @@ class Depacketizer:
 
     def _opened(self, packet: RtpPacket, now: float) -> OpenUnit:
         again = packet.timestamp == self._closed  # the frame had not ended
-        self.proofs += self._marked and self._sure and not again
-        if again and self._sure and packet.payload:
+        self.proofs += self._marked and self._unbroken and not again
+        if again and self._unbroken and packet.payload:
             self._marks_lie, self.proofs = True, 0
-        sure = (self._sure or self._kind.begins(packet.payload)) and not again
-        opened = self._kind.open(packet.timestamp, sure, now)
+        whole = (self._unbroken or self._kind.begins(packet.payload)) and not again
+        opened = self._kind.open(packet.timestamp, whole, now)
         before, self._parameters = self._parameters, None
-        if before is not None and self._sure:
+        if before is not None and self._unbroken:
             opened.parts, opened.size, opened.arrived = before.parts, before.size, before.arrived
         return opened
 

@@ -51,7 +51,7 @@ def target_of(url: str) -> RtspTarget:
     return RtspTarget(base, name, track)
 
 
-class TransportWish(NamedTuple):
+class RequestedTransport(NamedTuple):
     """A transport requested by a client: channels of the connection, or a pair of ports.
 
     Attributes:
@@ -65,7 +65,7 @@ class TransportWish(NamedTuple):
     rtcp: int | None
 
 
-def wish_of(header: str, client: str) -> TransportWish:
+def requested_transport(header: str, client: str) -> RequestedTransport:
     """Return the first supported transport in a client's list.
 
     Args:
@@ -76,9 +76,9 @@ def wish_of(header: str, client: str) -> TransportWish:
         RtspError: the list has no supported transport.
     """
     for text in header.split(","):
-        wish = _read(text, client)
-        if wish is not None:
-            return wish
+        requested = _read(text, client)
+        if requested is not None:
+            return requested
     raise RtspError(
         461,
         "Transport: expected RTP/AVP;unicast;client_port=A-B to the client's own address, or "
@@ -86,7 +86,7 @@ def wish_of(header: str, client: str) -> TransportWish:
     )
 
 
-def _read(text: str, client: str) -> TransportWish | None:
+def _read(text: str, client: str) -> RequestedTransport | None:
     protocol, *rest = (part.strip() for part in text.split(";"))
     options = {key.lower(): value for key, _, value in (one.partition("=") for one in rest)}
     tcp = protocol.upper() == "RTP/AVP/TCP"
@@ -97,10 +97,10 @@ def _read(text: str, client: str) -> TransportWish | None:
     if options.get("mode", "play").strip('"').lower() != "play":
         return None
     if tcp and "interleaved" not in options:
-        return TransportWish(True, None, None)
+        return RequestedTransport(True, None, None)
     least, most = (0, 255) if tcp else (1, 65535)
     pair = _pair(options.get("interleaved" if tcp else "client_port", ""), least, most)
-    return None if pair is None else TransportWish(tcp, *pair)
+    return None if pair is None else RequestedTransport(tcp, *pair)
 
 
 def _pair(text: str, least: int, most: int) -> tuple[int, int] | None:

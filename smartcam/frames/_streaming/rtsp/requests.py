@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames._streaming.rtp.h264 import parameter_sets
-from smartcam.frames._streaming.rtsp.addresses import TRACK, target_of, wish_of
+from smartcam.frames._streaming.rtsp.addresses import TRACK, requested_transport, target_of
 from smartcam.frames._streaming.rtsp.delivery import ChannelDelivery, DatagramDelivery, port_pair
 from smartcam.frames._streaming.rtsp.messages import RtspError
 from smartcam.frames._streaming.rtsp.packing import PAYLOAD_TYPE
@@ -17,7 +17,7 @@ from smartcam.frames._streaming.rtsp.session import SESSION_TIMEOUT, RtspSession
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish
+    from smartcam.frames._streaming.rtsp.addresses import RequestedTransport, RtspTarget
     from smartcam.frames._streaming.rtsp.connection import RtspConnection
     from smartcam.frames._streaming.rtsp.delivery import PacketDelivery
     from smartcam.frames._streaming.rtsp.messages import RtspRequest
@@ -99,13 +99,13 @@ async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer
         if session.playing or session.stream is stream:
             raise RtspError(455, f"{stream.name}: the session is set up already")
         raise RtspError(459, "each stream has a session of its own")
-    wish = wish_of(request.headers.get("transport", ""), str(connection.peer[0]))
+    requested = requested_transport(request.headers.get("transport", ""), str(connection.peer[0]))
     if len(connection.sessions) >= MAX_SESSIONS:
         raise RtspError(453, f"{MAX_SESSIONS} sessions are open on this connection")
     session = RtspSession(stream, connection.session_ended)
     connection.owner.admit(session, str(connection.peer[0]))
     try:
-        delivery = await _delivery(connection, wish, session)
+        delivery = await _delivery(connection, requested, session)
     except BaseException:
         connection.owner.dismiss(session, str(connection.peer[0]))
         raise
@@ -116,30 +116,30 @@ async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer
 
 
 async def _delivery(
-    connection: RtspConnection, wish: TransportWish, session: RtspSession
+    connection: RtspConnection, requested: RequestedTransport, session: RtspSession
 ) -> PacketDelivery:
-    if wish.tcp:
-        return ChannelDelivery(connection.transport, *_channels(connection, wish))
+    if requested.tcp:
+        return ChannelDelivery(connection.transport, *_channels(connection, requested))
     address = connection.address
     family = socket.AF_INET6 if ":" in str(address[0]) else socket.AF_INET
     try:
         sockets = port_pair(str(address[0]), family)
     except OSError as exc:
         raise RtspError(503, f"no ports: {exc}") from exc
-    ports = (wish.rtp or 0, wish.rtcp or 0)
+    ports = (requested.rtp or 0, requested.rtcp or 0)
     delivery = DatagramDelivery(sockets, connection.peer, ports, session.take_rtcp)
     await delivery.open()
     return delivery
 
 
-def _channels(connection: RtspConnection, wish: TransportWish) -> tuple[int, int]:
+def _channels(connection: RtspConnection, requested: RequestedTransport) -> tuple[int, int]:
     taken = set(connection.channels())
-    if wish.rtp is None or wish.rtcp is None:
+    if requested.rtp is None or requested.rtcp is None:
         first = next(one for one in range(0, 256, 2) if not {one, one + 1} & taken)
         return first, first + 1
-    if {wish.rtp, wish.rtcp} & taken:
-        raise RtspError(461, f"Transport: channels {wish.rtp}-{wish.rtcp} are in use")
-    return wish.rtp, wish.rtcp
+    if {requested.rtp, requested.rtcp} & taken:
+        raise RtspError(461, f"Transport: channels {requested.rtp}-{requested.rtcp} are in use")
+    return requested.rtp, requested.rtcp
 
 
 async def _play(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Final
 
 
-def _texts(package: str, kind: str, said: dict[str, str]) -> dict[str, str]:
-    """Return texts of files from these, in which ``;`` ends a line, and ``|`` a request."""
+def _texts(package: str, kind: str, short: dict[str, str]) -> dict[str, str]:
+    """Return texts of files; in short texts ``;`` ends a line, and ``|`` ends a request."""
     return {
         f"{package}/{kind}/{name}": "\n".join(
             "---" if part == "|" else part
             for line in text.replace("|", ";|;").split(";")
             if (part := line.strip())
         )
-        for name, text in said.items()
+        for name, text in short.items()
     }
 
 

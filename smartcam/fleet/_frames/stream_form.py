@@ -10,7 +10,7 @@ from smartcam.fleet._frames.wire import VIDEO, FrameForm
 from smartcam.frames import RateControl, find_format
 
 
-class StreamWish(NamedTuple):
+class StreamForm(NamedTuple):
     """A program's request for a stream.
 
     Attributes:
@@ -33,7 +33,7 @@ class StreamWish(NamedTuple):
         who: str,
         *,
         decode: bool = True,
-    ) -> StreamWish:
+    ) -> StreamForm:
         """Return a checked request of ``who``, with arguments of :meth:`smartcam.Camera.frames`.
 
         Raises:
