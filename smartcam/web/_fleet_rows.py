@@ -44,7 +44,7 @@ MAX_TEXT_CHARACTERS: Final = 160
 RATE_SECONDS: Final = 5
 """Seconds over which a rate is counted."""
 
-BAD_SECONDS: Final = 60.0
+ERROR_MARK_SECONDS: Final = 60.0
 """Seconds for which a camera keeps the mark of an error."""
 
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
@@ -231,7 +231,7 @@ class FleetRow:
             self._note(reason or "lost", now)
             self.history.add_loss(reason or "no agent shares the camera")
             self.errors += 1
-        elif self.error_at is not None and now - self.error_at >= BAD_SECONDS:
+        elif self.error_at is not None and now - self.error_at >= ERROR_MARK_SECONDS:
             self.error, self.error_at = "", None
         state = RowState(
             connected, over, status, application, reason, self.error, tuple(sorted(self.agents))

@@ -121,7 +121,7 @@ def test_record_over_a_file_needs_force(url: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     command = ["record", url, "-o", str(path), "--seconds", "0.1"]
-    run(*command).failed(2, "run.mcap: the file is there already")
+    run(*command).failed(2, "run.mcap: the file exists already")
     assert path.read_text() == "precious"
     run(*command, "--force").done()
     assert load_recording(path).remark == ""
