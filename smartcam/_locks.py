@@ -14,7 +14,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-PLACE = 1 << 62
+LOCK_OFFSET = 1 << 62
 """Offset of the byte that is locked on Windows: after all data, which others may then still use."""
 
 _HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK})
@@ -29,7 +29,7 @@ def try_lock(descriptor: int) -> bool | None:
     try:
         if sys.platform == "win32":
             place = os.lseek(descriptor, 0, os.SEEK_CUR)
-            os.lseek(descriptor, PLACE, os.SEEK_SET)
+            os.lseek(descriptor, LOCK_OFFSET, os.SEEK_SET)
             try:
                 msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
             finally:

@@ -85,7 +85,7 @@ REPLY_THREADS = 4
 MAX_WAITING_QUERIES = 4096
 """Largest number of queries that may wait for an answering thread; further ones get no answer."""
 
-TURN = 64
+CALLBACKS_PER_TURN = 64
 """Callbacks that run in one turn of the event loop."""
 
 PATIENT_TURN = 8
@@ -482,7 +482,7 @@ class ZenohSession:
 
     def _drain(self) -> None:
         waiting, patient = self._waiting, self._patient
-        for _ in range(TURN):
+        for _ in range(CALLBACKS_PER_TURN):
             if not waiting:
                 break
             call, arguments, size = waiting.popleft()

@@ -149,9 +149,8 @@ async def _run(demo: _Demo) -> None:
         f"Models, calibration, cell file and pictures stand in {demo.folder}. Try on them what you "
         "change:"
     )
-    steps.detail(
-        f"   smartcam inspect {demo.folder / CELL_FILE} desk/camera 1 {demo.folder}/judged"
-    )
+    cell, to = demo.folder / CELL_FILE, demo.folder / "judged"
+    steps.detail(f"   smartcam inspect {cell} desk/camera 1 {to}")
 
 
 async def _taught(demo: _Demo) -> PartModel:

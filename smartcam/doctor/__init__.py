@@ -111,7 +111,7 @@ _AT_THE_WIRE = (
         session_checks.connect,
         # a session that fails, all other ways, and a session by one of them; and their ends
         lambda options: (
-            4 * options.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.CONNECTS
+            4 * options.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.SESSION_COUNT
         ),
         in_session=False,
     ),

@@ -257,7 +257,7 @@ CONVERTED: dict[str, _Converted] = {
 that all lie within two millimetres, or are turned by less than six degrees, look the same: so the
 hint only asks."""
 
-NONSENSE = (1e-20, 1e20)
+PLAUSIBLE_REALS = (1e-20, 1e20)
 """Reals outside of these limits, except zero, are probably bytes of other types."""
 
 
@@ -274,7 +274,11 @@ def _look_at_values(
         for record in layout.parse_records(reading.data, reading.byte_order):
             for field in fields:
                 value = abs(float(getattr(record, field.name)))
-                if value and not field.wire.is_integer and not NONSENSE[0] < value < NONSENSE[1]:
+                if (
+                    value
+                    and not field.wire.is_integer
+                    and not PLAUSIBLE_REALS[0] < value < PLAUSIBLE_REALS[1]
+                ):
                     nonsense.setdefault(field.name, value)
                 elif field.unit is None:
                     found[field.name] = max(value, found.get(field.name, 0.0))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._probing import CameraAnswer, Trial
     from smartcam.exceptions import SmartCamError
 
-CONNECTS = 5
+SESSION_COUNT = 5
 """Number of sessions made one after the other, for the spread of the connect time."""
 
 CONNECTS_WITHIN = 3.0
@@ -90,7 +90,7 @@ async def connect(exam: Examination) -> None:
     exam.pin(camera.url)
     first = times[0] if times and not pinned else None
     try:
-        while len(times) < CONNECTS and loop.time() - begin < CONNECTS_WITHIN:
+        while len(times) < SESSION_COUNT and loop.time() - begin < CONNECTS_WITHIN:
             await camera.close()
             one_begin = loop.time()
             camera = await exam.make_camera().open()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._context import Examination, Witness
     from smartcam.doctor._findings import Severity
 
-QUERIES = 30
+QUERY_COUNT = 30
 """Number of requests for the round-trip time: enough for a median, and fast."""
 
 QUERIES_WITHIN = 3.0
@@ -109,7 +109,7 @@ async def measure_round_trip(exam: Examination) -> None:
     """Check ``round trip``: the time from a Query to its answer."""
     camera, loop = exam.connected_camera, asyncio.get_running_loop()
     begin, times = loop.time(), list[float]()
-    while len(times) < QUERIES and loop.time() - begin < QUERIES_WITHIN:
+    while len(times) < QUERY_COUNT and loop.time() - begin < QUERIES_WITHIN:
         sent_at = loop.time()
         await camera.query_application()
         times.append(loop.time() - sent_at)

@@ -52,7 +52,7 @@ CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
 SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
 """The fields of an application that the page shows."""
 
-_SHOWN = 20  # largest number of ids that an error names
+_MAX_NAMED_IDS = 20  # largest number of ids that an error names
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -234,8 +234,8 @@ class EmulatedCamera(WireCamera):
                 )
                 return ("applications", number, "id"), text
         if plan.active is not None and plan.active not in known:
-            there = ", ".join(str(number) for number in known[:_SHOWN])
-            more = ", ..." if len(known) > _SHOWN else ""
+            there = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
+            more = ", ..." if len(known) > _MAX_NAMED_IDS else ""
             asked = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
             return ("active",), f"no application has {asked}; there are {there}{more}"
         try:

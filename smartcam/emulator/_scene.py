@@ -49,7 +49,7 @@ PIECES: Mapping[str, TablePose] = {
 }
 """The pieces at their first poses; no two touch, none reaches over the table's edge."""
 
-_ARM = 0.02
+_HALF_LENGTH_M = 0.02
 """Half the length of a piece, metres; pixel noise at this distance turns the piece."""
 
 
@@ -120,7 +120,7 @@ class TableScene:
         found: list[Observation] = []
         for name, pose in list(self.pieces.items()):  # a test may change them in its own thread
             u, v, theta = self.to_pixels(pose)
-            turn = gauss(0.0, self.pixel_noise / (_ARM * self.scale))
+            turn = gauss(0.0, self.pixel_noise / (_HALF_LENGTH_M * self.scale))
             found.append(
                 Observation(
                     name=name,

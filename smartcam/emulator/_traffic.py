@@ -31,7 +31,7 @@ MAX_IDS = 1000
 """Largest number of unknown message ids that are counted; those of the dialect always are. Only a
 client that sends anything at all uses more."""
 
-_ENTRY = 400  # bytes of an entry with its message, without the payload
+_ENTRY_BYTES = 400  # bytes of an entry with its message, without the payload
 _PER_BYTE = 4  # bytes for each of a payload: one in the message, three in hex
 
 MAX_VISITS = 1000
@@ -162,7 +162,7 @@ class Log(Sequence[LogEntry]):
     def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
         """Add a frame that passed unchanged; as :meth:`append`."""
         self._unread.append((time, peer, sender, frame, fault, None))
-        weight = _ENTRY + _PER_BYTE * len(frame[1])
+        weight = _ENTRY_BYTES + _PER_BYTE * len(frame[1])
         if fault is not None:
             weight += len(fault)
         self._weights.append(weight)
@@ -174,11 +174,11 @@ class Log(Sequence[LogEntry]):
         """Add an entry, or the parts of one."""
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
-            weight = _ENTRY + _PER_BYTE * size + sum(len(text) for text in texts if text)
+            weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
         else:  # its size once it is read
             _, _, _, what, fault, wire = entry
             size = len(what.payload if isinstance(what, Frame) else what)
-            weight = _ENTRY + _PER_BYTE * size
+            weight = _ENTRY_BYTES + _PER_BYTE * size
             if fault is not None or wire is not None:
                 weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
         self._unread.append(entry)

@@ -204,7 +204,7 @@ class LocalizationsInterpreter(PlainInterpreter):
 
 
 def _wrong(field: Field, value: float) -> str:
-    """Return what was expected in place of an invalid number; "" for a valid number."""
+    """Return a description of the valid numbers for an invalid number; "" for a valid one."""
     if field.name in _POSE and not math.isfinite(value):
         return "a finite number"
     if field.name == "quality" and not 0.0 <= value <= MAX_QUALITY:

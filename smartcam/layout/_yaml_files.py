@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=BaseModel)
 
-_SHOWN = 20  # number of mistakes that are reported at once
+_MAX_MISTAKES = 20  # number of mistakes that are reported at once
 
 MAX_FILES_BESIDE = 1000
 """Largest number of files of a folder that are compared with a wrong file name."""
@@ -148,7 +148,7 @@ def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], 
     texts = [
         # the text of a layout has a marker below it; its first line gives the position
         ": ".join([f"line {_line(root, place)}", *_field(place), text.partition("\n")[0]])
-        for place, text in itertools.islice(findings, _SHOWN)
+        for place, text in itertools.islice(findings, _MAX_MISTAKES)
     ]
     return f"{named}, {'; '.join(texts)}"
 

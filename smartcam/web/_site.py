@@ -28,7 +28,7 @@ _log = logging.getLogger("smartcam.web")
 API = "/api"
 """Prefix of the paths of all calls."""
 
-FAREWELL = 0.2
+FINISH_TIMEOUT = 0.2
 """Seconds that unfinished answers have to end when the site stops, and again after a cancel."""
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
@@ -120,7 +120,7 @@ class Site(Server):
     async def stop(self) -> None:
         """Close the port, every stream and every connection; do nothing if stopped.
 
-        Cancellation: takes effect when all is closed, after two :data:`FAREWELL` at most.
+        Cancellation: takes effect when all is closed, after two :data:`FINISH_TIMEOUT` at most.
         """
         opened, self._open = self._open, None
         if opened is None:
@@ -208,7 +208,7 @@ async def open_port(
     runner = web.AppRunner(
         application,
         access_log=None,
-        shutdown_timeout=FAREWELL,
+        shutdown_timeout=FINISH_TIMEOUT,
         keepalive_timeout=KEEP_ALIVE,
         logger=calm(_log),
     )

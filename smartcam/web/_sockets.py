@@ -11,7 +11,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from smartcam.exceptions import LinkError
 from smartcam.web._errors import RefusedError, shown
-from smartcam.web._site import FAREWELL
+from smartcam.web._site import FINISH_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -62,7 +62,7 @@ class PageSocket(ABC):
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
             max_msg_size=longest,
-            timeout=FAREWELL,
+            timeout=FINISH_TIMEOUT,
             compress=False,
             heartbeat=heartbeat,
         )
@@ -81,7 +81,7 @@ class PageSocket(ABC):
         try:
             await self._socket.prepare(self._request)
             await _first(self._listen(), self._show(), self._ending.wait())
-            async with asyncio.timeout(2 * FAREWELL):
+            async with asyncio.timeout(2 * FINISH_TIMEOUT):
                 await self._socket.close(code=WSCloseCode.GOING_AWAY)
         except TimeoutError:
             _log.info(

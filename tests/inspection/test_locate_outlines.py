@@ -196,7 +196,7 @@ def test_drawing_without_unit_or_in_space_is_told(tmp_path: Path) -> None:
     drawing = ezdxf.new(units=0)
     drawing.modelspace().add_lwpolyline([(0, 0), (9, 0), (9, 5), (0, 5)], close=True)
     drawing.saveas(tmp_path / "a.dxf")
-    with pytest.raises(TeachingError, match="say unit") as caught:
+    with pytest.raises(TeachingError, match="names no known unit") as caught:
         PartModel.from_outline(tmp_path / "a.dxf", 10.0)
     assert caught.value.why is TeachingTrouble.UNIT
     assert PartModel.from_outline(tmp_path / "a.dxf", 10.0, unit="mm").symmetry.fold == 2

@@ -81,7 +81,7 @@ async def test_levels(logger: logging.Logger, level: int, said: int) -> None:
     node = Node("x", parameters=False)
     out = RosOut(node, logger)
     record = logger.makeRecord("other", level, "f.py", -3, "m", (), None)
-    found = out._said(record)
+    found = out._fields(record)
     assert (found["level"], found["line"], found["name"]) == (said, 0, "x")
     node.types.message(LOG).encode(found)
 

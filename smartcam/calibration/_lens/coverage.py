@@ -42,7 +42,7 @@ class Coverage(NamedTuple):
 
 
 def coverage(outlines: Sequence[Array], size: tuple[int, int]) -> Coverage:
-    """Return how well views cover places, sizes and tilts of the target.
+    """Return the coverage of views: of places, sizes and tilts of the target.
 
     For each view, x and y are the place of the target's centre within the range that it can have
     without leaving the image, size is the square root of its part of the image's area, and skew is

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-INSPECTIONS = 3
+INSPECTION_COUNT = 3
 """Number of inspections that are observed, so that a changing order shows."""
 
 REBOOT_POLL_INTERVAL = 0.25
@@ -81,7 +81,7 @@ def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
     camera.require(Allow.TRIGGER)
     found: list[ObservedRun] = []
     with camera.session() as client:
-        for _ in range(INSPECTIONS):
+        for _ in range(INSPECTION_COUNT):
             camera.ready(client)
             found.append(_inspect_once(camera, client))
     times = [one.results[0].at - one.sent_at for one in found if one.results]

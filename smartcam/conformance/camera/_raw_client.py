@@ -26,7 +26,7 @@ experiment."""
 MAX_TRAIL = 60
 """Largest number of lines of the record that a report shows: the last ones."""
 
-FAREWELL = 0.2
+CLOSE_TIMEOUT = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
 
 LOOK_AGAIN = 0.01
@@ -96,7 +96,7 @@ class RawClient:
             if self._tcp:
                 # closing a socket with unread bytes sends a reset, which may overtake
                 self._socket.shutdown(socket.SHUT_WR)
-                deadline = time.monotonic() + FAREWELL
+                deadline = time.monotonic() + CLOSE_TIMEOUT
                 while (left := deadline - time.monotonic()) > 0:
                     self._socket.settimeout(left)
                     if not self._socket.recv(1 << 16):

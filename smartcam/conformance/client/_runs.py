@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message
 
-SETTLING_TIME = 0.3
+CLIENT_END_TIMEOUT = 0.3
 """Seconds that the camera waits for the last messages of a client that has ended."""
 
 MAX_LINES = 40
@@ -161,7 +161,7 @@ async def perform(
 
 async def _settle(camera: EmulatedCamera) -> None:
     """Wait until the camera has received the client's last message."""
-    end = time.monotonic() + SETTLING_TIME
+    end = time.monotonic() + CLIENT_END_TIMEOUT
     seen = -1
     while time.monotonic() < end:
         # each turn of the loop handles datagrams and deliveries that are there already

@@ -22,10 +22,10 @@ APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
 """The application that is loaded at first, one to switch to, one that sends results unasked, and
 an id that no application has."""
 
-HOLD_TIME = 0.25
+HOLD_SECONDS = 0.25
 """Seconds for which a message is held back; a client's time-outs are longer."""
 
-BUSY_TIME = 1.0
+BUSY_SECONDS = 1.0
 """Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to see
 it."""
 
@@ -216,7 +216,7 @@ SCENES: Mapping[str, Scene] = {
             name="inspection_under_way",
             about="a sensor has triggered the camera right before the client's trigger",
             faults=_always(
-                f.LateResult(seconds=HOLD_TIME), f.DigitalInput(on="Connect", when="before")
+                f.LateResult(seconds=HOLD_SECONDS), f.DigitalInput(on="Connect", when="before")
             ),
             stale=frozenset({0}),
         ),
@@ -249,7 +249,9 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="busy_after_switch",
             about="BUSY is still set when the switch is answered",
-            faults=_always(f.BusyForEver(seconds=BUSY_TIME, on="SwitchApplication", when="after")),
+            faults=_always(
+                f.BusyForEver(seconds=BUSY_SECONDS, on="SwitchApplication", when="after")
+            ),
             verb="switch",
             number=OTHER,
             dialects=SMART,
@@ -257,7 +259,7 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="late_switch_answer",
             about="the switch is answered after BUSY has fallen",
-            faults=_always(f.Delay(on="SwitchAnswer", seconds=HOLD_TIME, overtaken=True)),
+            faults=_always(f.Delay(on="SwitchAnswer", seconds=HOLD_SECONDS, overtaken=True)),
             verb="switch",
             number=OTHER,
         ),

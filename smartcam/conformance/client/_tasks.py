@@ -39,7 +39,7 @@ failed."""
 SHOWN_LENGTH = 2000
 """Largest number of characters of a command's output that a report shows."""
 
-TERMINATION_TIMEOUT = 2.0
+END_TIMEOUT = 2.0
 """Seconds that a client has to end after it was cancelled or killed."""
 
 Verb = Literal["trigger", "switch", "watch"]
@@ -148,9 +148,7 @@ class FunctionClient(Client):
                 await asyncio.shield(worker.done)
         except TimeoutError:
             worker.cancel()
-            await asyncio.wait(
-                {worker.done}, timeout=TERMINATION_TIMEOUT if worker.cancellable else 0
-            )
+            await asyncio.wait({worker.done}, timeout=END_TIMEOUT if worker.cancellable else 0)
             return Outcome(ended=False, seconds=time.monotonic() - began)
         return worker.outcome._replace(seconds=time.monotonic() - began)
 
@@ -311,7 +309,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
             else:
                 process.kill()
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(TERMINATION_TIMEOUT):
+        async with asyncio.timeout(END_TIMEOUT):
             await process.wait()
     transport = getattr(process, "_transport", None)  # closes pipes that child processes hold
     if transport is not None:

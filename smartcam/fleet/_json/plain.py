@@ -66,7 +66,7 @@ questions, separately, so that a viewer cannot displace the answers of commands.
 MAX_CAMERAS_ADDED = 100
 """Largest number of cameras that Setup adds."""
 
-GRACE = 0.5
+CANCEL_GRACE = 0.5
 """Seconds beyond a service's timeout after which its task is cancelled."""
 
 FIRST_TRY = 600.0
@@ -436,11 +436,13 @@ class Plain:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         try:
-            async with asyncio.timeout(timeout + GRACE) as limit:
+            async with asyncio.timeout(timeout + CANCEL_GRACE) as limit:
                 host = await self._host(order, request)
                 if getattr(request, "application", 0) or getattr(request, "application_id", 0):
                     # switching there and back takes further time
-                    limit.reschedule(begun + timeout + GRACE + 2 * host.settings.switch_timeout)
+                    limit.reschedule(
+                        begun + timeout + CANCEL_GRACE + 2 * host.settings.switch_timeout
+                    )
                 try:
                     return await self._serve(order, request, host, begun + timeout)
                 except BaseException:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.models import Statistics
     from smartcam.outlets._inside import OutletState
 
-SLICE = 24
+CAMERAS_PER_SLICE = 24
 """Number of cameras that are read at a time, which takes half a millisecond."""
 
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
@@ -59,8 +59,8 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     hosts = [*agent.hosts.values()]
     read: list[tuple[Host, CameraNumbers]] = []
     kept = kept_bytes = waiting = reserved = 0
-    for begin in range(0, len(hosts), SLICE):
-        for host in hosts[begin : begin + SLICE]:
+    for begin in range(0, len(hosts), CAMERAS_PER_SLICE):
+        for host in hosts[begin : begin + CAMERAS_PER_SLICE]:
             if agent.hosts.get(host.name) is host:  # it may have been removed meanwhile
                 read.append((host, _camera(host)))
                 kept += host.results.kept
@@ -82,8 +82,8 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     cameras = [one for host, one in read if agent.hosts.get(host.name) is host]
     totals = Totals(agent.past)
     totals.add(host.camera.statistics() for host in agent.leaving)
-    for begin in range(0, len(cameras), 4 * SLICE):
-        totals.add(one.account for one in cameras[begin : begin + 4 * SLICE])
+    for begin in range(0, len(cameras), 4 * CAMERAS_PER_SLICE):
+        totals.add(one.account for one in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
         await asyncio.sleep(0)
     return AgentNumbers(
         agent.name,

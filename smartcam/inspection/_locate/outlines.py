@@ -346,7 +346,7 @@ def _loop(corners: Array) -> Array:
 
 
 def _steps(radius: float, flat: float) -> int:
-    """Return how many corners a polygon needs to be within ``flat`` of a circle."""
+    """Return the number of corners of a polygon that is within ``flat`` of a circle."""
     return max(16, math.ceil(math.pi / math.sqrt(2 * min(flat / max(radius, 1e-9), 0.5))))
 
 

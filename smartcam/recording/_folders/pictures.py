@@ -90,12 +90,9 @@ class FleetPictures:
         delays, logged = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
-            if (
-                host is None
-                or host.frames.closed
-                or host.frames.make is None
-                or host.frames.reports_pictures
-            ):
+            if host is None or host.frames.closed or host.frames.make is None:
+                return
+            if host.frames.reports_pictures:
                 return
             why = "they ended"
             try:

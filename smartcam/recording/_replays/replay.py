@@ -52,7 +52,7 @@ MAX_SPEED = 1000.0
 MIN_INSPECTION_TIME = 1e-6
 """Least seconds of a replayed inspection, whose take is chosen after its beginning."""
 
-NEVER = 0.0001
+FREE_RUN_RATE = 0.0001
 """Rate of a free-running application, per second; the replay itself sends its containers."""
 
 MAX_LOAD_TIME = 3600.0
@@ -60,7 +60,7 @@ MAX_LOAD_TIME = 3600.0
 
 
 @dataclass(slots=True, eq=False)
-class _Runs:
+class _PendingRuns:
     """A list of runs that is played once, or over and over."""
 
     _runs: list[RecordedRun]
@@ -109,8 +109,8 @@ class _Track:
     """The parts of a replay that belong to one application."""
 
     waits: bool  # whether the camera waits for triggers
-    triggered: _Runs  # takes for triggers
-    untriggered: _Runs  # runs without a trigger
+    triggered: _PendingRuns  # takes for triggers
+    untriggered: _PendingRuns  # runs without a trigger
     current: RecordedRun | None = None  # the take of the inspection under way
     # further containers to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
@@ -214,8 +214,8 @@ class ReplayedCamera(EmulatedCamera):
         self._tracks = {
             number: _Track(
                 found.waits,
-                _Runs(found.triggered, loop),
-                _Runs(found.untriggered, loop),
+                _PendingRuns(found.triggered, loop),
+                _PendingRuns(found.untriggered, loop),
             )
             for number, found in self.plan.applications.items()
         }
@@ -440,7 +440,7 @@ def _application(found: ApplicationRuns, speed: float) -> _PlayedApplication:
     if found.waits:
         fields["processing_time"] = MIN_INSPECTION_TIME
     else:
-        fields["rate"] = NEVER
+        fields["rate"] = FREE_RUN_RATE
     return _PlayedApplication(**fields)
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-THREADS = 4
+EXECUTOR_THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
 LOOK_INTERVAL = 1.0
@@ -229,7 +229,7 @@ class SpunNode:
         namespace = "" if self._namespace == "/" else self._namespace
         make = managed_node if self._managed else rclpy("node").Node
         self.ros = make(self._name, namespace=namespace, context=context)
-        self.executor = rclpy("executors").MultiThreadedExecutor(THREADS, context=context)
+        self.executor = rclpy("executors").MultiThreadedExecutor(EXECUTOR_THREADS, context=context)
         self.executor.add_node(self.ros)
 
     def _spin(self, context: Any) -> RosError | None:
