@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.calibrate_files import (
-    DEFAULT_COMMAND,
+    DEFAULT,
     WIZARDS,
     DefaultCommand,
     DefaultCommandContext,
@@ -230,12 +230,7 @@ async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[Fr
 wizard_command.context_class = DefaultCommandContext
 calibrate = GroupWithDefault(
     "calibrate",
-    commands={
-        DEFAULT_COMMAND: wizard_command,
-        "lens": calibrate_lens,
-        "compare": compare,
-        "draw": draw,
-    },
+    commands={DEFAULT: wizard_command, "lens": calibrate_lens, "compare": compare, "draw": draw},
     help=HELP,
 )
 

@@ -34,7 +34,7 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 MIN_LIKENESS = 0.75
 """Likeness to a command, 0 to 1, from which a word counts as that command and not as a host."""
 
-DEFAULT_COMMAND = "wizard"
+DEFAULT = "wizard"
 """Name of the default command below ``calibrate``, which users need not type."""
 
 
@@ -65,7 +65,7 @@ class GroupWithDefault(ListedGroup):
         own = not args or args[0] not in self.commands
         if own and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
             self._check_host(ctx, *args[:2])
-        return super().parse_args(ctx, [DEFAULT_COMMAND, *args] if own else args)
+        return super().parse_args(ctx, [DEFAULT, *args] if own else args)
 
     def _check_host(self, ctx: click.Context, word: str, after: str = "-") -> None:
         """Refuse a word that is more probably a command, or a wizard, than the name of a host."""
@@ -73,7 +73,7 @@ class GroupWithDefault(ListedGroup):
 
         if word in WIZARDS:
             ctx.fail(f"{word!r} is no command but a wizard: smartcam calibrate URL --wizard {word}")
-        commands = [name for name in self.list_commands(ctx) if name != DEFAULT_COMMAND]
+        commands = [name for name in self.list_commands(ctx) if name != DEFAULT]
         if (
             after.startswith("-")
             and closest(word, [*commands, *WIZARDS], least=MIN_LIKENESS) is None
@@ -90,7 +90,7 @@ class GroupWithDefault(ListedGroup):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command, and the arguments that are left for it."""
         name, command, rest = super().resolve_command(ctx, args)
-        return (None if name == DEFAULT_COMMAND else name), command, rest
+        return (None if name == DEFAULT else name), command, rest
 
 
 def _svg(_context: object, _option: object, path: str | None) -> str | None:

@@ -15,7 +15,7 @@ from smartcam.gateway._requests import ASKING_FOR_PARTS, RobotRequests
 if TYPE_CHECKING:
     from smartcam._accepting import Acceptor
     from smartcam.gateway._lines import AnswerWriter, RobotRequest
-    from smartcam.gateway._requests import SharedCamera
+    from smartcam.gateway._requests import GatewayCamera
 
 MAX_WAITING_REQUESTS: Final = 8
 """Largest number of requests with a number that wait while another one is being answered."""
@@ -45,7 +45,7 @@ class RobotLink(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(
-        self, shared: SharedCamera, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
+        self, shared: GatewayCamera, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
     ) -> None:
         self.settled: bool = False
         self._shared, self._writer, self._acceptor = shared, writer, acceptor

@@ -61,7 +61,7 @@ CODES: tuple[tuple[type[BaseException], AnswerCode], ...] = (
 """The code of an error; the first class that matches counts."""
 
 
-class SharedCamera:
+class GatewayCamera:
     """The camera of a gateway, with the settings and counts that all robots share.
 
     Args:
@@ -91,7 +91,7 @@ class RobotRequests:
         shared: the camera that the robot shares with other robots.
     """
 
-    def __init__(self, shared: SharedCamera) -> None:
+    def __init__(self, shared: GatewayCamera) -> None:
         self._shared = shared
         self._rows: list[Row] | None = None  # rows of the last result; None without one
         self._until = 0.0  # loop time until which the rows may be asked for

@@ -19,8 +19,7 @@ MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks between two reports of the clock, for one report a second, which also detects a closed
-reader."""
+"""Looks between two reports of the clock, one a second; a report also detects a closed reader."""
 
 
 class Watcher:

@@ -114,7 +114,7 @@ class FleetView:
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
-        self._counts_by_second: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
+        self._totals: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._count = self._errors = 0
         self._orders: collections.OrderedDict[RowQuery, RowOrder] = collections.OrderedDict()
         self._events: Subscription[FleetEvent] | None = None
@@ -311,7 +311,7 @@ class FleetView:
             self._refresh(row, now)
             if number % AT_ONCE == AT_ONCE - 1:
                 await asyncio.sleep(0)
-        self._counts_by_second.append(self._count)
+        self._totals.append(self._count)
         bar = int(wall) // BUCKET * BUCKET
         if bar != self._bar_at:
             if self._bar.total() and self._bar_at:
@@ -324,8 +324,7 @@ class FleetView:
 
     def totals(self) -> dict[str, Any]:
         """Return the totals of all cameras, as values for JSON."""
-        totals = self._counts_by_second
-        rate = (totals[-1] - totals[0]) / max(1, len(totals) - 1)
+        rate = (self._totals[-1] - self._totals[0]) / max(1, len(self._totals) - 1)
         counts = {name: self._flags[name] for name in ("connected", "errors", "busy", "stopped")}
         return {
             "cameras": len(self.rows),

@@ -47,8 +47,7 @@ MAX_EXTRAPOLATION_SECONDS: Final = 0.25
 """Seconds by which a pose may be older than the first received transform, which is then used."""
 
 MAX_STAMP_STEP_BACK: Final = 10.0
-"""Largest number of seconds by which a stamp may precede the newest one; beyond, the clock was set
-back."""
+"""Largest delay of a stamp behind the newest one; a larger one means that the clock was reset."""
 
 MAX_FRAMES: Final = 2000
 """Largest number of known frames; others are left out, and logged."""
