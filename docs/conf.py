@@ -29,6 +29,7 @@ from pydantic import BaseModel
 
 import smartcam
 from smartcam._client.handshake import load_protocol
+from smartcam._settings_model import OPTIONS
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Application, InSightQuirks, Quirks, Scenario, faults
 from smartcam.emulator._scenario.timeline import Cue
@@ -54,7 +55,7 @@ from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._machine import State
 from smartcam.protocols.messages import Request, Sender, Wire
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import CameraSettings
+from smartcam.settings import CameraSettings, parse_address
 from smartcam.web import _clouds as cloud_page
 from smartcam.web import _colours as colour_page
 from smartcam.web import _emulator as emulator_page
@@ -533,10 +534,9 @@ def _faults(family: type[BaseModel]) -> str:
 
 def settings() -> str:
     """Return the options of ``connect()``."""
+    usual = CameraSettings(address=parse_address("camera"))
     rows = [
-        (f"`{name}`", "" if field.is_required() else f"`{field.default!r}`", field.description)
-        for name, field in CameraSettings.model_fields.items()
-        if name != "address"
+        (f"`{name}`", f"`{getattr(usual, name)!r}`", about) for name, (_, about) in OPTIONS.items()
     ]
     return _table(("option", "default", "meaning"), rows)
 

@@ -37,6 +37,9 @@ MAX_DATA_BYTES = 1 << 30
 """Largest number of bytes that a byte string may have; the largest payload that a client may
 accept."""
 
+MAX_NAME_CHARACTERS = 200
+"""Largest number of characters of a camera's name from a user."""
+
 MAX_SHOWN_LENGTH = 80
 """Largest number of characters of a wrong value that an error's text shows."""
 

@@ -71,6 +71,9 @@ MAX_INTERPRETATIONS = 32
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
 
+WAIT = "wait"
+"""Value of ``when_busy`` by which a trigger waits until the camera takes it."""
+
 DEFAULT_RECONNECT_TIMEOUT = 60.0
 """Seconds for a session to be there again: a reboot takes about 30 (mvBlueGEMINI manual p. 31,
 published for the sibling)."""
@@ -149,6 +152,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._listeners = self._make_listeners()
         self._default_spec: object = settings.interpret_as
         self._default = self._interpretation(self._default_spec, own=True)
+        self._usual_trigger = TriggerRequest(self._default, None, 1, wait=True)
 
     # ------------------------------------------------------------------ for each kind of camera
 
@@ -615,18 +619,28 @@ class Camera(abc.ABC, Generic[ValueT]):
         interpretation = (
             self._default if interpret_as is None else self._interpretation(interpret_as)
         )
-        who = self.name
+        who = self.settings.name
         if application is not None:
             application = check_application(self._named(application), who=who)
-        wait = check_choice(when_busy, "when_busy", ("wait", "refuse"), who) == "wait"
+        wait = (
+            when_busy is WAIT or check_choice(when_busy, "when_busy", (WAIT, "refuse"), who) == WAIT
+        )
         wanted = 1
         if results_per_trigger is not None:
             wanted = check_integer(
                 results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, who
             )
         data = None if input is None else check_bytes(input, "input", who)
-        timeout = check_seconds(timeout, "timeout", who)
-        request = TriggerRequest(interpretation, data, wanted, wait)
+        if timeout is not DEFAULT_TRIGGER_TIMEOUT:
+            timeout = check_seconds(timeout, "timeout", who)
+        request = self._usual_trigger
+        if (
+            data is not None
+            or wanted != 1
+            or not wait
+            or request.interpretation is not interpretation
+        ):
+            request = TriggerRequest(interpretation, data, wanted, wait)
         called_at = datetime.now(UTC) if self._observed else None
         try:
             results = await self._trigger(application, request, timeout)

@@ -8,6 +8,7 @@ are here; each sends a few messages and waits with a deadline.
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from datetime import datetime
 from typing import TYPE_CHECKING
 
@@ -93,7 +94,7 @@ class SmartCamera(Camera[ValueT]):
 
     def _go_to(self, address: Address) -> None:
         """Use another address than that of the settings; only before the client is opened."""
-        self.settings: CameraSettings = self.settings.model_copy(update={"address": address})
+        self.settings: CameraSettings = replace(self.settings, address=address)
         self._supervisor.use_settings(self.settings)
 
     def _read_by(self, spec: object) -> None:

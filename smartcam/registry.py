@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import logging
-from importlib.metadata import distributions
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam._arguments import shown
@@ -185,6 +184,8 @@ def _entry_points_text(found: Distribution) -> str | None:
 
 
 def _distributions() -> Iterator[Distribution]:
+    from importlib.metadata import distributions  # built-in plug-ins do without
+
     try:
         yield from distributions()
     except Exception as exc:  # noqa: BLE001 - so may what other people put on sys.meta_path

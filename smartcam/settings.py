@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import re
+import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, TypeVar, cast
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar, cast
 from urllib.parse import parse_qsl, quote, quote_plus, unquote, urlencode, urlsplit
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, InstanceOf, ValidationError
-
-from smartcam._arguments import check_text, plain, shown
+from smartcam._arguments import MAX_NAME_CHARACTERS, check_text, shown
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
@@ -22,6 +22,7 @@ from smartcam.registry import PROTOCOLS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from pydantic import BaseModel, ValidationError
     from pydantic_core import ErrorDetails
 
     from smartcam.interpreters import Spec
@@ -33,19 +34,7 @@ __all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address"]
 FLEET_SCHEMES = ("fleet", "fleet+tls")
 """URL schemes of cameras that an agent shares."""
 
-M = TypeVar("M", bound=BaseModel)
-
-PLAIN = BeforeValidator(plain)
-"""Lets a strict type take numbers and texts of any class, such as numpy's."""
-
-MAX_NAME_CHARACTERS = 200
-"""Largest number of characters of a camera's name from a user."""
-
-Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
-Integer = Annotated[int, Field(strict=True), PLAIN]
-ApplicationId = Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF), PLAIN]
-Text = Annotated[str, Field(strict=True), PLAIN]
-Flag = Annotated[bool, Field(strict=True), PLAIN]
+M = TypeVar("M", bound="BaseModel")
 
 
 class Address(NamedTuple):
@@ -319,57 +308,32 @@ class CameraOptions(OtherOptions, total=False):
     interpret_as: Spec | Mapping[int, Spec]
 
 
-class CameraSettings(BaseModel):
-    """Options of one client. Times are seconds, each bounds one step."""
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """Options of one client. Times are seconds, each bounds one step.
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(
-        frozen=True, extra="forbid", arbitrary_types_allowed=True
-    )
+    Attributes:
+        given: names of the options that were given.
+    """
 
-    address: Address = Field(description="address of the camera")
-    name: Text = Field(
-        "",
-        max_length=MAX_NAME_CHARACTERS,
-        description="name in logs and results; default HOST:PORT",
-    )
-    application: Integer | None = Field(
-        None, ge=0, le=0xFFFFFFFF, description="application to have running and ready"
-    )
-    application_names: dict[Text, ApplicationId] = Field(
-        default_factory=dict,
-        max_length=1000,
-        description="names of applications and their ids; a name may replace any id",
-    )
-    interpret_as: Any = Field(None, description="interpretation of result containers")
-    calibration: Any = Field(
-        None,
-        description="transforms localizations into the robot's frame: one for all applications, "
-        "or a mapping from application id to one, or to None to leave its values as they are",
-    )
-    y_down: Flag = Field(
-        False, description="the camera's y axis points down; turned to y up on the way in"
-    )
-    lenient: Flag = Field(False, description="any non-zero byte is a true bool")
-    connect_timeout: Seconds = Field(10.0, description="longest wait for a session, all attempts")
-    connect_attempts: Integer = Field(3, ge=1, le=100, description="fresh links tried per dialect")
-    switch_timeout: Seconds = Field(10.0, description="longest wait for a switch")
-    request_timeout: Seconds = Field(5.0, description="longest wait for the answer to a request")
-    close_timeout: Seconds = Field(1.0, description="longest wait for an orderly end of the link")
-    liveness_timeout: Seconds | None = Field(
-        5.0,
-        description="longest silence of a camera that is asked for a sign of life; None: no end",
-    )
-    reconnect: InstanceOf[Backoff] | None = Field(
-        Backoff(), description="when a lost camera is tried again; None: never"
-    )
-    restore: Flag = Field(
-        False,
-        description="after a reconnect have the named application and the run state back that "
-        "were wanted; else they are left as the camera has them",
-    )
-    max_length: Integer = Field(
-        1 << 20, ge=16, le=1 << 30, description="largest payload accepted, bytes"
-    )
+    address: Address
+    name: str = ""
+    application: int | None = None
+    application_names: Mapping[str, int] = field(default_factory=dict)
+    interpret_as: Any = None
+    calibration: Any = None
+    y_down: bool = False
+    lenient: bool = False
+    connect_timeout: float = 10.0
+    connect_attempts: int = 3
+    switch_timeout: float = 10.0
+    request_timeout: float = 5.0
+    close_timeout: float = 1.0
+    liveness_timeout: float | None = 5.0
+    reconnect: Backoff | None = Backoff()  # noqa: RUF009 - it cannot be changed
+    restore: bool = False
+    max_length: int = 1 << 20
+    given: frozenset[str] = frozenset()
 
     @classmethod
     def make(
@@ -392,17 +356,62 @@ class CameraSettings(BaseModel):
         usual = address.path or f"{address.host}:{address.port}"
         try:
             given = with_ids(cast("dict[str, Any]", options))
-            if "name" not in given and len(usual) <= MAX_NAME_CHARACTERS:
-                given = {**given, "name": usual}
-            settings = cls(address=address, **given)
-        except ValidationError as exc:
-            known = [*CameraOptions.__annotations__, *OtherOptions.__annotations__]
-            raise ConfigurationError(f"connect: {validation_text(exc, known)}") from exc
         except TypeError as exc:
             raise ConfigurationError(f"connect: {exc!s:.200}") from exc
-        if settings.name:
-            return settings
-        return settings.model_copy(update={"name": usual})
+        if "name" not in given and len(usual) <= MAX_NAME_CHARACTERS:
+            given = {**given, "name": usual}
+        used = {option: _as_usual(option, value) for option, value in given.items()}
+        if any(value is _UNUSUAL for value in used.values()):
+            used = _validated(given)
+        used["name"] = used.get("name") or usual
+        return cls(address=address, given=frozenset(given), **used)
+
+
+_UNUSUAL = object()
+"""Stands for a value about which pydantic has to decide."""
+
+_SECONDS = (float, sys.float_info.min, 86_400.0)
+_BOUNDS: dict[str, tuple[type[float], float, float]] = {
+    **dict.fromkeys(("y_down", "lenient", "restore"), (bool, 0, 1)),
+    **{f"{of}_timeout": _SECONDS for of in ("connect", "switch", "request", "close", "liveness")},
+    "application": (int, 0, 0xFFFFFFFF),
+    "connect_attempts": (int, 1, 100),
+    "max_length": (int, 16, 1 << 30),
+}
+"""Type, least and largest value of options that are numbers or truth values."""
+
+
+def _as_usual(option: str, value: Any) -> Any:
+    """Return the value of an option as it is used if it certainly is valid, else ``_UNUSUAL``."""
+    if option in _BOUNDS:
+        kind, least, most = _BOUNDS[option]
+        if type(value) is kind or (kind is float and type(value) is int):
+            return kind(value) if least <= value <= most else _UNUSUAL
+        none = value is None and option in {"application", "liveness_timeout"}
+        return None if none else _UNUSUAL
+    if option == "name":
+        short = type(value) is str and value.isascii() and len(value) <= MAX_NAME_CHARACTERS
+        return value if short else _UNUSUAL
+    if option == "reconnect":
+        return value if value is None or isinstance(value, Backoff) else _UNUSUAL
+    return value if option in {"interpret_as", "calibration"} else _UNUSUAL
+
+
+def _validated(given: dict[str, Any]) -> dict[str, Any]:
+    """Return options as pydantic's model reads them, which judges all that is unusual.
+
+    Raises:
+        ConfigurationError: names the option, what came and what was expected.
+    """
+    from pydantic import ValidationError
+
+    from smartcam._settings_model import OPTIONS, SettingsModel
+
+    try:
+        settings = SettingsModel(**given)
+    except ValidationError as exc:
+        raise ConfigurationError(f"connect: {validation_text(exc, OPTIONS)}") from exc
+    return {option: getattr(settings, option) for option in given}
 
 
 def with_ids(options: dict[str, Any]) -> dict[str, Any]:
@@ -447,6 +456,8 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
     Raises:
         ConfigurationError: a field is wrong; the text begins with ``what`` and names the field.
     """
+    from pydantic import ValidationError
+
     try:
         return kind.model_validate(dict(given) if isinstance(given, Mapping) else given)
     except ValidationError as exc:

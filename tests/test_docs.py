@@ -330,7 +330,7 @@ def test_promises_have_every_wait_with_its_default() -> None:
         seconds = [
             method.parameters[option].default
             if option in method.parameters
-            else CameraSettings.model_fields[option].default
+            else getattr(CameraSettings, option)
             for option in options
         ]
         assert default == ", ".join(f"{one:g} s" for one in seconds), call

@@ -118,7 +118,7 @@ def test_built_in_is_loaded_without_a_look_at_what_is_installed(
         raise AssertionError("looked")
 
     registry = Registry("smartcam.nothing", {"raw": "smartcam.interpreters._basic:RawInterpreter"})
-    monkeypatch.setattr("smartcam.registry.distributions", looked)
+    monkeypatch.setattr("importlib.metadata.distributions", looked)
     assert registry.load("raw") is type(resolve("raw"))
     assert "raw" in registry
 

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 
 import smartcam
+from smartcam._settings_model import SettingsModel
 from smartcam._suggestions import closest, did_you_mean
 from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, load_fleet
 from smartcam.layout import Layout
 from smartcam.protocols import BVS
-from smartcam.settings import CameraSettings
 
-OPTIONS = [*CameraSettings.model_fields]
+OPTIONS = [*SettingsModel.model_fields]
 FLEET_FIELDS = [*FleetFile.model_fields]
 KINDS = [*FAULTS]
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Interpreted,
         in_pixels,
         localizations_of,
+        new_tuple,
         own_interpreter,
         without_poses,
     )
@@ -50,6 +51,7 @@ __all__ = [
     "localizations_of",
     "make_doorbell",
     "names_of",
+    "new_tuple",
     "own_interpreter",
     "reason_for",
     "remarks",
@@ -68,7 +70,7 @@ if not TYPE_CHECKING:
             "doorbell": "Outcome make_doorbell",
             "handshake": "Session attempt names_of remarks",
             "interpretation": "Interpretation Interpreted in_pixels localizations_of "
-            "own_interpreter without_poses",
+            "new_tuple own_interpreter without_poses",
             "listeners": "Listeners",
             "triggering": "TriggerRequest",
         },

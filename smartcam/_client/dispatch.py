@@ -192,12 +192,12 @@ class Dispatch:
         if listeners.hears_statuses:  # an agent
             state.report(known.began, ())
             listeners.offer_status(known.began.status, now)
-            self._results.on_own(container, owner, now, at)
+            self._results.hand_on(container, owner, "triggered", None, now, at)
             state.report(known.ended, ())
             listeners.offer_status(known.ended.status, now)
             return True
         state.report_round(known.ended)
-        self._results.on_own(container, owner, now, at)
+        self._results.hand_on(container, owner, "triggered", None, now, at)
         return True
 
     def _only_streams(self) -> bool:

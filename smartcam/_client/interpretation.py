@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from smartcam._arguments import check_application, shown
 from smartcam._user_code import ENDS_PROGRAM, text_of
@@ -63,12 +63,8 @@ MAX_NUMBER = (1 << 31) - 1
 """Largest own sequence number: it fits into an int32 in the container."""
 
 
-class Interpreted(NamedTuple):
-    """A container's value, its sequence number if the layout has one, and its empty slots."""
-
-    value: Any
-    sequence: int | None
-    empty_slots: int
+Interpreted: TypeAlias = tuple[Any, int | None, int]
+"""A container's value, its sequence number if the layout has one, and its empty slots."""
 
 
 class Numbering(NamedTuple):
@@ -209,8 +205,7 @@ class Interpretation:
             value = run_plain(simple, data, context)
             if self._calibrations is not None and way.calibrated:
                 value = self._calibrations.apply(value, container.application)
-            read: Interpreted = new_tuple(Interpreted, (value, None, context.empty_slots))
-            return read
+            return value, None, context.empty_slots
         order = byte_order(endian)
         context = Context(
             camera, container.application, number, at, order, self._y_down, self._lenient
@@ -220,7 +215,7 @@ class Interpretation:
         if self._calibrations is not None and way.calibrated:
             value = self._calibrations.apply(value, container.application)
         sequence = run_sequence(interpreter, reader) if way.sequenced else None
-        return Interpreted(value, sequence, context.empty_slots)
+        return value, sequence, context.empty_slots
 
     def _context(
         self, application: int, endian: int, camera: str, number: int, at: datetime

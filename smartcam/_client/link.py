@@ -393,7 +393,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             for frame in frames:
                 self._transport.sendto(frame)
         else:
-            self._transport.write(b"".join(frames))
+            self._transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
 
     def _read_aside(self, sock: socket.socket) -> OSError | None:
         """Read the datagrams that have come already, without a turn of the loop for each.
@@ -469,9 +469,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def _lose(self, reason: BaseException) -> None:
         if self._loss is None:
             self._loss = reason
-            self._show_rest()
-        self._full = False
-        self._writable.set()
+            if self.on_rest is not None:
+                self._show_rest()
+        if self._full:
+            self.resume_writing()
         self._doorbell.ring()
 
 
@@ -576,17 +577,23 @@ async def open_link(
     return link
 
 
+_PROBE_TIMES = [
+    getattr(socket, name)
+    for name in ("TCP_KEEPIDLE", "TCP_KEEPALIVE", "TCP_KEEPINTVL")  # the first two are one option
+    if hasattr(socket, name)
+]
+_PROBES, _USER_TIMEOUT = (
+    getattr(socket, f"TCP_{name}", None) for name in ("KEEPCNT", "USER_TIMEOUT")
+)
+
+
 def _keep_alive(sock: socket.socket, timeout: float) -> None:
     """Make the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     probe = max(1, round(timeout / 3))  # whole seconds before the first probe, and between two
-    options = {
-        "TCP_KEEPIDLE": probe,
-        "TCP_KEEPALIVE": probe,  # another name of the same option
-        "TCP_KEEPINTVL": probe,
-        "TCP_KEEPCNT": 2,
-        "TCP_USER_TIMEOUT": max(1, round(timeout * 1000)),  # milliseconds
-    }
-    for name, value in options.items():
-        if hasattr(socket, name):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    for option in _PROBE_TIMES:
+        sock.setsockopt(socket.IPPROTO_TCP, option, probe)
+    if _PROBES is not None:
+        sock.setsockopt(socket.IPPROTO_TCP, _PROBES, 2)
+    if _USER_TIMEOUT is not None:  # milliseconds
+        sock.setsockopt(socket.IPPROTO_TCP, _USER_TIMEOUT, max(1, round(timeout * 1000)))

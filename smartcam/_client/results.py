@@ -268,12 +268,12 @@ class Results:
             pending.came -= sum(fate == "triggered" for _, fate, *_ in unproven)
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
-                self._hand_on(container, None, fate, number, now, at)
+                self.hand_on(container, None, fate, number, now, at)
             elif not pending.ended:  # it has ended if the container before could not be read
-                self._hand_on(container, pending, fate, number, now, at)
+                self.hand_on(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate
-                self._hand_on(container, None, older, number, now, at)
+                self.hand_on(container, None, older, number, now, at)
 
     def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
         """Count and pass on several containers at once; one by one if they may differ."""
@@ -347,7 +347,7 @@ class Results:
         if expected is not None and container.application != expected:
             self.give_up(self._wrong_application(container, expected))  # ours may still come
             if state.shared:  # another program may want it
-                self._hand_on(container, None, "streamed", None, now, at)
+                self.hand_on(container, None, "streamed", None, now, at)
             else:
                 counters.count("wrong_application")
             return
@@ -367,9 +367,9 @@ class Results:
                 pending.came += 1
             return
         owner = pending if match.fate == "triggered" else None
-        self._hand_on(container, owner, match.fate, number, now, at)
+        self.hand_on(container, owner, match.fate, number, now, at)
 
-    def _hand_on(
+    def hand_on(
         self,
         container: m.ResultContainer,
         owner: PendingTrigger | None,
@@ -378,7 +378,7 @@ class Results:
         now: float,
         at: datetime,
     ) -> None:
-        """Count a container, and give its result to the trigger and the listeners."""
+        """Count a container, and give its result to its trigger, ``owner``, and the listeners."""
         counters, listeners = self._counters, self._listeners
         current = fate in _CURRENT
         if owner is None:
@@ -388,8 +388,16 @@ class Results:
             if not heard:
                 counters.count(fate)
                 return
+        name, own_number = self._name, counters.received + 1
+        interpretation, began, latency = self.interpretation, None, None
+        if owner is not None:
+            interpretation, began = owner.interpretation, owner.triggered_at
+            latency = now - owner.sent_at
         try:
-            result = self._interpret(container, owner, now, at)
+            # by the method's name: a call of the object itself costs four times as much
+            value, sequence, empty_slots = interpretation.__call__(
+                container, self._state.endian, camera=name, number=own_number, at=at
+            )
         except InterpretationError as error:
             counters.count("late" if fate == "late" else "uninterpretable")
             size, owned = len(container.data), owner is not None
@@ -397,6 +405,11 @@ class Results:
             if owner is not None:
                 self._fail_unread(owner, error, number)
             return
+        if empty_slots:
+            counters.skip(empty_slots)
+        application, data = container.application, container.data
+        fields = (name, application, sequence, own_number, began, at, latency, data, value)
+        result: Result = new_tuple(Result, fields)
         counters.count(fate)
         listeners.offer_result(result, now, current=current, late=fate == "late")
         if owner is not None:
@@ -407,7 +420,7 @@ class Results:
     def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
         """Return the trigger under way if a container with its answers around it is its result.
 
-        That is noted then, and :meth:`on_own` handles the container. None if anything but its
+        That is noted then, and :meth:`hand_on` handles the container. None if anything but its
         evidence decides, or a result of it has come already.
         """
         pending = self._pending
@@ -423,12 +436,6 @@ class Results:
         if pending.unproven or pending.given_up or not self.correlation.take_round(pending):
             return None
         return pending
-
-    def on_own(
-        self, container: m.ResultContainer, owner: PendingTrigger, now: float, at: datetime
-    ) -> None:
-        """Handle a container that is known to be a trigger's."""
-        self._hand_on(container, owner, "triggered", None, now, at)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if an equal container came before, as when a datagram comes twice."""
@@ -450,25 +457,6 @@ class Results:
         if not self._warned_others:
             self._warned_others = True
             logger.warning("%s ! something else triggers the camera, too", self._name)
-
-    def _interpret(
-        self, container: m.ResultContainer, owner: PendingTrigger | None, now: float, at: datetime
-    ) -> Result:
-        interpretation = owner.interpretation if owner is not None else self.interpretation
-        number = self._counters.received + 1
-        # by the method's name: a call of the object itself costs four times as much
-        value, sequence, empty_slots = interpretation.__call__(
-            container, self._state.endian, camera=self._name, number=number, at=at
-        )
-        if empty_slots:
-            self._counters.skip(empty_slots)
-        name, application, data = self._name, container.application, container.data
-        triggered_at, latency = None, None
-        if owner is not None:
-            triggered_at, latency = owner.triggered_at, now - owner.sent_at
-        fields = (name, application, sequence, number, triggered_at, at, latency, data, value)
-        result: Result = new_tuple(Result, fields)
-        return result
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, without a sign against them."""

@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -406,7 +406,7 @@ class Supervisor:
             SmartCamError: the client gave up.
         """
         policy, name = self._settings.reconnect, self._name
-        settings = self._settings.model_copy(update={"address": self.address})
+        settings = replace(self._settings, address=self.address)
         failed: SmartCamError = loss
         if policy is not None:
             delays = policy.delays(short_lived=self._short_lived)

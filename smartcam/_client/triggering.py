@@ -57,6 +57,9 @@ if TYPE_CHECKING:
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
+_TELLS_AGAINST = int(
+    Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR | Status.OVERTRIGGERED
+)  # of these, exactly Waiting is set if a trigger may go out at once
 _SPEAKS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
 )  # of these, exactly Waiting must be set before a trigger
@@ -211,51 +214,11 @@ class Triggers:
             SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
         """
         connection, state, correlation = self._connection, self._state, self._correlation
-        features = connection.features
-        if features.polled:
-            await self._status.refresh(deadline)
-            correlation.note_query_answered()
-        if state.bits & _SYSTEM_ERROR:
-            raise self._fault()
-        if request.input_data is not None and self._results.input_in_doubt:
-            raise InputContainerError(
-                f"{self._name}: input data of an earlier trigger, which had no result, may still "
-                "be queued in the camera and would be taken for this one's; switch_application() "
-                "empties the queue"
-            )
+        features, interpretation = connection.features, request.interpretation
         expected = state.expected if request.expected is None else request.expected
-        if expected is not None and state.active != expected:
-            await self._check_application(expected, deadline)
-        if self._doubtful is not None and self._doubtful is connection.link:
-            await self._status.demand(deadline)
-            await self._requests.fence(deadline)  # a status has come by then, or is lost again
-            self._doubtful = None
-            correlation.note_query_answered()
-        interpretation = request.interpretation
+        if not self._is_ready(request, expected):
+            await self._get_ready(request, expected, deadline)
         numbering = interpretation.numbering(state.active) if features.numbered else None
-        # an older result shows by its number if each container has one
-        decided = numbering is not None and numbering.always
-        if correlation.doubted:  # the trigger before may not show in the status yet
-            await self._requests.fence(deadline)
-            correlation.note_query_answered()
-        if correlation.owed or self._commands.is_halted():
-            await self._settle_debt(deadline, wait=request.wait, decided=decided)
-        waited = False  # in line with Queries, so that neither kind delays the other
-        while True:
-            status = state.bits
-            if status & _SPEAKS_AGAINST != _WAITING:
-                await self._wait_for_trigger(deadline, wait=request.wait)
-            elif status & _OVERTRIGGERED:
-                await self._clear_overtriggered(deadline)
-            elif features.fences and (
-                self._waits.is_pending(m.QueryAnswer)  # one can be open
-                if waited
-                else not self._requests.is_free(m.QueryAnswer)
-            ):
-                await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
-                waited = True
-            else:
-                break
         link = connection.require_link()
         now = link.loop.time()
         if deadline - now < MAX_SHARE_WITHOUT_WAIT * timeout:
@@ -264,7 +227,7 @@ class Triggers:
         pending = PendingTrigger(
             request.results,
             number,
-            _evidence(features),
+            EvidenceByStatus() if features.tells_all else _evidence(features),
             link.outcome(),
             interpretation,
             request.input_data is not None,
@@ -297,7 +260,7 @@ class Triggers:
                 pending.outcome.exception()  # no task will read it
             raise
         else:
-            took = link.loop.time() - now
+            took = link.heard_at - now
             if took < self._quickest or self._quickest_of != state.active:
                 self._quickest, self._quickest_of = took, state.active
             return results
@@ -308,6 +271,74 @@ class Triggers:
             if features.polled:
                 self._polling.end_trigger()
             self._results.end_trigger()
+
+    def _is_ready(self, request: TriggerRequest, expected: int | None) -> bool:
+        """Return True if :meth:`_get_ready` certainly has nothing to do."""
+        correlation = self._correlation
+        return (
+            self._connection.features.tells_all
+            and self._state.bits & _TELLS_AGAINST == _WAITING
+            and (expected is None or expected == self._state.active)
+            and request.input_data is None
+            and not correlation.doubted
+            and not correlation.owed
+            and not self._commands.is_halted()
+            and self._requests.is_free(m.QueryAnswer)
+        )
+
+    async def _get_ready(
+        self, request: TriggerRequest, expected: int | None, deadline: float
+    ) -> None:
+        """Wait until the camera takes a trigger, and no result of an earlier one can come.
+
+        Raises:
+            SmartCamError: one of the outcomes of :meth:`Camera.trigger`; no trigger was sent.
+        """
+        connection, state, correlation = self._connection, self._state, self._correlation
+        features = connection.features
+        if features.polled:
+            await self._status.refresh(deadline)
+            correlation.note_query_answered()
+        if state.bits & _SYSTEM_ERROR:
+            raise self._fault()
+        if request.input_data is not None and self._results.input_in_doubt:
+            raise InputContainerError(
+                f"{self._name}: input data of an earlier trigger, which had no result, may still "
+                "be queued in the camera and would be taken for this one's; switch_application() "
+                "empties the queue"
+            )
+        if expected is not None and state.active != expected:
+            await self._check_application(expected, deadline)
+        if self._doubtful is not None and self._doubtful is connection.link:
+            await self._status.demand(deadline)
+            await self._requests.fence(deadline)  # a status has come by then, or is lost again
+            self._doubtful = None
+            correlation.note_query_answered()
+        interpretation = request.interpretation
+        numbering = interpretation.numbering(state.active) if features.numbered else None
+        # an older result shows by its number if each container has one
+        decided = numbering is not None and numbering.always
+        if correlation.doubted:  # the trigger before may not show in the status yet
+            await self._requests.fence(deadline)
+            correlation.note_query_answered()
+        if correlation.owed or self._commands.is_halted():
+            await self._settle_debt(deadline, wait=request.wait, decided=decided)
+        waited = False  # in line with Queries, so that neither kind delays the other
+        while True:
+            status = state.bits
+            if status & _SPEAKS_AGAINST != _WAITING:
+                await self._wait_for_trigger(deadline, wait=request.wait)
+            elif status & _OVERTRIGGERED:
+                await self._clear_overtriggered(deadline)
+            elif features.fences and (
+                self._waits.is_pending(m.QueryAnswer)  # one can be open
+                if waited
+                else not self._requests.is_free(m.QueryAnswer)
+            ):
+                await self._requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
+                waited = True
+            else:
+                break
 
     async def _await_turn(self, deadline: float) -> None:
         """Wait until a trigger may go out: another task may have asked meanwhile."""

@@ -79,6 +79,7 @@ class Waits:
         end: reason why there is no session, None while there is one.
         answers: waiters for answers, by the type of the answer; by id for a message that the
             dialect does not know.
+        fences_open: Queries that went out with the last trigger and are not answered.
         statuses: waiters for statuses.
     """
 
@@ -88,13 +89,13 @@ class Waits:
         self.answers: dict[type[m.Message] | int, PendingAnswer] = {}
         self._asked_at: dict[object, float] = {}
         self._behind: dict[object, int] = {}  # deliveries received before the request was sent
-        self._fences_open = 0  # Queries that went out with the last trigger and are not answered
+        self.fences_open: int = 0
         self.statuses: dict[StatusWaiter, None] = {}  # waiters in order; each leaves in one step
 
     def begin_session(self) -> None:
         """Begin a session, without a pending request."""
         self.end = None
-        self._fences_open = 0
+        self.fences_open = 0
 
     def fail(self, error: SmartCamError) -> bool:
         """End every wait, also one that begins before the next session, with the reason.
@@ -112,7 +113,7 @@ class Waits:
         self.answers.clear()
         self._asked_at.clear()
         self._behind.clear()
-        self._fences_open = 0
+        self.fences_open = 0
         for waiter in self.statuses:
             if not waiter.outcome.done():
                 waiter.outcome.set_result(error)
@@ -164,21 +165,21 @@ class Waits:
 
     def is_pending(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""
-        return key in self.answers or (key is m.QueryAnswer and self._fences_open > 0)
+        return key in self.answers or (key is m.QueryAnswer and self.fences_open > 0)
 
     def expect_fences(self, count: int) -> None:
         """Note that Queries went out with a trigger; no task waits for their answers."""
-        self._fences_open = count
+        self.fences_open = count
 
     def awaits_fences(self, count: int) -> bool:
         """Return True if ``count`` Queries of a trigger are open, and no task waits."""
-        return self._fences_open == count and not self.answers and not self.statuses
+        return self.fences_open == count and not self.answers and not self.statuses
 
     def take_fence(self) -> bool:
         """Return True if no task waits for an answer to Query; count that answer off."""
-        if not self._fences_open:
+        if not self.fences_open:
             return False
-        self._fences_open -= 1
+        self.fences_open -= 1
         return True
 
     def on_message(self, message: m.Message, now: float, delivery: int) -> None:

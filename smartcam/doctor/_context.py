@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from smartcam.client import SmartCamera
@@ -276,7 +276,7 @@ class Examination:
             camera = connect(self.address.url, observers=observers, **options)
         else:
             settings = CameraSettings.make(self.address.url, None, options)
-            settings = settings.model_copy(update={"address": self.address})
+            settings = replace(settings, address=self.address)
             camera = SmartCamera(settings, observers=observers)
         self.stack.push_async_callback(camera.close)
         return camera

@@ -442,8 +442,7 @@ class EmulatedCamera(WireCamera):
     def _deliver_at_once(self) -> None:
         self._send_all(self.device.take_output(), provoke=False)
 
-    def _move(self) -> None:
-        now = self.clock.now
+    def _move(self, now: float) -> None:
         passed, self._moved_at = now - self._moved_at, now
         self.device.tick(max(0.0, passed))
 

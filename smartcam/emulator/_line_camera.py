@@ -415,9 +415,9 @@ class LineCamera(WireCamera):
 
     # ------------------------------------------------------------------ steps
 
-    def _move(self) -> None:
-        now = nanoseconds(self.clock.now)
-        while self._agenda and self._agenda[0][0] <= now:
+    def _move(self, now: float) -> None:
+        instant = nanoseconds(now)
+        while self._agenda and self._agenda[0][0] <= instant:
             heapq.heappop(self._agenda)[2]()
 
     def _collect(self) -> None:

@@ -59,6 +59,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
+_CLIENT = m.Sender.CLIENT
+
 MAX_LINKS = 32
 """Largest number of clients that are connected. The camera serves one; a few more may wait to take
 over. A newcomer always gets in: the client without a session for longest makes room."""
@@ -167,6 +169,7 @@ class WireCamera(Server):
         self._listener: Listener = _LISTENERS[Transport(transport)](self)
         self._port = Port(self._listener, host, port, name)
         self._traffic = TrafficLog(spoken)
+        self._step_at: float | None = None  # time of the present step
         self._shows = False  # whether each frame is logged, checked once a step
         self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
         self._stage = Stage(
@@ -515,10 +518,12 @@ class WireCamera(Server):
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
-        traffic, now = self._traffic, self.clock.now
+        traffic, now = self._traffic, self._step_at
+        if now is None:
+            now = self.clock.now
         if isinstance(what, Frame):
             traffic.entries.keep(now, link.peer, sender, what, link.input_faults)
-            if sender is m.Sender.CLIENT:
+            if sender is _CLIENT:
                 traffic.count(what)
         else:
             traffic.add(now, link.peer, sender, what, link.input_faults)
@@ -561,19 +566,23 @@ class WireCamera(Server):
     def _begin_step(self) -> None:
         self._shows = _log.isEnabledFor(logging.DEBUG)
         if self._started:
-            self._move()
+            self._step_at = now = self.clock.now
+            self._move(now)
 
     def _end_step(self) -> None:
-        if self._started:
-            self._settle()
+        try:
+            if self._started:
+                self._settle()
+        finally:
+            self._step_at = None
 
     def _wake(self) -> None:
         with self.step():
             pass
 
     @abstractmethod
-    def _move(self) -> None:
-        """Advance the device's time."""
+    def _move(self, now: float) -> None:
+        """Advance the device's time; ``now``: the clock's."""
 
     @abstractmethod
     def _collect(self) -> None:

@@ -21,5 +21,5 @@ from smartcam._client.handshake import establish
 from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, open_link, split
 from smartcam._client.requests import Requests
 from smartcam._client.results import PendingTrigger, Results
-from smartcam._client.triggering import FENCED_TRIGGER
+from smartcam._client.triggering import FENCED_TRIGGER, TriggerRequest
 from smartcam._client.waits import StatusWaiter, Waits

@@ -51,6 +51,7 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
         "test_result_that_comes_while_its_caller_is_being_cancelled_is_late",
         "test_results_per_trigger_that_lack_one_say_how_many_came",
         "test_supervisor_that_fails_tells_everybody",
+        "test_trigger_that_goes_out_at_once_has_nothing_to_wait_for",
         "test_input_of_a_trigger_without_result_is_never_taken_for_the_next",
         "test_results_of_a_lost_link_give_what_was_queued_first",
         "test_trigger_is_never_sent_again_by_itself",

@@ -620,13 +620,13 @@ async def test_udp_refusal_among_datagrams_is_told_behind_those_before_it(
     async with datagrams(connects) as camera:
         link = await udp_session(camera.port)
         camera.send(STATUS, RESULT)
-    hear = link.machine.receive_data
+    hear = Machine.receive_data
 
-    def hear_and_ask(data: bytes) -> None:
-        hear(data)
+    def hear_and_ask(machine: Machine, data: bytes) -> None:
+        hear(machine, data)
         link.send(m.Query())  # which the system refuses at once: nothing listens there any more
 
-    monkeypatch.setattr(link.machine, "receive_data", hear_and_ask)
+    monkeypatch.setattr(Machine, "receive_data", hear_and_ask)
     assert await take(link, 1) == [RUNNING]
     error = await lost(link)
     assert isinstance(error.__cause__, ConnectionRefusedError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import struct
 from datetime import UTC, datetime
@@ -60,7 +61,7 @@ from tests.client.clientkit import (
     quiet,
     steps,
 )
-from tests.client.inside import Chunk
+from tests.client.inside import Chunk, TriggerRequest
 from tests.handmade import until
 from tests.insides import inside
 from tests.timed_loop import spend
@@ -567,6 +568,41 @@ async def test_trigger_when_busy_mistyped_is_refused() -> None:
 
 
 # ---------------------------------------------------------------------- turns and debts
+
+
+async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
+    """The straight way is taken only where the long one would neither wait, nor send, nor raise."""
+    async with by_hand() as (_, camera):
+        client = inside(camera)
+        triggers, state, waits = client._triggers, client._state, client._waits
+        correlation, commands, link = (
+            triggers._correlation,
+            client._commands,
+            triggers._connection.link,
+        )
+        assert link is not None
+        bits = [sum(some) for some in itertools.product(*((0, int(one)) for one in TELLING))]
+        doubts = [*itertools.product((False, True), ([], [None]), (None, 0), (0, 1))]
+        usual = state.status, state.bits, correlation.owed
+        straight = 0
+        for said, (doubted, owed, halted, open_) in itertools.product(bits, doubts):
+            for data, expected in itertools.product((None, b"1"), (None, state.active, 99)):
+                state.status, state.bits = Status(said), said
+                correlation.doubted, correlation.owed = doubted, owed  # type: ignore[assignment]
+                commands._halted_at, waits.fences_open = halted, open_
+                request = TriggerRequest(client._default, data, 1, wait=True)
+                if triggers._is_ready(request, expected):
+                    straight += 1
+                    written = link.machine.counters.frames_sent
+                    with pytest.raises(StopIteration):
+                        triggers._get_ready(request, expected, link.loop.time() + 1.0).send(None)
+                    assert link.machine.counters.frames_sent == written
+        state.status, state.bits, correlation.owed = usual
+        correlation.doubted, commands._halted_at, waits.fences_open = False, None, 0
+    assert straight == 4  # with Running or without, whichever application is expected
+
+
+TELLING = (WAITING, RUNNING, BUSY, OVERTRIGGERED, SYSTEM_ERROR)
 
 
 async def test_triggers_at_once_take_turns() -> None:

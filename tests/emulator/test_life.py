@@ -484,10 +484,10 @@ async def test_message_that_does_not_fit_its_frame_is_dropped_and_logged(
         await wire.greet(client)
         link: Any = emulator._active
 
-        def refuse(message: m.Message) -> None:
+        def refuse(_: object, message: m.Message) -> None:
             raise LocalProtocolError("too long for its header")
 
-        monkeypatch.setattr(link.machine, "send", refuse)
+        monkeypatch.setattr(type(link.machine), "send", refuse)
         emulator.device.start()
         monkeypatch.undo()
         await client.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)

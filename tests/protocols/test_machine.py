@@ -781,7 +781,7 @@ def test_answer_that_came_before_is_reported_once_a_request_and_else_counted(
             made.send(request)
         made.receive_data(frame * 2)
         assert made.events() == [answer]
-        assert made._open == set()
+        assert made._open == ()
         assert made.counters.unexpected_messages == turn
         assert made.counters.frames_received == 1 + 2 * turn
 
@@ -843,6 +843,9 @@ APPLICATION = b"\x15\0\0" + MAGIC[:1]
 """An id that the first bytes, with the next frame after them, are read as."""
 
 
+TOLD = m.StatusReport, m.ResultContainer
+
+
 def result(data: bytes, application: int = 21) -> m.ResultContainer:
     return m.ResultContainer(application=application, data=data)
 
@@ -858,6 +861,43 @@ def test_result_as_there_was_one_before_has_its_own_data(dialect: FramedDialect)
             assert feed(made, heard) == feed(traced, heard)
     assert made.counters == traced.counters
     assert len(made._results) == (0 if dialect is NO_ID else 8)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS, ids=label)
+def test_datagram_as_there_was_one_before_is_read_as_if_it_were_the_first(
+    dialect: FramedDialect,
+) -> None:
+    made, traced = (
+        Machine(dialect, Role.CLIENT, UDP, trace=trace) for trace in (None, lambda *_: None)
+    )
+    told: list[m.Message] = [STATUS_MESSAGE, m.StatusReport(status=Status(0x88), endian=1)]
+    told += [
+        result(data, one) for data, one in itertools.product((b"", b"abcd", b"efgh"), (21, 22))
+    ]
+    frames = [*map(dialect.encode, told)]
+    wrong = [b"", frames[0][:-1], frames[3] + b"\0", frames[0] * 2, frames[3] + frames[0]]
+    connect = dialect.encode(m.ConnectAnswer(code=0, version=1))
+    asked = [m.UnknownMessage(message_id=dialect.message_id(kind), payload=b"") for kind in TOLD]
+    chance = random.Random(1)  # noqa: S311
+    for each in made, traced:
+        each.send(m.Connect())
+        each.receive_data(connect)
+    for step in range(2000):
+        if step == 1000:  # in another state nothing is known
+            for each in made, traced:
+                each.send(m.Disconnect())
+        elif step < 1000 and not step % 7:
+            request = chance.choice(asked)
+            if not made._open:
+                for each in made, traced:
+                    each.send(request, answered=True)
+        datagram = chance.choice(frames if chance.random() < 0.8 else wrong)
+        for each in made, traced:
+            each.receive_data(datagram)
+        assert made.events() == traced.events()
+        assert made._open == traced._open
+    assert made.counters == traced.counters
+    assert made.counters.ignored_frames > 100
 
 
 def test_result_as_there_was_one_before_waits_for_its_last_byte() -> None:
@@ -885,7 +925,7 @@ def test_result_as_there_was_one_before_is_told_to_who_asked_for_it() -> None:
     for _ in range(3):
         made.send(request, answered=True)
         feed(made, frame)
-        assert made._open == set()
+        assert made._open == ()
 
 
 def test_results_of_many_kinds_are_all_told() -> None:

@@ -384,9 +384,9 @@ class EmulatedInSight(LineCamera):
     def _after_start(self) -> None:
         self._offset = nanoseconds(self.clock.now) - self.device.now
 
-    def _move(self) -> None:
-        self.device.advance_to(nanoseconds(self.clock.now) - self._offset)
-        super()._move()
+    def _move(self, now: float) -> None:
+        self.device.advance_to(nanoseconds(now) - self._offset)
+        super()._move(now)
 
     def _settle(self) -> None:
         if self.device.online != self._was_online:

@@ -17,6 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from smartcam._arguments import check_moment, check_seconds
+from smartcam._client._inside import new_tuple
 from smartcam._finishing import close_all
 from smartcam.exceptions import (
     ConfigurationError,
@@ -621,8 +622,9 @@ class Agent:
             host, guest, program, number, epoch, action, deadline, timeout, True, reservation
         )
         if guest is not None and left is not None:
-            owner, entered = Owner(guest.number, number), guest.entered
-            call = ProgramCall(host, program, owner, {}, [], left, entered, order, reservation)
+            owner, entered = new_tuple(Owner, (guest.number, number)), guest.entered
+            fields: Any = (host, program, owner, {}, [], left, entered, order, reservation)
+            call: ProgramCall = new_tuple(ProgramCall, fields)
             worker = self._workers.take()
             guest.begin(True, number, worker.task)
             worker.do(partial(self._do, action, call, guest, True))

@@ -10,7 +10,13 @@ import json
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._client._inside import CameraState, Interpretation, Interpreted, Listeners
+from smartcam._client._inside import (
+    CameraState,
+    Interpretation,
+    Interpreted,
+    Listeners,
+    new_tuple,
+)
 from smartcam.client import SmartCamera
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError, TriggerTimeoutError
 
@@ -60,16 +66,16 @@ class Carrier(Interpretation):
     def of(self, owner: Owner) -> Carrier:
         """Return a copy for another owner's trigger, which is cheaper than a new object."""
         other = Carrier.__new__(Carrier)
-        other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
+        other.__dict__ = {**self.__dict__, "_carried": new_tuple(Carried, (owner, b""))}
         return other
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:
         if container.cells is None and container.fault is None:
-            return Interpreted(self._carried, None, 0)
+            return self._carried, None, 0
         text = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
-        return Interpreted(self._carried._replace(cells=text), None, 0)
+        return self._carried._replace(cells=text), None, 0
 
     def burst(
         self,
@@ -126,7 +132,7 @@ class TappedListeners(Listeners):
             self.tap.end()
 
     def offer_status(self, status: Status, now: float) -> None:
-        super().offer_status(status, now)
+        Listeners.offer_status(self, status, now)  # super() would take longer than this
         if self.tap is not None:
             self.tap.status(status)
 
@@ -136,7 +142,7 @@ class TappedListeners(Listeners):
             self.tap.results(results, True, False)
 
     def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
-        super().offer_result(result, now, current=current, late=late)
+        Listeners.offer_result(self, result, now, current=current, late=late)
         if self.tap is not None:
             self.tap.results((result,), current, late)
 
@@ -196,8 +202,8 @@ class SharedCamera(SmartCamera[Carried]):
         If the camera may still have input data queued, from a trigger without a result, the
         application is loaded again first, which empties the queue.
         """
-        if not self._observed:
-            return await self._trigger_in_order(application, request, timeout)
+        if not self._observed and request.input_data is None:
+            return await self._trigger(application, request, timeout)
         called_at = datetime.now(UTC)
         try:
             return await self._trigger_in_order(application, request, timeout)

@@ -45,12 +45,13 @@ class Handle(abc.ABC):
 
 
 class Publisher(Handle):
-    """An end that publishes under one key."""
+    """An end that publishes under one key.
 
-    @property
-    @abc.abstractmethod
-    def heard(self) -> bool:
-        """True if the publisher has a known subscriber."""
+    Attributes:
+        heard: whether the publisher has a known subscriber.
+    """
+
+    heard: bool = False
 
     @abc.abstractmethod
     def put(self, payload: bytes) -> None:
@@ -431,19 +432,14 @@ class _MemoryPublisher(Publisher):
         self.pattern = key
         self._end, self._place = end, place
         self._on_heard = on_heard
-        self._heard = False
         place.add(self)
         self.look()
-
-    @property
-    def heard(self) -> bool:
-        return self._heard
 
     def look(self) -> None:
         """Check for subscribers, and report a change."""
         heard = self._end.is_heard(self.pattern)
-        if heard != self._heard:
-            self._heard = heard
+        if heard != self.heard:
+            self.heard = heard
             if self._on_heard is not None:
                 self._on_heard(heard)
 

@@ -42,11 +42,8 @@ class Numbered(Protocol):
         ...
 
 
-class _Kept(NamedTuple):
-    number: int
-    next: int
-    clock: float
-    data: bytes
+_Kept = tuple[int, int, float, bytes]
+"""A number, the one after the entry's last, the clock, and the entry; each message makes one."""
 
 
 class LogPart(NamedTuple):
@@ -83,7 +80,7 @@ class AgentLog:
     @property
     def first(self) -> int:
         """The first kept number; the next number if none is kept."""
-        return self._entries[0].number if self._entries else self.following
+        return self._entries[0][0] if self._entries else self.following
 
     @property
     def kept(self) -> int:
@@ -98,13 +95,14 @@ class AgentLog:
     def add(self, count: int, clock: float, data: bytes) -> None:
         """Keep ``count`` messages with the next numbers, which are in ``data``."""
         entries, number = self._entries, self.following
-        self.following = number + count
-        entries.append(_Kept(number, self.following, clock, data))
-        self._bytes += len(data)
-        while len(entries) > 1 and (
-            self._bytes > self._most_bytes or self.following - entries[0].next >= self._most
-        ):
-            self._bytes -= len(entries.popleft().data)
+        following = self.following = number + count
+        entries.append((number, following, clock, data))
+        size = self._bytes + len(data)
+        while following - entries[0][1] >= self._most or size > self._most_bytes:
+            if len(entries) == 1:
+                break
+            size -= len(entries.popleft()[3])
+        self._bytes = size
 
     def part(self, first: int, most_bytes: int) -> LogPart:
         """Return the entries from ``first`` on: up to ``most_bytes`` bytes, and at least one.
@@ -113,22 +111,22 @@ class AgentLog:
         """
         begin = max(first, self.first)
         found: list[bytes] = []
-        for entry in self._entries:
-            if entry.next <= begin:
+        for _, following, _, data in self._entries:
+            if following <= begin:
                 continue
-            most_bytes -= len(entry.data)
+            most_bytes -= len(data)
             if found and most_bytes < 0:
                 break
-            found.append(entry.data)
+            found.append(data)
         return LogPart(begin, found, self.following)
 
     def first_since(self, clock: float) -> int:
         """Return the number of the first message at ``clock`` or later."""
         number = self.following
-        for entry in reversed(self._entries):
-            if entry.clock < clock:
+        for first, _, at, _ in reversed(self._entries):
+            if at < clock:
                 break
-            number = entry.number
+            number = first
         return number
 
 

@@ -15,6 +15,7 @@ import struct
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+from smartcam._client._inside import new_tuple
 from smartcam.exceptions import RemoteProtocolError
 
 if TYPE_CHECKING:
@@ -245,7 +246,8 @@ def decode_runs(payload: bytes, what: str) -> Batch:
             raise ValueError(f"{len(payload) - place} bytes are left over")
     except (ValueError, struct.error, OverflowError) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return Batch(epoch, following, runs)
+    batch: Batch = new_tuple(Batch, (epoch, following, runs))
+    return batch
 
 
 def decode_own_run(data: bytes) -> ResultRun:
@@ -269,21 +271,8 @@ def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
     for length in lengths:
         payloads.append(payload[place : place + length])
         place += length
-    end = place + cells
-    run = ResultRun(
-        number,
-        application,
-        endian,
-        flags,
-        owner,
-        call,
-        clock,
-        at,
-        trigger,
-        latency,
-        payloads,
-        payload[place:end],
-    )
+    end, about = place + cells, (number, application, endian, flags, owner, call, clock, at)
+    run: ResultRun = new_tuple(ResultRun, (*about, trigger, latency, payloads, payload[place:end]))
     return run, end
 
 
@@ -398,20 +387,24 @@ def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
             raise ValueError(f"{len(payload)} bytes came, {end} were expected")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return program, TriggerOrder(
-        number,
-        epoch,
-        deadline,
-        timeout,
-        None if application == _NONE else application,
-        None if expected == _NONE else expected,
-        results,
-        bool(flags & _WAIT),
-        bool(flags & _BY_APPLICATION),
-        payload[end:] if flags & _INPUT else None,
-        None,
-        reservation,
+    order: TriggerOrder = new_tuple(
+        TriggerOrder,
+        (
+            number,
+            epoch,
+            deadline,
+            timeout,
+            None if application == _NONE else application,
+            None if expected == _NONE else expected,
+            results,
+            flags & _WAIT != 0,
+            flags & _BY_APPLICATION != 0,
+            payload[end:] if flags & _INPUT else None,
+            None,
+            reservation,
+        ),
     )
+    return program, order
 
 
 class TriggerReply(NamedTuple):
@@ -465,7 +458,10 @@ def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
             raise ValueError(f"{place} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return TriggerReply(call, epoch, clock, states, new_states, decode_runs(payload[place:], what))
+    batch = decode_runs(payload[place:], what)
+    fields = (call, epoch, clock, states, new_states, batch)
+    reply: TriggerReply = new_tuple(TriggerReply, fields)
+    return reply
 
 
 def timestamp(at: datetime | None) -> float:

@@ -509,7 +509,6 @@ class _ZenohPublisher(Publisher):
     ) -> None:
         zenoh = end.engine
         self._end = end
-        self._heard = False
         self._on_change = on_heard
         self._urgent_key = key if urgent else None
 
@@ -535,18 +534,13 @@ class _ZenohPublisher(Publisher):
         if again:
             self._end.later(self._declared.call, self._on_heard, heard)
         else:
-            self._heard = heard
+            self.heard = heard
         return publisher
 
     def _on_heard(self, heard: bool) -> None:
-        if heard != self._heard:
-            self._heard = heard
+        self.heard = heard
         if self._on_change is not None:
             self._on_change(heard)
-
-    @property
-    def heard(self) -> bool:
-        return self._heard
 
     def put(self, payload: bytes) -> None:
         self._end.publish(self._publisher, payload, self._urgent_key)

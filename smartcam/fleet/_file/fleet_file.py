@@ -21,6 +21,7 @@ from pydantic import (
 from smartcam._arguments import check_path
 from smartcam._client._inside import Interpretation
 from smartcam._extras import from_part
+from smartcam._settings_model import Seconds  # noqa: TC001 - pydantic does
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet._bus.address import (
@@ -39,7 +40,6 @@ from smartcam.fleet._file.standby import Standby, standby_of
 from smartcam.layout._inside import read_model
 from smartcam.settings import (
     CameraSettings,
-    Seconds,
     is_fleet,
     masked,
     parse_address,

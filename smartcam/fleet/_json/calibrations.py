@@ -59,7 +59,7 @@ class JsonCalibrationCamera:
         reading = self._topics.reading(self._spec)
         async with self._allowed():
             (run,) = await triggered(self._within(DEFAULT_TRIGGER_TIMEOUT), reading, None)
-        return checked_localizations(interpreted(run, reading, self.name).value, self.name)
+        return checked_localizations(interpreted(run, reading, self.name)[0], self.name)
 
     async def take_picture(self) -> Any:
         """Return the grey levels of a picture of the camera."""

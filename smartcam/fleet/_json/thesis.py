@@ -140,7 +140,7 @@ class JsonThesisFace:
         """Trigger; return the result's application, and its value by ``spec``."""
         reading = self._topics.reading(spec)
         (run,) = await triggered(self._work, reading, application)
-        return run.application, interpreted(run, reading, self.name).value
+        return run.application, interpreted(run, reading, self.name)[0]
 
 
 def _topic(text: str) -> str:

@@ -7,6 +7,7 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._client._inside import new_tuple
 from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
@@ -495,6 +496,7 @@ class Caller:
         application: int | None,
         expected: int | None,
         number: int,
+        deadline: float,
         timeout: float,
     ) -> TriggerReply:
         """Trigger by the agent; return its reply.
@@ -504,7 +506,8 @@ class Caller:
             application: application that must run for the trigger; None for any.
             expected: application whose results are expected; None for any.
             number: number of the call.
-            timeout: seconds.
+            deadline: loop time.
+            timeout: seconds that the user gave.
 
         Raises:
             SmartCamError: like :meth:`call`.
@@ -512,27 +515,27 @@ class Caller:
         Cancellation: the agent is told.
         """
         met = self.require()
-        begun = asyncio.get_running_loop().time()
-        deadline = begun + timeout
         interpretation = request.interpretation
-        order = TriggerOrder(
-            number,
-            met.epoch,
-            self.clock(deadline),
-            timeout,
-            application,
-            expected,
-            request.results,
-            request.wait,
-            interpretation.by_application,
-            request.input_data,
-            interpretation.numbered_layouts(),
-            self._fence("trigger"),
+        order: TriggerOrder = new_tuple(
+            TriggerOrder,
+            (
+                number,
+                met.epoch,
+                self.clock(deadline),
+                timeout,
+                application,
+                expected,
+                request.results,
+                request.wait,
+                interpretation.by_application,
+                request.input_data,
+                interpretation.numbered_layouts(),
+                self._fence("trigger"),
+            ),
         )
         payload = encode_order(self.program.token, order)
-        reply = await self._ask(
-            "trigger", number, payload, begun, deadline + grace(timeout), met.agent, met
-        )
+        begun, until = deadline - timeout, deadline + grace(timeout)
+        reply = await self._ask("trigger", number, payload, begun, until, met.agent, met)
         if not isinstance(reply, TriggerReply):
             raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
         self.sample(reply.clock)

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -177,7 +177,7 @@ class FleetCamera(Camera[ValueT]):
         settings = self.settings
         if spec is None and settings.calibration is not None:
             spec = "localizations"
-        is_given = "y_down" in settings.model_fields_set
+        is_given = "y_down" in settings.given
         refused: ConfigurationError | None = None
         for y_down in [settings.y_down] if is_given else [False, True]:
             try:
@@ -394,10 +394,10 @@ class FleetCamera(Camera[ValueT]):
         if isinstance(layout, dict):
             layout = {int(key): value for key, value in layout.items()}
         offered = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
-        changes = {key: on for key, on in offered.items() if key not in settings.model_fields_set}
-        fields_set = settings.model_fields_set
-        self.settings: CameraSettings = settings.model_copy(update=changes)
-        self.settings.model_fields_set.intersection_update(fields_set)
+        changes: dict[str, Any] = {
+            key: on for key, on in offered.items() if key not in settings.given
+        }
+        self.settings: CameraSettings = replace(settings, **changes)
         self._agents_layout = layout
         self._interpretations.clear()
         self._met, self._unreadable = True, None
@@ -656,14 +656,16 @@ class FleetCamera(Camera[ValueT]):
         if self._switch_in_doubt:
             timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
-        deadline = self._deadline(timeout)
+        deadline = asyncio.get_running_loop().time() + timeout
         if self.opening is not None:
             await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)
         try:
-            reply = await self._caller.trigger(request, application, expected, number, timeout)
+            reply = await self._caller.trigger(
+                request, application, expected, number, deadline, timeout
+            )
             receiver.take_states(reply)
             if not receiver.has(reply.states, reply.batch.following):
                 await self._reach(reply.states, reply.batch.following, deadline)

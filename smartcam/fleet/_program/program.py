@@ -7,7 +7,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from smartcam._client._inside import DeadlineTimer, Outcome, make_doorbell
+from smartcam._client._inside import DeadlineTimer, Outcome, make_doorbell, new_tuple
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import (
     ConfigurationError,
@@ -205,7 +205,7 @@ class Program:
         Without a reply by ``deadline`` (loop time) it raises :exc:`TimeoutError`.
         """
         reply = self._bell.outcome()
-        self._pending[number] = Pending(camera, reply, deadline)
+        self._pending[number] = new_tuple(Pending, (camera, reply, deadline))
         if deadline < self._expires_at:
             self._expires_at = deadline
             self._expiry.set(deadline)

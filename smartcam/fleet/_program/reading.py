@@ -6,7 +6,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client._inside import localizations_of
+from smartcam._client._inside import localizations_of, new_tuple
 from smartcam._json import plain
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import InterpretationError
@@ -49,7 +49,8 @@ def interpreted(
         cells = None if given is None else tuple(given)
     (data,) = run.payloads
     container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
-    return interpretation(
+    # by the method's name: a call of the object itself costs four times as much
+    return interpretation.__call__(
         container, run.endian, camera=camera, number=run.number, at=at or run.received_at
     )
 
@@ -59,17 +60,11 @@ def as_result(
 ) -> Result[Any]:
     """Return the one container of ``run`` as a result with this value; ``at``: time of receipt."""
     latency = None if math.isnan(run.latency) else run.latency
-    return Result(
-        camera,
-        run.application,
-        sequence,
-        run.number,
-        run.trigger_time,
-        at or run.received_at,
-        latency,
-        run.payloads[0],
-        value,
-    )
+    number, triggered_at, received_at = run.number, run.trigger_time, at or run.received_at
+    times = number, triggered_at, received_at, latency
+    fields = (camera, run.application, sequence, *times, run.payloads[0], value)
+    result: Result[Any] = new_tuple(Result, fields)
+    return result
 
 
 def result_fields(

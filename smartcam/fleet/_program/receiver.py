@@ -9,7 +9,7 @@ import math
 import weakref
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._client._inside import Listeners
+from smartcam._client._inside import Listeners, new_tuple
 from smartcam.exceptions import (
     InterpretationError,
     ProtocolError,
@@ -66,7 +66,8 @@ def state(data: bytes) -> StateMessage:
     """
     fields = decode_state(data)
     number: int = fields["number"]
-    return StateMessage(number, number + 1, fields)
+    message: StateMessage = new_tuple(StateMessage, (number, number + 1, fields))
+    return message
 
 
 class FleetListeners(Listeners):
@@ -380,13 +381,19 @@ class Receiver:
         Raises:
             InterpretationError: a result cannot be interpreted; the error of the first one.
         """
-        found = [self._outcome(own, run) for run in batch.runs]
-        if batch.runs and not math.isnan(batch.runs[-1].latency):
-            self._counters.processing.add(batch.runs[-1].latency)
-        for one in found:
-            if isinstance(one, InterpretationError):
-                raise one
-        return [one for one in found if not isinstance(one, InterpretationError)]
+        found: list[Result] = []
+        error, latency = None, math.nan
+        for run in batch.runs:
+            outcome, latency = self._outcome(own, run), run.latency
+            if not isinstance(outcome, InterpretationError):
+                found.append(outcome)
+            elif error is None:
+                error = outcome
+        if not math.isnan(latency):
+            self._counters.processing.add(latency)
+        if error is not None:
+            raise error
+        return found
 
     def _outcome(self, own: Own, run: ResultRun) -> Result | InterpretationError:
         """Return a trigger's result, made and counted once, though it comes in two ways."""

@@ -162,8 +162,8 @@ class _Delivery(NamedTuple):
         begin: place where the data begins.
         tail: bytes after the data.
         end: place where the data ends.
-        pending: ids of the answers that were pending before it, and of those pending twice.
-        pending_after: ids of the answers that were pending after it, and of those pending twice.
+        pending: ids of the answers that were pending before it.
+        pending_after: ids of the answers that were pending after it.
         before: messages before the result; all messages if there is no result.
         make: function that makes the result of its data.
         behind: messages after the result.
@@ -174,8 +174,8 @@ class _Delivery(NamedTuple):
     begin: int
     tail: bytes
     end: int
-    pending: tuple[set[int], set[int]]
-    pending_after: tuple[set[int], set[int]]
+    pending: tuple[int, ...]
+    pending_after: tuple[int, ...]
     before: list[Message]
     make: Callable[[bytes], Message] | None
     behind: list[Message]
@@ -187,17 +187,19 @@ class _Volley(NamedTuple):
 
     Attributes:
         messages: messages; the same tuple is recognized.
-        frames: frames of these messages.
+        data: frames of these messages; on TCP joined.
+        frames: number of the frames.
         size: number of bytes of all frames.
-        pending: ids of the answers that were pending before, and of those pending twice.
-        pending_after: ids of the answers that were pending afterwards, and of those pending twice.
+        pending: ids of the answers that were pending before.
+        pending_after: ids of the answers that were pending afterwards.
     """
 
     messages: tuple[Message, ...]
-    frames: list[bytes]
+    data: list[bytes]
+    frames: int
     size: int
-    pending: tuple[set[int], set[int]]
-    pending_after: tuple[set[int], set[int]]
+    pending: tuple[int, ...]
+    pending_after: tuple[int, ...]
 
 
 class Machine:
@@ -222,6 +224,17 @@ class Machine:
         transitions: the next state by state, sender and type of message; all other messages are
             illegal.
     """
+
+    # an object with more than thirty attributes and no slots is slower at each of them
+    __slots__ = (
+        *("_asks", "_begun", "_begun_at", "_bounded", "_burst_reader", "_burst_size", "_chunks"),
+        *("_constant", "_deaf", "_decoders", "_deliveries", "_events", "_familiar", "_framer"),
+        *("_header_size", "_may_come", "_may_go", "_narrows", "_open", "_outbox", "_plain"),
+        *("_policy", "_result_head", "_result_id", "_results", "_says", "_sender"),
+        *("_sent_data_key", "_sent_frames", "_state", "_status_id", "_status_size", "_statuses"),
+        *("_takes_bursts", "_trace", "_unfinished", "_unknown_deliveries", "_volley", "counters"),
+        *("dialect", "error", "kin", "replies", "role", "transport"),
+    )
 
     transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
 
@@ -252,9 +265,8 @@ class Machine:
         self._trace = trace
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
-        self._open: set[int] = set()  # ids of the pending answers (client role)
-        # ids of which two answers are pending: of requests sent ``again``
-        self._open_twice: set[int] = set()
+        # ids of the pending answers (client role), in order; of requests sent ``again``, twice
+        self._open: tuple[int, ...] = ()
         self._sender, self._says = role.receives, role.sends
         self._asks = role is Role.CLIENT
         self._plain = self._asks and trace is None
@@ -462,12 +474,12 @@ class Machine:
         if answered is not None:
             pending = message_id if answered else None
         if pending is not None and self._asks:
-            if pending in (self._open_twice if again else self._open):
+            if self._open.count(pending) > again:
                 raise LocalProtocolError(
                     f"an answer to message {message_id:#04x} is still owed; one request of an id "
                     "can be open"
                 )
-            (self._open_twice if pending in self._open else self._open).add(pending)
+            self._open += (pending,)
         if following is not self._state:
             self.state = following
         self._outbox.append(data)
@@ -489,22 +501,21 @@ class Machine:
         """
         volley = self._volley
         if volley is not None:
-            known, frames, size, pending, pending_after = volley
-            if known is messages and pending[0] == self._open and pending[1] == self._open_twice:
-                self._open = pending_after[0].copy() if pending_after[0] else set()
-                self._open_twice = pending_after[1].copy() if pending_after[1] else set()
-                self._outbox += frames
+            known, data, frames, size, pending, pending_after = volley
+            if known is messages and pending == self._open:
+                self._open = pending_after
+                self._outbox += data
                 counters = self.counters
-                counters.frames_sent += len(frames)
+                counters.frames_sent += frames
                 counters.bytes_sent += size
                 return
-        pending, state, sent = self._pending_answers(), self._state, len(self._outbox)
+        pending, state, sent = self._open, self._state, len(self._outbox)
         send_each(self, messages)
         if self._plain and state is self._state and isinstance(messages, tuple):
-            frames = self._outbox[sent:]
-            self._volley = _Volley(
-                messages, frames, sum(map(len, frames)), pending, self._pending_answers()
-            )
+            data = self._outbox[sent:]
+            frames, size = len(data), sum(map(len, data))
+            data = [b"".join(data)] if self.transport is Transport.TCP else data
+            self._volley = _Volley(messages, data, frames, size, pending, self._open)
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -562,22 +573,22 @@ class Machine:
         buffer, start = framer.buffer, framer.start
         if not self._plain or isinstance(buffer, memoryview):
             return
-        known, size, pending = self._statuses.get, self._status_size, self._open
+        known, size, status_id = self._statuses.get, self._status_size, self._status_id
         before, available = len(events), len(buffer)
         looks = self._unknown_deliveries and available <= MAX_KNOWN_DELIVERY_BYTES
-        were = self._pending_answers() if looks and not start and not before else None
+        were = self._open if looks and not start and not before else None
         while start < available:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
                 found = self._find_result(buffer, start)
-                if found is None and pending:
+                if found is None and self._open:
                     found = self._find_answer(buffer, start)
                 if found is None:
                     break
                 message, end = found
-            elif pending:
-                pending.discard(self._status_id)
+            elif status_id in self._open:
+                self._close(status_id)
             events.append(message)
             start = end
         framer.start = start
@@ -585,10 +596,7 @@ class Machine:
         if were is not None and 0 < start == available:
             self._note_delivery(buffer, were)
 
-    def _pending_answers(self) -> tuple[set[int], set[int]]:
-        return set(self._open), set(self._open_twice)
-
-    def _note_delivery(self, buffer: bytes, pending: tuple[set[int], set[int]]) -> None:
+    def _note_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
         """Store a delivery that consisted of familiar frames only, each of them an event."""
         framer, events = self._framer, [one for one in self._events if isinstance(one, m.Message)]
         results = [at for at, one in enumerate(events) if isinstance(one, m.ResultContainer)]
@@ -609,7 +617,7 @@ class Machine:
             buffer[end:],
             end,
             pending,
-            self._pending_answers(),
+            self._open,
             events[:at],
             make,
             events[at + 1 :],
@@ -628,12 +636,11 @@ class Machine:
         if known is None or events or framer.start or type(buffer) is not bytes:
             return False
         head, begin, tail, end, pending, pending_after, before, make, behind, frames = known
-        if buffer[:begin] != head or buffer[end:] != tail:
+        if not (buffer.startswith(head) and buffer.endswith(tail)):
             return False
-        if pending[0] != self._open or pending[1] != self._open_twice:
+        if pending != self._open:
             return False
-        self._open = pending_after[0].copy() if pending_after[0] else set()
-        self._open_twice = pending_after[1].copy() if pending_after[1] else set()
+        self._open = pending_after
         events += before
         if make is not None:
             events.append(make(buffer[begin:end]))
@@ -656,9 +663,21 @@ class Machine:
         end = start + length
         if end != len(buffer) and buffer[end : end + self._status_size] not in self._statuses:
             return None
-        if self._open:
-            self._open.discard(self._result_id)
+        if self._result_id in self._open:
+            self._close(self._result_id)
         return make(buffer[data:end]), end
+
+    def _find_datagram(self, datagram: bytes) -> Message | None:
+        """Return the message of a datagram that is a status, or a result, like an earlier one."""
+        message, message_id = self._statuses.get(datagram), self._status_id
+        if message is None:
+            known, message_id = self._results.get(datagram[: self._result_head]), self._result_id
+            if known is None or known[0] != len(datagram):
+                return None
+            message = known[1](datagram[self._result_head :])
+        if message_id in self._open:
+            self._close(message_id)
+        return message
 
     def _find_answer(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it is a pending answer that was seen before."""
@@ -695,6 +714,13 @@ class Machine:
 
     def _receive_datagram(self) -> None:
         framer = self._framer
+        if self._plain and isinstance(framer.buffer, bytes):
+            message = self._find_datagram(framer.buffer)
+            if message is not None:
+                self.counters.frames_received += 1
+                self._events.append(message)
+                framer.clear()
+                return
         try:
             found = framer.cut()
             if found is None or framer.buffered:
@@ -741,8 +767,8 @@ class Machine:
         elif self._plain and codec is not None and surplus == 0:
             self._note_familiar(codec, message, begin, end)
         if kind in _BY_ITSELF:
-            if self._open:  # answers a request, perhaps a raw one
-                self._open.discard(message_id)
+            if message_id in self._open:  # answers a request, perhaps a raw one
+                self._close(message_id)
         elif self._asks and not self._wanted(message_id, known=codec is not None):
             return None
         self._events.append(message)
@@ -831,7 +857,8 @@ class Machine:
 
     def _close(self, message_id: int) -> None:
         """Note that a pending answer has come."""
-        (self._open_twice if message_id in self._open_twice else self._open).remove(message_id)
+        at = self._open.index(message_id)
+        self._open = self._open[:at] + self._open[at + 1 :]
 
     def _reject(self, error: RemoteProtocolError) -> bool:
         """Fail the link (return True), or drop and count the input, as the policy says."""

@@ -133,7 +133,7 @@ class Client:
         )
         self.queues: list[Queue[Any]] = []
         self.awaited: list[Any] = []  # futures of callers
-        self.written: list[bytes] = []
+        self.written = b""
         self.outcomes: list[Any] = []
         self.events: list[Any] = []
         self.begin()
@@ -145,7 +145,7 @@ class Client:
         self.dispatch.begin_session(HANDBOOK, ordered=True)
         self.counters.begin(self.machine.counters)
         self.machine.send(m.Connect())
-        self.written += self.machine.data_to_send()
+        self.written += b"".join(self.machine.data_to_send())
 
     # -- what a caller does
 
@@ -167,7 +167,7 @@ class Client:
         self.results.begin_trigger(pending, 1e9)
         self.machine.send_all(FENCED_TRIGGER)
         self.waits.expect_fences(2)
-        self.written += self.machine.data_to_send()
+        self.written += b"".join(self.machine.data_to_send())
 
     def wake(self) -> None:
         """Have the caller of the trigger go on, as it does when there is an outcome."""
@@ -192,7 +192,7 @@ class Client:
             self.machine.send(request)
             owed = self.waits.next_answer(answer, LOOP, LOOP.time(), behind=self.deliveries)
             self.awaited.append(owed)
-            self.written += self.machine.data_to_send()
+            self.written += b"".join(self.machine.data_to_send())
 
     def await_status(self, mask: int) -> None:
         """Wait for a status."""
@@ -245,11 +245,12 @@ class Client:
     def known(self) -> Iterator[object]:
         """Yield all that it knows, without what is the same anyway."""
         machine, waits, results = self.machine, self.waits, self.results
-        yield self.written[-4:]
+        self.written = self.written[-128:]
+        yield self.written
         yield machine.counters, machine.state, machine.buffered, machine.room().nbytes
-        yield machine._open, machine._open_twice, self.frames, self.deliveries
+        yield machine._open, self.frames, self.deliveries
         yield _parts(self.state, "_listeners")
-        yield [*waits.answers], waits._behind, waits._fences_open, len(waits.statuses)
+        yield [*waits.answers], waits._behind, waits.fences_open, len(waits.statuses)
         correlation = results.correlation
         yield _parts(correlation, "pending", "_last", "owed")
         yield _slots(correlation._last)
@@ -512,7 +513,7 @@ def _compare_one(short: Client, judge: Client, chance: Chance, counts: Counter[s
             if not sleeps:
                 client.wake()
             client.awaited = [one for one in client.awaited if not one.done()]
-        stuck = short.waits._fences_open if short.results._pending is None else 0
+        stuck = short.waits.fences_open if short.results._pending is None else 0
         if stuck and chance.random.random() < 0.8:  # the answers that are missing come, too
             for client in both:
                 client.hear(chance.rest + _answer() * stuck, 0.0)

@@ -44,7 +44,7 @@ class KeepsFences(ShortDispatch):
 class LooksAtSizes(ShortMachine):
     """Takes any delivery of a known size for the known one."""
 
-    def _note_delivery(self, buffer: bytes, owed: tuple[set[int], set[int]]) -> None:
+    def _note_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
         super()._note_delivery(buffer, owed)
         for size, known in self._deliveries.items():
             self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
@@ -55,7 +55,7 @@ class IsOwedAnything(ShortMachine):
 
     def _receive_known(self) -> bool:
         for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(pending=(self._open, self._open_twice))
+            self._deliveries[size] = known._replace(pending=self._open)
         return super()._receive_known()
 
 

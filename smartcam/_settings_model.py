@@ -1,0 +1,69 @@
+"""The options of a connection as pydantic checks them.
+
+:class:`~smartcam.settings.CameraSettings` accepts the usual values itself, since importing pydantic
+takes longer than connecting; whether any other value is valid is decided here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, ConfigDict, Field, InstanceOf, create_model
+
+from smartcam._arguments import MAX_NAME_CHARACTERS, plain
+from smartcam.backoff import Backoff
+
+PLAIN = BeforeValidator(plain)
+"""Lets a strict type take numbers and texts of any class, such as numpy's."""
+
+Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
+ApplicationId = Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF), PLAIN]
+Text = Annotated[str, Field(strict=True), PLAIN]
+Flag = Annotated[bool, Field(strict=True), PLAIN]
+
+
+def _integer(least: int, most: int) -> Any:
+    return Annotated[int, Field(strict=True, ge=least, le=most), PLAIN]
+
+
+OPTIONS: dict[str, tuple[Any, str]] = {
+    "name": (
+        Annotated[str, Field(strict=True, max_length=MAX_NAME_CHARACTERS), PLAIN],
+        "name in logs and results; default HOST:PORT",
+    ),
+    "application": (ApplicationId | None, "application to have running and ready"),
+    "application_names": (
+        Annotated[dict[Text, ApplicationId], Field(max_length=1000)],
+        "names of applications and their ids; a name may replace any id",
+    ),
+    "interpret_as": (Any, "interpretation of result containers"),
+    "calibration": (
+        Any,
+        "transforms localizations into the robot's frame: one for all applications, or a mapping "
+        "from application id to one, or to None to leave its values as they are",
+    ),
+    "y_down": (Flag, "the camera's y axis points down; turned to y up on the way in"),
+    "lenient": (Flag, "any non-zero byte is a true bool"),
+    "connect_timeout": (Seconds, "longest wait for a session, all attempts"),
+    "connect_attempts": (_integer(1, 100), "fresh links tried per dialect"),
+    "switch_timeout": (Seconds, "longest wait for a switch"),
+    "request_timeout": (Seconds, "longest wait for the answer to a request"),
+    "close_timeout": (Seconds, "longest wait for an orderly end of the link"),
+    "liveness_timeout": (
+        Seconds | None,
+        "longest silence of a camera that is asked for a sign of life; None: no end",
+    ),
+    "reconnect": (InstanceOf[Backoff] | None, "when a lost camera is tried again; None: never"),
+    "restore": (
+        Flag,
+        "after a reconnect have the named application and the run state back that were wanted; "
+        "else they are left as the camera has them",
+    ),
+    "max_length": (_integer(16, 1 << 30), "largest payload accepted, bytes"),
+}
+"""Type of each option, and its description."""
+
+_FIELDS: dict[str, Any] = {option: (kind, None) for option, (kind, _) in OPTIONS.items()}
+_CONFIG = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+SettingsModel = create_model("SettingsModel", __config__=_CONFIG, **_FIELDS)
+"""Takes any of the options; those that are not given are None."""
