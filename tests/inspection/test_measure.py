@@ -369,7 +369,7 @@ def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> Non
 def test_calibration_without_a_known_error_is_remarked() -> None:
     found = fit_plane(GRID[[0, 2, 6]], tilted(GRID)[[0, 2, 6]], model="affine")
     assert found.touch_sigma is None
-    assert plane_of(found).remark == "sigma is without the touches' error, which nothing tells"
+    assert plane_of(found).remark == "sigma does not include the touches' error: unknown"
 
 
 def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
